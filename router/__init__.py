@@ -1,0 +1,1 @@
+"""A configuration-driven declarative router between protobuf over UDP and ROS 2."""

@@ -1,0 +1,106 @@
+"""The books: every series that the router exports, and where in a flat list of integers it is counted.
+
+The metrics are declared once, in `METRICS`; the collector, the documentation and the compiler read
+them from here. Counting itself is `counts[slot] += 1` in the thread that owns the list.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One metric. `kind` is counter, gauge (nanoseconds in the books, seconds exported) or histogram."""
+
+    name: str
+    kind: str
+    labels: tuple[str, ...]
+    help: str
+
+
+METRICS = (
+    Metric("datagrams_received", "counter", ("listener",), "Datagrams taken from the listener's socket."),
+    Metric("received_bytes", "counter", ("listener",), "Bytes in those datagrams."),
+    Metric("kernel_drops", "counter", ("listener",), "Datagrams that the kernel dropped before the router saw them."),
+    Metric("datagrams_padded", "counter", ("listener",), "Datagrams whose trailing zeros were put back or taken off."),
+    Metric("datagrams_rejected", "counter", ("listener", "reason"), "Datagrams that no route took, by reason."),
+    Metric("unhandled", "counter", ("payload_case",), "Datagrams of a payload case without a route."),
+    Metric("messages_received", "counter", ("route", "source"), "Messages that a route took, by who sent them."),
+    Metric("datagrams_sent", "counter", ("route", "destination"), "Datagrams handed to the kernel."),
+    Metric("sent_bytes", "counter", ("route", "destination"), "Bytes in those datagrams."),
+    Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
+    Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
+    Metric("messages_filtered", "counter", ("route", "target"), "Messages withheld on purpose."),
+    Metric("route_seconds", "histogram", ("route",), "Time from datagram received to all targets served."),
+    Metric("route_last_message_timestamp_seconds", "gauge", ("route",), "When the route last took a message."),
+    Metric("endpoint_last_seen_timestamp_seconds", "gauge", ("endpoint",), "When the endpoint last sent."),
+)
+
+REJECT_REASONS = (
+    "truncated", "empty", "malformed", "no_payload", "unknown_case", "unhandled", "ignored", "source_mismatch",
+)  # fmt: skip
+
+DROP_REASONS = (
+    "mapping_error", "non_finite", "stale", "rate_limited", "queue_full", "send_buffer_full", "send_error",
+    "publish_error", "incomplete", "loop",
+)  # fmt: skip
+
+UNKNOWN_CASE = "unknown"
+"""The `payload_case` label of a field number that the envelope does not have."""
+
+HISTOGRAM_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000))
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One slot's meaning: a metric's name and its label values, in the metric's order.
+
+    A histogram has a run of slots: one for each bound, one for everything slower, one for the sum (ns).
+    """
+
+    metric: str
+    labels: tuple[str, ...]
+    part: int = 0
+
+
+HISTOGRAM_SLOTS = len(HISTOGRAM_BOUNDS_NS) + 2
+
+
+@dataclass(slots=True)
+class Books:
+    """Slots by series. Asking twice for one series gives the same slot, so series exist once."""
+
+    _slots: dict[Series, int] = field(default_factory=dict)
+
+    def slot(self, metric: str, *labels: str) -> int:
+        declared = _BY_NAME[metric]
+        if len(labels) != len(declared.labels):
+            raise ValueError(f"{metric} has the labels {declared.labels}, not {labels}")
+        first = Series(metric, labels)
+        if first not in self._slots:
+            for part in range(HISTOGRAM_SLOTS if declared.kind == "histogram" else 1):
+                self._slots[Series(metric, labels, part)] = len(self._slots)
+        return self._slots[first]
+
+    def series(self) -> Iterable[tuple[Series, int]]:
+        """Every series with its slot, in the order in which they were asked for."""
+        return self._slots.items()
+
+    def fresh_counts(self) -> list[int]:
+        """A list of zeros, one for each slot, for one thread to own."""
+        return [0] * len(self._slots)
+
+
+_BY_NAME = {metric.name: metric for metric in METRICS}
+
+
+def metric(name: str) -> Metric:
+    return _BY_NAME[name]
+
+
+def histogram_part(elapsed_ns: int) -> int:
+    """Which slot of a histogram's run counts this duration."""
+    return bisect_left(HISTOGRAM_BOUNDS_NS, elapsed_ns)

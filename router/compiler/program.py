@@ -1,0 +1,97 @@
+"""What the compiler hands on: all handlers, and what must be opened for them.
+
+A program is plain data and code objects. It holds no socket, no publisher and no counter value; `engine`
+binds it to those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import CodeType
+
+from router.compiler.books import Books
+from router.table.model import Address, Framing, RouteTable
+from router.types.protobuf import Envelope
+
+
+@dataclass(frozen=True, slots=True)
+class ListenerPlan:
+    name: str
+    address: Address
+    framing: Framing
+    receive_buffer: int
+
+
+@dataclass(frozen=True, slots=True)
+class SenderPlan:
+    """A connected UDP socket to one destination endpoint; `local_ports` are never reused by it."""
+
+    endpoint: str
+    address: Address
+
+
+@dataclass(frozen=True, slots=True)
+class QosPlan:
+    """A complete ROS QoS: no None but for durations that are infinite. Durations in ns, rclpy's names."""
+
+    reliability: str
+    durability: str
+    history: str
+    depth: int
+    deadline: int | None = None
+    lifespan: int | None = None
+    liveliness: str = "system_default"
+    liveliness_lease_duration: int | None = None
+
+    @property
+    def serves_late_joiners(self) -> bool:
+        """A late subscriber gets the last messages, so they must be published before anybody listens."""
+        return self.durability == "transient_local"
+
+
+@dataclass(frozen=True, slots=True)
+class PublisherPlan:
+    """One ROS publisher; `definition` is what the CDR bytes were laid out after (see edges.ros)."""
+
+    topic: str
+    type_name: str
+    qos: QosPlan
+    definition: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Handler:
+    """One inbound or forward route as generated Python.
+
+    `code` defines a function `handle`. Executed in a namespace that holds `constants` and what the
+    engine binds (see engine.binding), it takes a message's payload bytes. `source` is the same as text.
+    `sources` maps an endpoint's name, or None for a stranger when the route takes any, to the slot that
+    counts its messages.
+    """
+
+    case: str
+    number: int
+    source: str
+    code: CodeType
+    constants: Mapping[str, object]
+    sources: Mapping[str | None, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """A compiled table.
+
+    Handlers are by envelope field number. `ignored` are the numbers of cases that the table ignores.
+    """
+
+    table: RouteTable
+    envelope: Envelope
+    books: Books
+    listeners: tuple[ListenerPlan, ...]
+    senders: tuple[SenderPlan, ...]
+    publishers: tuple[PublisherPlan, ...]
+    handlers: Mapping[int, Handler]
+    ignored: frozenset[int]
+    declared_outbound: tuple[str, ...]
+    protos_sha256: str

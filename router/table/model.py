@@ -1,0 +1,217 @@
+"""The route table as typed, frozen data. Every value that a finding may blame keeps its span.
+
+Knows shapes and places only: whether a payload case, a field or a ROS type exists is the compiler's
+business.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, NamedTuple, TypeVar
+
+from router.errors import SourceSpan
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Located(Generic[T]):
+    """A value and the place in the table that it was read from."""
+
+    value: T
+    span: SourceSpan
+
+
+class Address(NamedTuple):
+    """An IPv4 address and a UDP (for metrics: TCP) port."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+
+class Framing(enum.Enum):
+    EXACT = "exact"
+    ZERO_TRIMMED = "zero_trimmed"
+
+
+class EndpointKind(enum.Enum):
+    BOARD = "board"
+    BASESTATION = "basestation"
+    TOOL = "tool"
+
+
+@dataclass(frozen=True, slots=True)
+class EnvelopeSettings:
+    """`protos` is an absolute path; `message` and `oneof` name the envelope in them."""
+
+    protos: Located[Path]
+    message: Located[str]
+    oneof: Located[str]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSettings:
+    name: str
+    namespace: str
+
+
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """`span` is the listener's name in the table. `receive_buffer` is in bytes."""
+
+    name: str
+    span: SourceSpan
+    address: Located[Address]
+    framing: Framing
+    receive_buffer: int
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """`span` is the endpoint's name in the table."""
+
+    name: str
+    span: SourceSpan
+    address: Located[Address]
+    kind: EndpointKind
+    source_port: Located[int] | None
+    trim_trailing_zeros: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Expression:
+    """The text of an expression, not yet parsed.
+
+    `verbatim` says that the text stands in the file exactly as it is here, on one line, beginning at
+    `text_column`; then an offset into the text is a column. Otherwise (escapes, folded lines, a value
+    from a variable) findings blame the whole span. A YAML sequence becomes `items`, with empty text.
+    """
+
+    text: str
+    span: SourceSpan
+    verbatim: bool
+    text_column: int
+    items: tuple[Expression, ...] | None = None
+
+    def part(self, start: int, end: int) -> SourceSpan:
+        """The span of characters `start` to `end` of the text (from 0, `end` exclusive)."""
+        if not self.verbatim:
+            return self.span
+        column = self.text_column
+        return SourceSpan(self.span.file, self.span.line, column + start, column + max(end, start + 1))
+
+
+@dataclass(frozen=True, slots=True)
+class FieldEntry:
+    """`linear_acceleration: {x: accel_x}` is path ("linear_acceleration", "x"); dotted keys are split.
+
+    `path_spans` has the place of each part of the path.
+    """
+
+    path: tuple[str, ...]
+    path_spans: tuple[SourceSpan, ...]
+    value: Expression
+
+
+@dataclass(frozen=True, slots=True)
+class FieldMap:
+    """What `fields:` says. `fields: auto`, or `auto: true` among the entries, sets `auto`.
+
+    Entries win over what auto would do with the same field.
+    """
+
+    span: SourceSpan
+    auto: bool
+    entries: tuple[FieldEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """rclpy's names; durations in nanoseconds. None where the table says nothing."""
+
+    span: SourceSpan
+    profile: Located[str] | None = None
+    reliability: Located[str] | None = None
+    durability: Located[str] | None = None
+    history: Located[str] | None = None
+    depth: Located[int] | None = None
+    deadline: Located[int] | None = None
+    lifespan: Located[int] | None = None
+    liveliness: Located[str] | None = None
+    liveliness_lease_duration: Located[int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """A destination endpoint of a route. `max_rate` is in Hz."""
+
+    endpoint: Located[str]
+    span: SourceSpan
+    when: Expression | None = None
+    max_rate: Located[float] | None = None
+    fields: FieldMap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A ROS topic of a route: published for a UDP source, subscribed to for `source: ros`."""
+
+    topic: Located[str]
+    type: Located[str]
+    span: SourceSpan
+    queue_depth: Located[int] | None = None
+    qos: Qos | None = None
+    when: Expression | None = None
+    max_rate: Located[float] | None = None
+    fields: FieldMap | None = None
+
+
+ANY = "any"
+ROS = "ros"
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """What happens to one payload case. `ignore` holds the reason of a case that goes nowhere.
+
+    `sources` are endpoint names, or just `any`, or just `ros`. `fields` belongs to `source: ros`.
+    """
+
+    case: Located[str]
+    sources: tuple[Located[str], ...]
+    destinations: tuple[Destination, ...]
+    topics: tuple[Topic, ...]
+    fields: FieldMap | None = None
+    ignore: Located[str] | None = None
+
+    @property
+    def is_outbound(self) -> bool:
+        return any(source.value == ROS for source in self.sources)
+
+
+@dataclass(frozen=True, slots=True)
+class RouteTable:
+    """One table after `extends` and variables. `files` are all files read, the table itself first.
+
+    `routes_span` is the place of the key `routes`. `sha256` is over the bytes of `files` in order.
+    `broken` names what the table has but is left out here because of findings of its own, as
+    `endpoints/arm_board` or `routes/imu_info`, so that nobody reports its absence as well.
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    sha256: str
+    envelope: EnvelopeSettings
+    node: NodeSettings
+    metrics: Located[Address] | None
+    listeners: Mapping[str, Listener]
+    endpoints: Mapping[str, Endpoint]
+    routes: tuple[Route, ...]
+    routes_span: SourceSpan
+    broken: frozenset[str] = frozenset()

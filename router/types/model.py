@@ -1,0 +1,139 @@
+"""One type model for both sides: protobuf messages and ROS interfaces, seen by the compiler alike.
+
+Knows neither descriptors nor `.msg` files; `types.protobuf` and `types.ros` build it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Union
+
+
+@dataclass(frozen=True, slots=True)
+class Bool:
+    def __str__(self) -> str:
+        return "bool"
+
+
+@dataclass(frozen=True, slots=True)
+class Int:
+    """A two's complement integer of 8, 16, 32 or 64 bits."""
+
+    bits: int
+    signed: bool
+
+    @property
+    def low(self) -> int:
+        return -(1 << (self.bits - 1)) if self.signed else 0
+
+    @property
+    def high(self) -> int:
+        return (1 << (self.bits - self.signed)) - 1
+
+    def __str__(self) -> str:
+        return f"{'' if self.signed else 'u'}int{self.bits}"
+
+
+@dataclass(frozen=True, slots=True)
+class Float:
+    """IEEE 754, 32 or 64 bits."""
+
+    bits: int
+
+    def __str__(self) -> str:
+        return f"float{self.bits}"
+
+
+@dataclass(frozen=True, slots=True)
+class String:
+    """Text. `bound` is the largest length (ROS: bytes without the final NUL), None for unbounded."""
+
+    bound: int | None = None
+    wide: bool = False
+
+    def __str__(self) -> str:
+        return ("wstring" if self.wide else "string") + (f"<={self.bound}" if self.bound is not None else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Bytes:
+    """A protobuf `bytes` field of at most `bound` bytes, None for unbounded."""
+
+    bound: int | None = None
+
+    def __str__(self) -> str:
+        return "bytes" + (f"<={self.bound}" if self.bound is not None else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Enum:
+    """A protobuf enum: open, so a value may be any int32; `values` are those that have names."""
+
+    name: str
+    values: tuple[tuple[str, int], ...]
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class List:
+    """`length` elements exactly (a ROS array), or at most `bound`, or any number."""
+
+    element: Type
+    length: int | None = None
+    bound: int | None = None
+
+    def __str__(self) -> str:
+        size = str(self.length) if self.length is not None else f"<={self.bound}" if self.bound is not None else ""
+        return f"{self.element}[{size}]"
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One member of a message.
+
+    `number` is the protobuf field number (0 for ROS). `has_presence` says that "not set" differs from
+    the default. `default` is a ROS field's declared default, None where the type's zero is meant.
+    `comment` is the documentation beside it, as one line.
+    """
+
+    name: str
+    type: Type
+    number: int = 0
+    has_presence: bool = False
+    default: object = None
+    comment: str = ""
+
+
+@dataclass(eq=False, slots=True)
+class MessageType:
+    """A protobuf message (`SensorBoardIMUInfo`) or a ROS one (`sensor_msgs/msg/Imu`).
+
+    Compared by identity: a name has one MessageType per schema. Fields keep their declared order,
+    which for ROS decides the bytes. Protobuf messages may contain themselves, so `fields` is filled
+    by whoever builds the type, once, and not changed afterwards.
+    """
+
+    name: str
+    is_ros: bool
+    fields: tuple[Field, ...] = ()
+    constants: Mapping[str, object] = field(default_factory=dict)
+
+    def field(self, name: str) -> Field | None:
+        return next((member for member in self.fields if member.name == name), None)
+
+    @property
+    def short_name(self) -> str:
+        """`Imu` of `sensor_msgs/msg/Imu`; `State` of `MotorInformation.State`."""
+        return self.name.replace("/", ".").rpartition(".")[2]
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __repr__(self) -> str:
+        return f"MessageType({self.name!r}, {len(self.fields)} fields)"
+
+
+Type = Union[Bool, Int, Float, String, Bytes, Enum, List, MessageType]
