@@ -153,12 +153,18 @@ def shown_path(path: Path) -> str:
         return str(absolute)
 
 
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name that somebody who wrote `name` most likely meant, None when none is near."""
+    folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
+    close = difflib.get_close_matches(name.lower(), folded, n=1, cutoff=0.6)
+    return folded[close[0]] if close else None
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A hint for a name that does not exist: the nearest known one, else a short list, else nothing."""
     candidates = sorted(set(known))
-    folded = {candidate.lower(): candidate for candidate in candidates}
-    if close := difflib.get_close_matches(name.lower(), folded, n=1, cutoff=0.6):
-        return f"did you mean '{folded[close[0]]}'?"
+    if close := nearest(name, candidates):
+        return f"did you mean '{close}'?"
     if not candidates:
         return ""
     shown = ", ".join(candidates[:8])
