@@ -1,0 +1,223 @@
+"""The protobuf side of the type model: a folder of `.proto` files, compiled at start-up, and the envelope in it.
+
+Knows nothing of routes; the names it is asked for come from the table's `envelope:`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
+
+from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, shown_path
+from router.table.model import EnvelopeSettings
+from router.types.board_options import NO_OPTIONS, BoardOptions, OptionsFile, read_options
+from router.types.model import Enum, MessageType
+from router.types.proto_model import build_types
+from router.types.proto_source import Part, ProtoSources
+from router.types.protoc import WELL_KNOWN, compile_protos
+from router.types.sizes import UnboundedError, field_size, largest_encoding
+
+_PROTO = ".proto"
+_OPTIONS = ".options"
+
+
+class ProtoSchema:
+    """Everything that the `.proto` files below `root` declare, by full name.
+
+    What they import of `google/protobuf` is among them. `sha256` is over the relative names and the bytes
+    of all `.proto` and `.options` files; `files` has those names.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        files: Mapping[str, bytes],
+        compiled: FileDescriptorSet,
+        sources: ProtoSources,
+        options: Mapping[str, OptionsFile],
+    ) -> None:
+        self.root = root
+        self.files = tuple(files)
+        self.sha256 = _sha256(files)
+        self.sources = sources
+        self._options = options
+        self._pool = DescriptorPool()
+        for file in compiled.file:
+            self._pool.AddSerializedFile(file.SerializeToString())
+        self.messages: Mapping[str, MessageType]
+        self.enums: Mapping[str, Enum]
+        names = [file.name for file in compiled.file]
+        self.messages, self.enums = build_types(self._pool, names, sources, self.board_options)
+
+    def message_class(self, name: str) -> type[Message]:
+        """The Python class of a message, by full name. Raises KeyError."""
+        return GetMessageClass(self.descriptor(name))
+
+    def descriptor(self, name: str) -> Descriptor:
+        """By full name. Raises KeyError."""
+        return self._pool.FindMessageTypeByName(name)
+
+    def board_options(self, field: FieldDescriptor) -> BoardOptions:
+        """What the `.options` file beside the field's `.proto` says about it."""
+        options = self._options.get(field.containing_type.file.name)
+        return options.of(field.containing_type.full_name, field.name) if options is not None else NO_OPTIONS
+
+    def span(self, message: str, field: str | None = None) -> SourceSpan:
+        """The place of a declaration in its `.proto` file: of a message or enum, of a field or enum value."""
+        return self.sources.span(message if field is None else f"{message}.{field}", Part.NAME)
+
+
+@dataclass(frozen=True, slots=True)
+class PayloadCase:
+    """One member of the envelope's oneof.
+
+    `max_size` is the largest encoding of the payload in bytes as nanopb computes it, None when unbounded.
+    """
+
+    name: str
+    number: int
+    type: MessageType
+    message_class: type[Message]
+    max_size: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """The message around every payload, by full name.
+
+    `max_size` is its largest encoding in bytes over the bounded cases, nanopb's `PBEnvelope_size`.
+    """
+
+    name: str
+    oneof: str
+    message_class: type[Message]
+    cases: Mapping[str, PayloadCase]
+    max_size: int
+
+
+def load_protos(root: Path, blame: SourceSpan | None = None) -> ProtoSchema:
+    """Compile all `.proto` files below `root`.
+
+    Raises TableError with every finding. What is wrong with the folder itself is blamed on `blame`, the
+    place that names it, else on the folder.
+    """
+    files = _read_folder(root, blame or SourceSpan(shown_path(root)))
+    compiled = compile_protos(root, [name for name in files if name.endswith(_PROTO)])
+    paths = {file.name: (root if file.name in files else WELL_KNOWN) / file.name for file in compiled.file}
+    sources = ProtoSources(compiled.file, paths)
+    findings = _same_name_findings([file for file in compiled.file if file.name in files], sources)
+    options = {}
+    for name in files:
+        if name.endswith(_OPTIONS):
+            options[name[: -len(_OPTIONS)] + _PROTO], complaints = read_options(root / name)
+            findings += complaints
+    if findings:
+        raise TableError(findings)
+    return ProtoSchema(root, files, compiled, sources, options)
+
+
+def _read_folder(root: Path, blame: SourceSpan) -> dict[str, bytes]:
+    """The bytes of all `.proto` and `.options` files by name relative to `root`, sorted. Raises TableError."""
+    if not root.is_dir():
+        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {shown_path(root)}")])
+    found = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.suffix in (_PROTO, _OPTIONS)}
+    if not any(name.endswith(_PROTO) for name in found):
+        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")])
+    files = {}
+    findings = []
+    for name, path in sorted(found.items()):
+        try:
+            files[name] = path.read_bytes()
+        except OSError as error:
+            message = f"cannot be read: {error.strerror}"
+            findings.append(Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message))
+    if findings:
+        raise TableError(findings)
+    return files
+
+
+def _sha256(files: Mapping[str, bytes]) -> str:
+    digest = hashlib.sha256()
+    for name, content in files.items():
+        digest.update(f"{name}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def _same_name_findings(files: Sequence[FileDescriptorProto], sources: ProtoSources) -> list[Diagnostic]:
+    """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
+    findings = []
+    first: dict[str, str] = {}
+    for file in files:
+        for message in file.message_type:
+            name = f"{file.package}.{message.name}" if file.package else message.name
+            if message.name not in first:
+                first[message.name] = name
+                continue
+            other = sources.span(first[message.name])
+            hint = f"the other is at {other.file}:{other.line}; names must differ even in different packages"
+            text = f"there are two messages '{message.name}'"
+            findings.append(Diagnostic(sources.span(name), Code.DUPLICATE_MESSAGE, text, hint))
+    return findings
+
+
+def find_envelope(schema: ProtoSchema, settings: EnvelopeSettings) -> Envelope:
+    """The message and the oneof that the table names, the message by full or short name.
+
+    Raises TableError: a name that does not exist, a member of the oneof that is no message.
+    """
+    wanted = settings.message
+    named = [name for name in schema.messages if wanted.value in (name, name.rpartition(".")[2])]
+    name = wanted.value if wanted.value in named else next(iter(named), None)
+    if name is None:
+        hint = did_you_mean(wanted.value, schema.messages)
+        message = f"no .proto file declares a message '{wanted.value}'"
+        raise TableError([Diagnostic(wanted.span, Code.BAD_VALUE, message, hint)])
+    descriptor = schema.descriptor(name)
+    oneof = descriptor.oneofs_by_name.get(settings.oneof.value)
+    if oneof is None:
+        hint = did_you_mean(settings.oneof.value, descriptor.oneofs_by_name)
+        message = f"{name} has no oneof '{settings.oneof.value}'"
+        raise TableError([Diagnostic(settings.oneof.span, Code.BAD_VALUE, message, hint)])
+    if scalars := [field for field in oneof.fields if field.message_type is None]:
+        raise TableError([_scalar_finding(schema, field) for field in scalars])
+    cases = {field.name: _payload_case(schema, field) for field in oneof.fields}
+    return Envelope(name, oneof.name, schema.message_class(name), cases, _envelope_size(schema, oneof))
+
+
+def _scalar_finding(schema: ProtoSchema, field: FieldDescriptor) -> Diagnostic:
+    span = schema.span(field.containing_type.full_name, field.name)
+    message = f"'{field.name}' is a payload case and must be a message"
+    return Diagnostic(span, Code.BAD_PROTO, message, "wrap the value in a message of its own")
+
+
+def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:
+    name = field.message_type.full_name
+    try:
+        size = largest_encoding(field.message_type, schema.board_options)
+    except UnboundedError:
+        size = None
+    return PayloadCase(field.name, field.number, schema.messages[name], schema.message_class(name), size)
+
+
+def _envelope_size(schema: ProtoSchema, oneof: OneofDescriptor) -> int:
+    """The largest encoding over the cases that have one, with whatever else the envelope holds beside them."""
+    sizes = [0]
+    for field in oneof.fields:
+        try:
+            sizes.append(field_size(field, schema.board_options))
+        except UnboundedError:
+            continue  # the case is reported where a board shall take it
+    beside = 0
+    for field in oneof.containing_type.fields:
+        if field.containing_oneof != oneof:
+            beside += field_size(field, schema.board_options)
+    return max(sizes) + beside
