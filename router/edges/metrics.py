@@ -1,0 +1,100 @@
+"""Prometheus: reads the books' integers when it is asked, and serves them over HTTP.
+
+Counting happens elsewhere, in plain lists; nothing here is called per datagram.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate
+
+from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+from prometheus_client.metrics_core import InfoMetricFamily
+from prometheus_client.metrics_core import Metric as Family
+from prometheus_client.registry import Collector
+from prometheus_client.samples import Sample
+
+from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, METRICS, Books, Metric
+from router.compiler.books import metric as metric_named
+from router.edges.port_holder import port_holder
+from router.errors import SourceSpan, StartError
+from router.table.model import Address
+
+PREFIX = "router_"
+
+_BUCKETS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
+
+
+class BooksCollector(Collector):
+    """All series of the books, each from its first scrape on, at 0 while nothing has happened.
+
+    `counts` has the list of each thread that counts: a counter is their sum, a gauge the latest of them.
+    `kernel_drops` is asked by listener at each scrape. `build` has the labels of `router_build_info`.
+    """
+
+    def __init__(
+        self,
+        books: Books,
+        counts: Sequence[list[int]],
+        kernel_drops: Mapping[str, Callable[[], int]],
+        build: Mapping[str, str],
+    ) -> None:
+        self._counts = counts
+        self._kernel_drops = kernel_drops
+        self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
+        self._slots: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
+        for series, slot in books.series():
+            if series.part == 0:
+                labels = dict(zip(metric_named(series.metric).labels, series.labels, strict=True))
+                self._slots[series.metric].append((labels, slot))
+
+    def collect(self) -> Iterator[Family]:
+        threads = [counts.copy() for counts in self._counts]  # at one instant each: copying holds the interpreter lock
+        for metric in METRICS:
+            family = Family(PREFIX + metric.name, metric.help, metric.kind)
+            family.samples = list(self._samples(metric, threads))
+            yield family
+        yield self._build
+
+    def _samples(self, metric: Metric, threads: Sequence[list[int]]) -> Iterator[Sample]:
+        name = PREFIX + metric.name
+        for labels, slot in self._slots[metric.name]:
+            if metric.kind == "histogram":
+                yield from _histogram(name, labels, [thread[slot : slot + HISTOGRAM_SLOTS] for thread in threads])
+            elif metric.kind == "gauge":
+                yield Sample(name, labels, max(thread[slot] for thread in threads) / 1e9)
+            elif metric.name == "kernel_drops":
+                yield Sample(f"{name}_total", labels, self._kernel_drops[labels["listener"]]())
+            else:
+                yield Sample(f"{name}_total", labels, sum(thread[slot] for thread in threads))
+
+
+def _histogram(name: str, labels: dict[str, str], threads: Iterable[list[int]]) -> Iterator[Sample]:
+    *parts, sum_ns = map(sum, zip(*threads, strict=True))
+    cumulative = list(accumulate(parts))
+    for bound, count in zip(_BUCKETS, cumulative, strict=True):
+        yield Sample(f"{name}_bucket", {**labels, "le": bound}, count)
+    yield Sample(f"{name}_count", labels, cumulative[-1])
+    yield Sample(f"{name}_sum", labels, sum_ns / 1e9)
+
+
+class MetricsServer:
+    """Serves the collector's metrics and those of the process at `address` until closed."""
+
+    def __init__(self, address: Address, span: SourceSpan, collector: Collector) -> None:
+        registry = CollectorRegistry()
+        registry.register(collector)
+        ProcessCollector(registry=registry)
+        try:
+            self._server, self._thread = start_http_server(address.port, address.host, registry)
+        except OSError as error:
+            holder = f": {port_holder('tcp', address.port)} has the port" if error.errno == errno.EADDRINUSE else ""
+            what = f"metrics cannot be served at {address}: {error.strerror}{holder}"
+            raise StartError(f"{span}: {what}; choose another metrics.address") from error
+        self.address = Address(address.host, self._server.server_port)
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

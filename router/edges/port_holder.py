@@ -1,0 +1,44 @@
+"""Says which process holds a port, as far as /proc shows it; only for the text of an error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+_LISTENING = {"udp": "07", "tcp": "0A"}
+"""The state of a socket that waits for anybody, as /proc/net writes it."""
+
+
+def port_holder(protocol: str, port: int) -> str:
+    """`python (pid 4711)`, or "another process" where /proc does not tell. `protocol` is udp or tcp."""
+    wanted = {f"socket:[{inode}]" for inode in _inodes(protocol, port)}
+    for process in Path("/proc").glob("[0-9]*"):
+        if not wanted.isdisjoint(_open_files(process)):
+            return f"{_name(process)} (pid {process.name})"
+    return "another process"
+
+
+def _inodes(protocol: str, port: int) -> Iterator[str]:
+    for table in (Path("/proc/net", protocol), Path("/proc/net", f"{protocol}6")):
+        if not table.exists():
+            continue
+        for line in table.read_text().splitlines()[1:]:
+            columns = line.split()
+            local, state, inode = columns[1], columns[3], columns[9]
+            if state == _LISTENING[protocol] and int(local.rpartition(":")[2], 16) == port:
+                yield inode
+
+
+def _open_files(process: Path) -> Iterator[str]:
+    try:
+        for descriptor in (process / "fd").iterdir():
+            yield str(descriptor.readlink())
+    except OSError:  # somebody else's process, or one that has just ended
+        return
+
+
+def _name(process: Path) -> str:
+    try:
+        return (process / "comm").read_text().strip()
+    except OSError:
+        return "a process"

@@ -1,0 +1,138 @@
+"""UDP sockets: listeners that own their port and tell what the kernel dropped, senders that lose nothing to old errors.
+
+Knows no envelope, route or counter; what a datagram means is the engine's business.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+from collections.abc import Callable
+
+from router.compiler.program import ListenerPlan, SenderPlan
+from router.edges.log import logger
+from router.edges.port_holder import port_holder
+from router.errors import SourceSpan, StartError
+from router.table.model import Address
+
+# Linux values that the socket module does not name.
+SO_RCVBUFFORCE = 33
+SO_MEMINFO = 55
+_MEMINFO = struct.Struct("9I")
+_MEMINFO_DROPS = 8
+
+
+class Listener:
+    """A bound socket. Opening raises StartError, which says where in the table and what to do."""
+
+    def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
+        self.name = plan.name
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
+            self.socket.bind(plan.address)
+            _ask_for_receive_buffer(self.socket, plan)
+        except OSError as error:
+            self.socket.close()
+            raise StartError(f"{span}: {_why_not_bound(plan, error)}") from error
+        self.address = Address(*self.socket.getsockname())
+        self._drops_at_close = 0
+
+    def kernel_drops(self) -> int:
+        """Datagrams that the kernel threw away before anybody received them, since the socket was opened."""
+        if self.socket.fileno() < 0:
+            return self._drops_at_close
+        words = _MEMINFO.unpack(self.socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
+        return int(words[_MEMINFO_DROPS])
+
+    def end_input(self) -> None:
+        """Lets nothing new in. What has arrived can still be received; after it comes the end, peer None.
+
+        A socket that is connected to itself takes nothing from others, so that a flood cannot keep the
+        receiver busy for ever; shutting down then wakes a receiver that waits.
+        """
+        host, port = self.address
+        self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
+        self.socket.shutdown(socket.SHUT_RD)
+
+    def close(self) -> None:
+        self._drops_at_close = self.kernel_drops()
+        self.socket.close()
+
+
+def _ask_for_receive_buffer(opened: socket.socket, plan: ListenerPlan) -> None:
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, plan.receive_buffer)
+    # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
+    if (granted := opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2) >= plan.receive_buffer:
+        return
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, plan.receive_buffer)
+    except PermissionError:
+        logger.warning(
+            "receive buffer is smaller than the table asks for: bursts may be dropped by the kernel",
+            listener=plan.name,
+            asked=plan.receive_buffer,
+            granted=granted,
+            remedy=f"sysctl -w net.core.rmem_max={plan.receive_buffer}",
+        )
+
+
+def _why_not_bound(plan: ListenerPlan, error: OSError) -> str:
+    what = f"listener '{plan.name}' cannot use {plan.address}"
+    if error.errno == errno.EADDRINUSE:
+        return f"{what}: {port_holder('udp', plan.address.port)} has the port; stop it, or choose another port"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return f"{what}: no network interface of this computer has that address; 0.0.0.0 listens on all of them"
+    if error.errno == errno.EACCES:
+        return f"{what}: ports below 1024 need a privilege; choose a higher port, or grant CAP_NET_BIND_SERVICE"
+    return f"{what}: {error.strerror}"
+
+
+class Sender:
+    """A non-blocking socket, connected to one destination. Opening raises StartError.
+
+    A destination that no network leads to yet (the router may start before the link is up) is warned
+    about and tried again with every datagram.
+    """
+
+    def __init__(self, plan: SenderPlan, span: SourceSpan) -> None:
+        self.endpoint = plan.endpoint
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        try:
+            self.socket.connect(plan.address)
+        except OSError as error:
+            if error.errno != errno.ENETUNREACH:
+                self.socket.close()
+                what = f"cannot send to endpoint '{plan.endpoint}' at {plan.address}"
+                raise StartError(f"{span}: {what}: {error.strerror}") from error
+            logger.warning("no network leads to this endpoint yet", endpoint=plan.endpoint, address=str(plan.address))
+        self.send = _careful_send(self.socket, plan.address)
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+def _careful_send(connected: socket.socket, address: Address) -> Callable[[bytes], int]:
+    """`send(data)` returns the bytes sent, or raises OSError: then exactly one datagram is lost.
+
+    "Connection refused" is news about an earlier datagram, which was taken for sent. The kernel gives it
+    instead of sending this one, so this one is sent now, and the error still raised: it stands for the
+    loss of the earlier one. So one is counted as lost for one that is, and the books balance.
+    """
+    send = connected.send
+
+    def careful_send(data: bytes) -> int:
+        try:
+            return send(data)
+        except ConnectionRefusedError:
+            send(data)
+            raise
+        except OSError as error:
+            if error.errno != errno.EDESTADDRREQ:
+                raise
+            connected.connect(address)  # there was no network when the router started
+            return send(data)
+
+    return careful_send

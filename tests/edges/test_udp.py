@@ -1,0 +1,224 @@
+"""Listeners, senders and the receive thread on real sockets of the loopback interface."""
+
+from __future__ import annotations
+
+import os
+import queue
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from router.compiler.program import ListenerPlan, SenderPlan
+from router.edges.receiver import ReceiveThread
+from router.edges.udp import Listener, Sender
+from router.errors import SourceSpan, StartError
+from router.table.model import Address, Framing
+
+SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
+LIMIT = 1000
+Received = "queue.SimpleQueue[tuple[str, bytes, tuple[str, int]]]"
+
+
+def plan(name: str = "rover", host: str = "127.0.0.1", port: int = 0, receive_buffer: int = 65536) -> ListenerPlan:
+    return ListenerPlan(name, Address(host, port), Framing.EXACT, receive_buffer)
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as opened:
+        yield opened
+
+
+@pytest.fixture
+def peer(stack: ExitStack) -> socket.socket:
+    """A board: bound, and patient for 5 s."""
+    board = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    board.bind(("127.0.0.1", 0))
+    board.settimeout(5)
+    return board
+
+
+def listen(stack: ExitStack, name: str = "rover") -> Listener:
+    return stack.enter_context(closing(Listener(plan(name), SPAN)))
+
+
+class Receiving:
+    """A receive thread over some listeners that puts what it gets into a queue."""
+
+    def __init__(self, listeners: list[Listener]) -> None:
+        self.got: queue.SimpleQueue[tuple[str, bytes, tuple[str, int]]] = queue.SimpleQueue()
+        self.failures: queue.SimpleQueue[Exception] = queue.SimpleQueue()
+        receive = {listener.name: self._into_queue(listener.name) for listener in listeners}
+        self.thread = ReceiveThread(listeners, receive, LIMIT, self.failures.put)
+
+    def _into_queue(self, name: str) -> Callable[[bytes, tuple[str, int]], None]:
+        def receive(data: bytes, peer: tuple[str, int]) -> None:
+            if data == b"bug":
+                raise LookupError("a bug")
+            self.got.put((name, data, peer))
+
+        return receive
+
+    def all_received(self) -> list[bytes]:
+        return [self.got.get_nowait()[1] for _ in range(self.got.qsize())]
+
+
+@pytest.fixture(params=[1, 3], ids=["one listener", "three listeners"])
+def several(request: pytest.FixtureRequest, stack: ExitStack) -> list[Listener]:
+    return [listen(stack, f"listener_{number}") for number in range(request.param)]
+
+
+def test_each_datagram_arrives_with_its_listener_and_peer(several: list[Listener], peer: socket.socket) -> None:
+    receiving = Receiving(several)
+    receiving.thread.start()
+    for listener in several:
+        peer.sendto(listener.name.encode(), listener.address)
+    arrived = {receiving.got.get(timeout=5) for _ in several}
+    receiving.thread.stop()
+    assert arrived == {(listener.name, listener.name.encode(), peer.getsockname()) for listener in several}
+
+
+def test_stop_handles_what_has_arrived_and_ends(several: list[Listener], peer: socket.socket) -> None:
+    receiving = Receiving(several)
+    sent = [b"%d" % number for number in range(20)]
+    for data in sent:
+        peer.sendto(data, several[-1].address)
+    receiving.thread.start()
+    receiving.thread.stop()
+    assert receiving.all_received() == sent
+
+
+def test_nothing_new_gets_in_after_the_end_of_input(stack: ExitStack, peer: socket.socket) -> None:
+    listener = listen(stack)
+    peer.sendto(b"before", listener.address)
+    listener.end_input()
+    peer.sendto(b"after", listener.address)
+    received = listener.socket.recvfrom(LIMIT)
+    assert (received, listener.socket.recvfrom(LIMIT)) == ((b"before", peer.getsockname()), (b"", None))
+
+
+def test_a_listener_on_all_interfaces_ends_too(stack: ExitStack) -> None:
+    listener = stack.enter_context(closing(Listener(plan(host="0.0.0.0"), SPAN)))
+    receiving = Receiving([listener])
+    receiving.thread.start()
+    receiving.thread.stop()
+    assert receiving.all_received() == []
+
+
+@pytest.mark.parametrize("length", [0, 1, LIMIT, LIMIT + 1, 60000])
+def test_a_datagram_arrives_with_its_true_length(several: list[Listener], peer: socket.socket, length: int) -> None:
+    receiving = Receiving(several)
+    receiving.thread.start()
+    sent = bytes(index % 251 for index in range(length))
+    peer.sendto(sent, several[0].address)
+    _, data, _ = receiving.got.get(timeout=5)
+    receiving.thread.stop()
+    assert (len(data), data[:LIMIT]) == (length, sent[:LIMIT])
+
+
+def test_a_fault_is_handed_over_and_receiving_goes_on(several: list[Listener], peer: socket.socket) -> None:
+    receiving = Receiving(several)
+    receiving.thread.start()
+    peer.sendto(b"bug", several[0].address)
+    peer.sendto(b"fine", several[0].address)
+    assert receiving.got.get(timeout=5)[1] == b"fine"
+    receiving.thread.stop()
+    assert isinstance(receiving.failures.get_nowait(), LookupError)
+
+
+def test_datagrams_that_the_kernel_drops_are_known(stack: ExitStack, peer: socket.socket) -> None:
+    listener = stack.enter_context(closing(Listener(plan(receive_buffer=4096), SPAN)))
+    assert listener.kernel_drops() == 0
+    for _ in range(500):
+        peer.sendto(b"x" * 100, listener.address)
+    listener.socket.setblocking(False)
+    received = _drain(listener.socket)
+    assert listener.kernel_drops() == 500 - received > 0
+    listener.close()
+    assert listener.kernel_drops() == 500 - received
+
+
+def _drain(nonblocking: socket.socket) -> int:
+    count = 0
+    try:
+        while nonblocking.recv(LIMIT):
+            count += 1
+    except BlockingIOError:
+        return count
+    raise AssertionError("a datagram was empty")
+
+
+def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
+    taken = listen(stack).address
+    with pytest.raises(StartError) as refused:
+        Listener(plan(port=taken.port), SPAN)
+    name = Path("/proc/self/comm").read_text().strip()
+    assert str(refused.value) == (
+        f"routes/rover.yaml:12:20: listener 'rover' cannot use {taken}: "
+        f"{name} (pid {os.getpid()}) has the port; stop it, or choose another port"
+    )
+
+
+def test_an_address_of_another_computer_is_refused() -> None:
+    with pytest.raises(StartError, match=r"rover.yaml:12:20: .*192\.0\.2\.77.*no network interface of this computer"):
+        Listener(plan(host="192.0.2.77"), SPAN)
+
+
+def test_a_receive_buffer_is_as_large_as_asked_or_warned_about(stack: ExitStack) -> None:
+    asked = 8 * int(Path("/proc/sys/net/core/rmem_max").read_text())
+    with capture_logs() as logged:
+        listener = stack.enter_context(closing(Listener(plan(receive_buffer=asked), SPAN)))
+    granted = listener.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    assert (granted < asked) == any(f"net.core.rmem_max={asked}" in entry.get("remedy", "") for entry in logged)
+
+
+def send_to(stack: ExitStack, address: Address) -> Sender:
+    return stack.enter_context(closing(Sender(SenderPlan("basestation", address), SPAN)))
+
+
+def test_a_sender_sends_bytes_unchanged(stack: ExitStack, peer: socket.socket) -> None:
+    sender = send_to(stack, Address(*peer.getsockname()))
+    assert sender.send(b"\x0a\x00\x00") == 3
+    assert peer.recv(LIMIT) == b"\x0a\x00\x00"
+
+
+def test_news_of_an_old_loss_does_not_cost_a_healthy_datagram(stack: ExitStack) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
+        absent.bind(("127.0.0.1", 0))
+        address = Address(*absent.getsockname())
+    sender = send_to(stack, address)
+    sender.send(b"lost")  # nobody listens, and the kernel is told so
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as late:
+        late.bind(address)
+        late.settimeout(5)
+        with pytest.raises(ConnectionRefusedError):
+            sender.send(b"arrives")
+        assert sender.send(b"arrives too") == 11
+        assert [late.recv(LIMIT), late.recv(LIMIT)] == [b"arrives", b"arrives too"]
+
+
+def test_losses_are_counted_one_for_one(stack: ExitStack) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
+        absent.bind(("127.0.0.1", 0))
+        sender = send_to(stack, Address(*absent.getsockname()))
+    outcomes = []
+    for _ in range(10):
+        try:
+            outcomes.append(sender.send(b"lost"))
+        except ConnectionRefusedError:
+            outcomes.append(0)
+    assert outcomes == [4] + 9 * [0]  # the loss of the tenth would be told by an eleventh
+
+
+def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, peer: socket.socket) -> None:
+    with pytest.raises(OSError, match="too long"):
+        send_to(stack, Address(*peer.getsockname())).send(bytes(70000))
+
+
+def test_a_broadcast_destination_is_refused_at_the_start() -> None:
+    with pytest.raises(StartError, match=r"rover.yaml:12:20: cannot send .* 'basestation' at 255.255.255.255:9"):
+        Sender(SenderPlan("basestation", Address("255.255.255.255", 9)), SPAN)
