@@ -18,10 +18,14 @@ class Bool:
 
 @dataclass(frozen=True, slots=True)
 class Int:
-    """A two's complement integer of 8, 16, 32 or 64 bits."""
+    """A two's complement integer of 8, 16, 32 or 64 bits.
+
+    `octet` marks ROS's `byte`: a uint8 in every respect but how rclpy spells its type.
+    """
 
     bits: int
     signed: bool
+    octet: bool = field(default=False, compare=False)
 
     @property
     def low(self) -> int:
