@@ -1,0 +1,34 @@
+# `make help` says what there is. Everything needs `make setup`, and starts it.
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+# To use an interpreter or an installed ROS other than those found: make setup PYTHON=python3.12 ROS=/opt/ros/jazzy
+export PYTHON ROS
+
+# Says what must be sourced; nothing at all unless ROS comes from outside .venv.
+ENV := . .venv/env.sh &&
+
+.PHONY: help setup test demo validate lint clean
+
+help:  ## this list
+	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+
+setup:  ## build .venv with the router, ROS 2 Jazzy and the comms interfaces; what is up to date stays
+	@deploy/setup.sh
+
+test: setup  ## run the tests; TESTS=tests/wire for some of them
+	@$(ENV) .venv/bin/python -m pytest $(TESTS)
+
+demo: setup  ## simulator and router on real ROS for 15 seconds, with live rates
+	@$(ENV) .venv/bin/python -m demo
+
+validate: setup  ## say what is wrong with the tables in routes/
+	@$(ENV) .venv/bin/router validate routes/
+
+lint: setup  ## ruff and mypy
+	@.venv/bin/ruff check
+	@$(ENV) .venv/bin/mypy
+
+clean:  ## remove .venv and what tools left behind
+	rm -rf .venv build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,181 @@
+#!/usr/bin/env bash
+# Builds .venv: the router, ROS 2 Jazzy and the interfaces of schemas/comms. `make setup` calls it.
+#
+#   PYTHON=...  the interpreter to use, 3.10 to 3.13; found without it
+#   ROS=...     an installed Jazzy (/opt/ros/jazzy) to use instead of the wheels; a sourced one is found without it
+#
+# Each step leaves the checksum of what it was made from in .venv/.made and is repeated when that changes.
+# Both choices are remembered there. Details of each step are in .venv/setup.log.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+root=$PWD
+venv=$root/.venv
+python=$venv/bin/python
+made=$venv/.made
+log=$venv/setup.log
+
+die() {
+  printf 'setup: %s\n' "$@" >&2
+  exit 1
+}
+
+checksum() {  # of standard input
+  sha256sum | cut -d' ' -f1
+}
+
+is_made() {  # STEP CHECKSUM
+  [ -f "$made/$1" ] && [ "$(cat "$made/$1")" = "$2" ]
+}
+
+step() {  # STEP CHECKSUM TITLE COMMAND...: unless it is made; one line for the person, the rest for the log
+  local name=$1 sum=$2 title=$3 started=$SECONDS
+  shift 3
+  ! is_made "$name" "$sum" || return 0
+  printf 'setup: %s ... ' "$title"
+  if ! "$@" >>"$log" 2>&1; then
+    printf 'failed\n'
+    tail -n 30 "$log" >&2
+    die "$title failed; the whole output is in ${log#"$root"/}"
+  fi
+  printf '%s s\n' $((SECONDS - started))
+  printf '%s\n' "$sum" >"$made/$name"
+}
+
+find_sourced_ros() {
+  local prefix prefixes
+  [ "${ROS_DISTRO:-}" = jazzy ] || return 0
+  IFS=: read -ra prefixes <<<"${AMENT_PREFIX_PATH:-}"
+  for prefix in "${prefixes[@]}"; do
+    if [ -d "$prefix/share/rclpy" ]; then
+      printf '%s' "$prefix"
+      return
+    fi
+  done
+}
+
+is_supported() {  # PYTHON
+  "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null
+}
+
+missing_for() {  # PYTHON: the Debian packages without which it cannot build the environment
+  "$1" - <<'END'
+import importlib.util, pathlib, sys, sysconfig
+name = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+if importlib.util.find_spec("venv") is None or importlib.util.find_spec("ensurepip") is None:
+    print(f"{name}-venv")
+if not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists():
+    print(f"{name}-dev")
+END
+}
+
+find_python() {  # prints the first supported interpreter that has all it needs, else the first supported one
+  local candidate candidates first='' library
+  candidates=(python3 python3.13 python3.12 python3.11 python3.10)
+  if [ -n "$ros" ]; then  # rclpy there works with one interpreter only
+    candidates=()
+    for library in "$ros"/lib/python3.*; do candidates+=("$(basename "$library")"); done
+  fi
+  if [ -n "${PYTHON:-}" ]; then candidates=("$PYTHON"); fi
+  for candidate in "${candidates[@]}"; do
+    is_supported "$candidate" || continue
+    if [ -z "$(missing_for "$candidate")" ]; then
+      printf '%s' "$candidate"
+      return
+    fi
+    first=${first:-$candidate}
+  done
+  printf '%s' "$first"
+}
+
+check_tools() {
+  local missing=()
+  command -v cmake >/dev/null || missing+=(cmake)
+  command -v "${CC:-cc}" >/dev/null || missing+=(gcc)
+  command -v "${CXX:-c++}" >/dev/null || missing+=(g++)
+  if [ -n "$base" ]; then
+    mapfile -t -O "${#missing[@]}" missing < <(missing_for "$base")
+  elif [ -n "${PYTHON:-}" ]; then
+    die "PYTHON=$PYTHON is no Python 3.10 to 3.13"
+  else
+    missing+=(python3 python3-venv python3-dev)
+  fi
+  if [ -n "$ros" ] && [ ! -d "$ros/share/rosidl_default_generators" ]; then
+    missing+=(ros-jazzy-rosidl-default-generators)
+  fi
+  [ ${#missing[@]} -eq 0 ] || die "this machine lacks something; on Debian or Ubuntu:" "  apt-get install ${missing[*]}"
+}
+
+make_environment() {
+  "$base" -m venv ${ros:+--system-site-packages} "$venv"
+  # What has to be sourced before .venv/bin/router: nothing, unless ROS comes from elsewhere.
+  if [ -n "$ros" ]; then
+    printf '. "%s/setup.sh"\n. "%s/share/comms/local_setup.sh"\n' "$ros" "$venv" >"$venv/env.sh"
+  else
+    printf '# Nothing to set: the wheels find their libraries themselves.\n' >"$venv/env.sh"
+  fi
+  printf '%s' "$ros" >"$made/ros"
+}
+
+install_packages() {
+  local extras=ros,dev constraints=$root/constraints.txt
+  if [ -n "$ros" ]; then
+    extras=dev
+    # The distribution's rclpy is built for the distribution's numpy.
+    constraints=$made/constraints.txt
+    grep -v '^numpy==' "$root/constraints.txt" >"$constraints"
+  fi
+  # The variable, unlike pip's option, also holds for what pip fetches to build this package.
+  PIP_CONSTRAINT=$constraints PIP_DISABLE_PIP_VERSION_CHECK=1 \
+    "$python" -m pip install --no-input --editable "$root[$extras]"
+}
+
+build_comms() (
+  build=$venv/build/comms
+  if [ -n "$ros" ]; then
+    set +u  # ROS's script reads variables that nobody set
+    # shellcheck disable=SC1091
+    . "$ros/setup.bash"
+    set -u
+  else
+    libraries=$(printf ':%s' "$venv"/lib/python3.*/site-packages/ros_*.libs)
+    export AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv LD_LIBRARY_PATH=$venv/lib$libraries
+  fi
+  cmake -S schemas/comms -B "$build" -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX="$venv" \
+    -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF
+  cmake --build "$build" --parallel "$(nproc)"
+  # A message that is no more leaves nothing behind.
+  if [ -f "$build/install_manifest.txt" ]; then xargs -d '\n' rm -f <"$build/install_manifest.txt"; fi
+  cmake --install "$build"
+)
+
+is_usable() {  # the environment: made here, its interpreter still there, and the one asked for
+  local identity='import sys; print(sys.base_prefix, sys.version)'
+  is_made environment "$environment" && "$python" -c '' 2>/dev/null || return 1
+  [ -z "${PYTHON:-}" ] || [ "$("$PYTHON" -c "$identity")" = "$("$python" -c "$identity")" ]
+}
+
+# One at a time: the lock is this file itself, and ends with the process.
+exec 9<"${BASH_SOURCE[0]}"
+flock 9
+
+remembered=$(cat "$made/ros" 2>/dev/null || find_sourced_ros)
+ros=${ROS:-$remembered}
+environment=$(printf '%s\n' "$root" "$ros" | checksum)
+packages=$(cat pyproject.toml constraints.txt | checksum)
+# The pins of what the generated code is compiled against belong to it as much as the messages.
+comms=$({ find schemas/comms -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
+
+if is_usable && is_made packages "$packages" && is_made comms "$comms"; then
+  echo "setup: .venv is up to date"
+  exit
+fi
+if ! is_usable; then
+  base=$(find_python)
+  check_tools
+  rm -rf "$venv"
+  mkdir -p "$made"
+  step environment "$environment" "environment with $("$base" --version)" make_environment
+fi
+step packages "$packages" "packages${ros:+, with ROS from $ros}" install_packages
+step comms "$comms" "ROS interfaces of schemas/comms" build_comms

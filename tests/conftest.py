@@ -1,0 +1,15 @@
+"""What holds for every test: a ROS domain of this run alone that never leaves the machine."""
+
+from __future__ import annotations
+
+import os
+
+from hypothesis import settings
+
+# Before anything imports rclpy. Domains above 101 would use ports that the kernel gives to others.
+os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+# No deadline: how long an example takes says more about the machine than about the code.
+settings.register_profile("router", deadline=None)
+settings.load_profile("router")
