@@ -1,0 +1,148 @@
+"""The ROS edge against real rclpy, with the subscriber in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from rclpy.serialization import serialize_message
+from std_msgs.msg import String
+from structlog.testing import capture_logs
+
+from router.compiler.program import PublisherPlan, QosPlan
+from router.edges.ros import RosEdge
+from router.errors import SourceSpan, StartError
+from router.table.model import NodeSettings
+
+RELIABLE = QosPlan("reliable", "volatile", "keep_last", 10)
+SPAN = SourceSpan("routes/rover.yaml", 40, 16, 24)
+HELLO = bytes(serialize_message(String(data="hello, rover...")))  # 24 bytes: DDS pads to a multiple of four
+
+
+def string_topic(qos: QosPlan = RELIABLE, topic: str = "greeting") -> PublisherPlan:
+    return PublisherPlan(topic, "std_msgs/msg/String", qos, (("data", "string"),))
+
+
+def open_ros(*plans: PublisherPlan, args: tuple[str, ...] = ()) -> RosEdge:
+    return RosEdge(NodeSettings("router_test", "/"), plans, {plan.topic: SPAN for plan in plans}, args)
+
+
+@pytest.fixture(autouse=True)
+def own_domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(100 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+class Peer:
+    """A subscriber in another process; `lines` are what it has printed, one per message."""
+
+    def __init__(self, *arguments: str) -> None:
+        command = [sys.executable, str(Path(__file__).with_name("ros_peer.py")), *arguments]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def line(self) -> str:
+        assert self.process.stdout
+        return self.process.stdout.readline().strip()
+
+    def close(self) -> None:
+        self.process.communicate(timeout=20)
+        assert self.process.returncode == 0
+
+
+@pytest.fixture
+def subscribe() -> Iterator[Callable[..., Peer]]:
+    with ExitStack() as peers:
+        yield lambda *arguments: peers.enter_context(closing(Peer(*arguments)))
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = monotonic() + 20
+    while not condition():
+        assert monotonic() < deadline, "never happened"
+        sleep(0.01)
+
+
+def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: Callable[..., Peer]) -> None:
+    with closing(open_ros(string_topic())) as ros:
+        wanted = ros.wanted["greeting"]
+        assert wanted == [False]
+        peer = subscribe("greeting", "std_msgs/msg/String")
+        wait_until(lambda: wanted[0])
+        assert peer.line() == "matched"
+        ros.publish["greeting"](HELLO)
+        assert bytes.fromhex(peer.line()) == HELLO
+        peer.close()
+        wait_until(lambda: not wanted[0])
+
+
+def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..., Peer]) -> None:
+    with closing(open_ros(string_topic(QosPlan("reliable", "transient_local", "keep_last", 1)))) as ros:
+        assert ros.wanted["greeting"] == [True]
+        ros.publish["greeting"](HELLO)
+        peer = subscribe("greeting", "std_msgs/msg/String", "--transient-local")
+        assert {peer.line(), peer.line()} == {"matched", HELLO.hex()}
+        assert ros.wanted["greeting"] == [True]
+
+
+def test_a_subscriber_with_incompatible_qos_is_warned_about(subscribe: Callable[..., Peer]) -> None:
+    with capture_logs() as logged, closing(open_ros(string_topic(QosPlan("best_effort", "volatile", "keep_last", 5)))):
+        subscribe("greeting", "std_msgs/msg/String")
+        wait_until(lambda: bool(logged))
+    assert logged[0]["topic"] == "greeting"
+    assert logged[0]["policy"] == "RELIABILITY"
+    assert logged[0]["log_level"] == "warning"
+
+
+def test_ros_arguments_rename_topics(subscribe: Callable[..., Peer]) -> None:
+    with closing(open_ros(string_topic(), args=("--ros-args", "-r", "greeting:=salute"))) as ros:
+        peer = subscribe("salute", "std_msgs/msg/String")
+        wait_until(lambda: ros.wanted["greeting"][0])
+        assert peer.line() == "matched"
+
+
+def test_every_qos_that_a_table_can_name_opens() -> None:
+    second = 1_000_000_000
+    full = QosPlan("best_effort", "transient_local", "keep_all", 1, second, second, "manual_by_topic", second)
+    defaults = QosPlan("system_default", "system_default", "system_default", 3)
+    with closing(open_ros(string_topic(full, "one"), string_topic(defaults, "two"))) as ros:
+        assert set(ros.publish) == {"one", "two"}
+
+
+def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
+    stale = PublisherPlan("greeting", "std_msgs/msg/String", RELIABLE, (("data", "string"), ("more", "uint8")))
+    with pytest.raises(StartError) as refused:
+        open_ros(stale)
+    assert str(refused.value) == (
+        "routes/rover.yaml:40:16: std_msgs/msg/String as installed is not what the table was compiled for; "
+        "run 'make setup', or install the ROS package 'std_msgs'\n"
+        "  installed: string data\n"
+        "  compiled:  string data, uint8 more"
+    )
+
+
+@pytest.mark.parametrize("type_name", ["no_such_msgs/msg/String", "std_msgs/msg/NoSuch"])
+def test_a_type_that_is_not_installed_is_refused(type_name: str) -> None:
+    missing = PublisherPlan("greeting", type_name, RELIABLE, ())
+    with pytest.raises(StartError, match=rf"rover.yaml:40:16: {type_name} is not installed .* run 'make setup'"):
+        open_ros(missing)
+
+
+def test_bad_ros_arguments_are_refused() -> None:
+    with pytest.raises(StartError, match="ROS node cannot be created"):
+        open_ros(string_topic(), args=("--ros-args", "-r", "not a rule"))
+
+
+def test_an_impossible_name_is_refused_and_nothing_stays_open() -> None:
+    with pytest.raises(StartError, match=r"rover.yaml:40:16: topic '2bad' cannot be published"):
+        open_ros(string_topic(), string_topic(topic="2bad"))
+    with closing(open_ros(string_topic())) as ros:
+        ros.publish["greeting"](HELLO)
