@@ -1,0 +1,39 @@
+"""What the user wrote: YAML text to RouteTable, with every finding of text and shape.
+
+Knows neither protobuf nor ROS: whether a name means something is the compiler's business.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from router.errors import Diagnostic, TableError
+from router.table.build import build_table
+from router.table.extends import load_chain
+from router.table.model import RouteTable
+from router.table.shape import check_shape
+from router.table.source import Source
+
+
+def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[RouteTable | None, list[Diagnostic]]:
+    """The table at `path` and what is wrong with it, in the order of the file.
+
+    The table is None only when nothing usable could be built (unreadable, bad YAML, no envelope); else
+    it holds what is sound, and `broken` names what was left out. `environ` None means os.environ.
+    """
+    sources: list[Source] = []
+    findings: list[Diagnostic] = []
+    table = None
+    try:
+        root = load_chain(path, os.environ if environ is None else environ, sources, findings)
+        table = build_table(check_shape(root, findings), sources, findings)
+    except TableError as error:
+        findings.extend(error.diagnostics)
+    return table, in_order(findings)
+
+
+def in_order(findings: list[Diagnostic]) -> list[Diagnostic]:
+    """Each finding once (aliases repeat them), by its place."""
+    return sorted(dict.fromkeys(findings), key=lambda found: (found.span, found.code.value, found.message))

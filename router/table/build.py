@@ -1,0 +1,166 @@
+"""Nodes that have their shape to the typed route table; what has a finding is left out and named in `broken`.
+
+Knows the schema's shape and relies on it. Routes are built in `build_routes`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from router.errors import Code, Diagnostic, SourceSpan
+from router.table.address import BadAddressError, parse_address
+from router.table.build_routes import build_route
+from router.table.model import (
+    Address,
+    Endpoint,
+    EndpointKind,
+    EnvelopeSettings,
+    Framing,
+    Listener,
+    Located,
+    NodeSettings,
+    RouteTable,
+)
+from router.table.nodes import Entry, MappingNode, is_sound
+from router.table.reading import UnsoundError, boolean, integer, mapping, optional_text, text, text_or
+from router.table.source import Source
+from router.table.units import parse_size
+
+T = TypeVar("T")
+
+DEFAULT_NODE = NodeSettings("rover_router", "/")
+DEFAULT_RECEIVE_BUFFER = 4 << 20
+
+
+def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Diagnostic]) -> RouteTable | None:
+    """The table of everything sound; None where the envelope or the routes as a whole are not.
+
+    What only the values themselves can tell, such as a size beyond what the kernel takes, is added to
+    `findings`.
+    """
+    builder = _Builder(findings)
+    envelope = builder.one(root, "envelope", _envelope)
+    routes = root.entries.get("routes")
+    endpoints = root.entries.get("endpoints")
+    if envelope is None or not _is_group(routes) or not (endpoints is None or _is_group(endpoints)) or routes is None:
+        return None
+    return RouteTable(
+        path=sources[0].path,
+        files=tuple(source.path for source in sources),
+        sha256=hashlib.sha256(b"".join(source.data for source in sources)).hexdigest(),
+        envelope=envelope,
+        node=builder.one(root, "node", _node) or DEFAULT_NODE,
+        metrics=builder.one(root, "metrics", _metrics),
+        listeners=builder.each(root, "listen", _listener),
+        endpoints=builder.each(root, "endpoints", _endpoint),
+        routes=tuple(builder.each(root, "routes", build_route).values()),
+        routes_span=routes.key.span,
+        broken=frozenset(builder.broken),
+    )
+
+
+class _Builder:
+    """Builds parts and remembers which could not be built."""
+
+    def __init__(self, findings: list[Diagnostic]) -> None:
+        self._findings = findings
+        self.broken: set[str] = set()
+
+    def one(self, root: MappingNode, name: str, build: Callable[[Entry], T]) -> T | None:
+        """The part under a key of the root; None when it is absent or broken."""
+        entry = root.entries.get(name)
+        return self._built(name, entry, build) if entry else None
+
+    def each(self, root: MappingNode, name: str, build: Callable[[Entry], T]) -> Mapping[str, T]:
+        """The parts by name under a key of the root."""
+        group = root.entries.get(name)
+        if group is None:
+            return {}
+        if not isinstance(group.value, MappingNode):
+            self.broken.add(name)
+            return {}
+        built = {key: self._built(f"{name}/{key}", entry, build) for key, entry in group.value.entries.items()}
+        return {key: part for key, part in built.items() if part is not None}
+
+    def _built(self, name: str, entry: Entry, build: Callable[[Entry], T]) -> T | None:
+        try:
+            if is_sound(entry.key) and is_sound(entry.value):
+                return build(entry)
+        except UnsoundError as error:
+            self._findings.append(error.diagnostic)
+        self.broken.add(name)
+        return None
+
+
+def _is_group(entry: Entry | None) -> bool:
+    return entry is not None and isinstance(entry.value, MappingNode)
+
+
+def _envelope(entry: Entry) -> EnvelopeSettings:
+    settings = mapping(entry.value)
+    protos = text(settings, "protos")
+    folder = Path(protos.span.file).absolute().parent / protos.value
+    return EnvelopeSettings(Located(folder, protos.span), text(settings, "message"), text(settings, "oneof"))
+
+
+def _node(entry: Entry) -> NodeSettings:
+    settings = mapping(entry.value)
+    return NodeSettings(
+        text_or(settings, "name", DEFAULT_NODE.name), text_or(settings, "namespace", DEFAULT_NODE.namespace)
+    )
+
+
+def _metrics(entry: Entry) -> Located[Address]:
+    return _local_address(mapping(entry.value))
+
+
+def _listener(entry: Entry) -> Listener:
+    settings = mapping(entry.value)
+    size = optional_text(settings, "receive_buffer")
+    return Listener(
+        name=entry.key.text,
+        span=entry.key.span,
+        address=_local_address(settings),
+        framing=Framing(text_or(settings, "framing", Framing.ZERO_TRIMMED.value)),
+        receive_buffer=UnsoundError.guard(parse_size, text(settings, "receive_buffer"))
+        if size
+        else DEFAULT_RECEIVE_BUFFER,
+    )
+
+
+def _endpoint(entry: Entry) -> Endpoint:
+    settings = mapping(entry.value)
+    address = _address(settings)
+    first = int(address.value.host.partition(".")[0])
+    if first == 0 or first >= 224:
+        raise _bad_address(address.span, f"{address.value.host} is not the address of one machine")
+    return Endpoint(
+        name=entry.key.text,
+        span=entry.key.span,
+        address=address,
+        kind=EndpointKind(text(settings, "kind").value),
+        source_port=integer(settings, "source_port"),
+        trim_trailing_zeros=boolean(settings, "trim_trailing_zeros"),
+    )
+
+
+def _local_address(settings: MappingNode) -> Located[Address]:
+    address = _address(settings)
+    if int(address.value.host.partition(".")[0]) >= 224:
+        raise _bad_address(address.span, f"{address.value.host} is not an address that this machine can have")
+    return address
+
+
+def _address(settings: MappingNode) -> Located[Address]:
+    written = text(settings, "address")
+    try:
+        return Located(parse_address(written.value), written.span)
+    except BadAddressError as error:
+        raise _bad_address(written.span, error.what, error.hint) from error
+
+
+def _bad_address(span: SourceSpan, what: str, hint: str = "broadcast and multicast are not supported") -> UnsoundError:
+    return UnsoundError(Diagnostic(span, Code.BAD_ADDRESS, what, hint))

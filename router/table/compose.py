@@ -1,0 +1,181 @@
+"""YAML text to nodes: PyYAML's parser events, composed without recursion and with bounds.
+
+Knows YAML, no key of a route table. What the text leaves no sense in is raised as TableError; what is
+merely wrong becomes a finding, and its node is marked broken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import yaml
+
+from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
+from router.table.scalars import resolve, surprise
+from router.table.source import Source, unusable_character
+from router.table.variables import fill, has_variables
+from router.table.yaml_errors import explain
+
+MAX_DEPTH = 32
+MAX_NODES = 20_000
+
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's where this PyYAML was built with it
+
+
+@dataclass(slots=True)
+class _Collection:
+    """A mapping or sequence that is not closed yet. A mapping's children are key, value, key, value."""
+
+    event: yaml.CollectionStartEvent
+    span: SourceSpan
+    broken: bool
+    children: list[Node] = field(default_factory=list)
+    size: int = 1
+
+    @property
+    def expects_key(self) -> bool:
+        return isinstance(self.event, yaml.MappingStartEvent) and len(self.children) % 2 == 0
+
+
+def compose(source: Source, environ: Mapping[str, str], findings: list[Diagnostic]) -> Node:
+    """The one document of the text. Findings that leave a tree are appended to `findings`."""
+    return _Composer(source, environ, findings).compose()
+
+
+class _Composer:
+    def __init__(self, source: Source, environ: Mapping[str, str], findings: list[Diagnostic]) -> None:
+        self._source = source
+        self._environ = environ
+        self._findings = findings
+        self._open: list[_Collection] = []
+        self._anchors: dict[str, tuple[Node, int]] = {}
+        self._root: Node | None = None
+
+    def compose(self) -> Node:
+        for event in self._events():
+            if isinstance(event, yaml.ScalarEvent):
+                self._add(self._scalar(event), 1, event.anchor)
+            elif isinstance(event, yaml.CollectionStartEvent):
+                self._begin(event)
+            elif isinstance(event, yaml.CollectionEndEvent):
+                closed = self._open.pop()
+                self._add(self._closed(closed), closed.size, closed.event.anchor)
+            elif isinstance(event, yaml.AliasEvent):
+                self._alias(event)
+            elif isinstance(event, yaml.DocumentStartEvent) and self._root is not None:
+                raise self._fatal(self._span(event), "a second document begins here", "a table is one document")
+        if self._root is None or (isinstance(self._root, ScalarNode) and not self._root.text):
+            raise self._fatal(SourceSpan(self._source.file), "the file holds no table", "begin with 'version: 1'")
+        return self._root
+
+    def _events(self) -> Iterator[yaml.Event]:
+        try:
+            yield from yaml.parse(self._source.text, Loader=LOADER)
+        except yaml.MarkedYAMLError as error:
+            raise TableError([explain(error, self._source)]) from error
+        except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
+            raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
+
+    def _begin(self, event: yaml.CollectionStartEvent) -> None:
+        span = self._span(event)
+        if len(self._open) == MAX_DEPTH:
+            raise self._fatal(span, f"this is nested more than {MAX_DEPTH} deep", "")
+        if event.anchor is not None:
+            self._anchors.pop(event.anchor, None)
+        self._open.append(_Collection(event, span, self._has_tag(event, span)))
+
+    def _alias(self, event: yaml.AliasEvent) -> None:
+        if event.anchor not in self._anchors:
+            recursive = any(collection.event.anchor == event.anchor for collection in self._open)
+            what = f"the alias '*{event.anchor}' " + ("stands inside what it repeats" if recursive else "has no anchor")
+            raise self._fatal(self._span(event), what, "")
+        node, size = self._anchors[event.anchor]
+        self._add(node, size, None)
+
+    def _add(self, node: Node, size: int, anchor: str | None) -> None:
+        if anchor is not None:
+            self._anchors[anchor] = node, size
+        if not self._open:
+            self._root = node
+            return
+        parent = self._open[-1]
+        parent.children.append(node)
+        parent.size += size
+        if parent.size > MAX_NODES:
+            raise self._fatal(node.span, f"the table has more than {MAX_NODES} values, aliases written out", "")
+
+    def _scalar(self, event: yaml.ScalarEvent) -> ScalarNode:
+        span = self._span(event)
+        column = self._text_column(event, span)
+        broken = self._has_tag(event, span)
+        text = event.value
+        if has_variables(text):
+            text, problems = fill(text, self._environ)
+            for problem in problems:
+                place = SourceSpan(span.file, span.line, column, column) if column else span
+                place = place.part(problem.start, problem.end) if column else span
+                self._findings.append(Diagnostic(place, problem.code, problem.message, problem.hint))
+            broken |= bool(problems)
+            column = None
+        if unusable := unusable_character(text):
+            broken |= self._report(span, f"the text holds the character {unusable[1]}", "")
+        if event.style or broken:
+            return ScalarNode(span, text, text, column, broken)
+        if meaning := surprise(text):
+            what = f"'{text}' is {meaning} to some YAML readers and something else to others"
+            broken = self._report(span, what, f'put quotes around it if the text is meant: "{text}"', ambiguous=True)
+        return ScalarNode(span, text, resolve(text), column, broken)
+
+    def _text_column(self, event: yaml.ScalarEvent, span: SourceSpan) -> int | None:
+        """Where the text begins in its line if the file has it there word for word."""
+        line, first, end_line, last = _marks(event)
+        if event.style in ("'", '"'):
+            first, last = first + 1, last - 1
+        verbatim = line == end_line and self._source.lines[line][first:last] == event.value
+        return first + 1 if verbatim else None
+
+    def _closed(self, collection: _Collection) -> Node:
+        if isinstance(collection.event, yaml.SequenceStartEvent):
+            return SequenceNode(collection.span, tuple(collection.children), collection.broken)
+        entries: dict[str, Entry] = {}
+        broken = collection.broken
+        for key, value in zip(collection.children[::2], collection.children[1::2], strict=True):
+            if not isinstance(key, ScalarNode):
+                broken = self._report(key.span, "a key must be a word, not a mapping or a sequence", "")
+            elif key.text == "<<" and key.value == "<<":
+                broken = self._report(key.span, "merge keys ('<<') have no place in a table", "write the keys out")
+            elif key.text in entries:
+                first = entries[key.text].key.span
+                what = f"the key '{key.text}' is already in this mapping, at line {first.line}"
+                self._findings.append(Diagnostic(key.span, Code.DUPLICATE_KEY, what, "remove one of the two"))
+            else:
+                entries[key.text] = Entry(key, value)
+        return MappingNode(collection.span, entries, broken)
+
+    def _has_tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent, span: SourceSpan) -> bool:
+        if event.tag is None:
+            return False
+        name = event.tag.replace("tag:yaml.org,2002:", "!!")
+        return self._report(span, f"the tag '{name}' has no place in a table", "remove it; quotes make a value text")
+
+    def _report(self, span: SourceSpan, what: str, hint: str, *, ambiguous: bool = False) -> bool:
+        """Add a finding; True, because what has one is broken."""
+        code = Code.AMBIGUOUS_SCALAR if ambiguous else Code.BAD_YAML
+        self._findings.append(Diagnostic(span, code, what, hint))
+        return True
+
+    def _span(self, event: yaml.Event) -> SourceSpan:
+        return self._source.span(*_marks(event))
+
+    def _fatal(self, span: SourceSpan, what: str, hint: str) -> TableError:
+        return TableError([Diagnostic(span, Code.BAD_YAML, what, hint)])
+
+
+def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
+    """Line and column of the first character and of the one after the last, from 0."""
+    start, end = event.start_mark, event.end_mark
+    if start is None or end is None:
+        raise TypeError("the parser sets marks on every event")
+    return start.line, start.column, end.line, end.column

@@ -1,0 +1,98 @@
+"""`extends`: the chain of files that a table is made of, merged into one tree.
+
+Knows one key, `extends`. Mappings merge key by key, everything else replaces; every node keeps the span
+of the file in which it was written.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from router.errors import Code, Diagnostic, TableError, shown_path
+from router.table.compose import compose
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode
+from router.table.source import Source, read_source
+
+KEY = "extends"
+
+
+def load_chain(
+    path: Path, environ: Mapping[str, str], sources: list[Source], findings: list[Diagnostic]
+) -> MappingNode:
+    """The table at `path` with everything that it extends.
+
+    Appends every file read to `sources`, the table first, and what is wrong to `findings`. Raises
+    TableError for what leaves no tree.
+    """
+    layers: list[MappingNode] = []
+    seen: list[str] = []
+    reference: ScalarNode | None = None
+    while True:
+        seen.append(os.path.realpath(path))
+        source = read_source(path) if reference is None else _read_base(path, reference)
+        sources.append(source)
+        layers.append(_root_mapping(compose(source, environ, findings)))
+        reference = _reference(layers[-1])
+        if reference is None:
+            break
+        path = path.parent / reference.text
+        _refuse_cycle(path, seen, reference)
+    merged = layers.pop()
+    while layers:
+        merged = merge(merged, layers.pop())
+    return merged
+
+
+def merge(base: MappingNode, over: MappingNode) -> MappingNode:
+    """`over` laid upon `base`."""
+    entries = dict(base.entries)
+    for key, entry in over.entries.items():
+        below = entries[key].value if key in entries else None
+        if isinstance(below, MappingNode) and isinstance(entry.value, MappingNode):
+            entries[key] = Entry(entry.key, merge(below, entry.value))
+        else:
+            entries[key] = entry
+    return replace(over, entries=entries, broken=base.broken or over.broken)
+
+
+def _root_mapping(root: Node) -> MappingNode:
+    if isinstance(root, MappingNode):
+        return root
+    what = "a route table is a mapping of keys such as 'version', 'listen' and 'routes'"
+    raise TableError([Diagnostic(root.span, Code.WRONG_TYPE, what)])
+
+
+def _reference(root: MappingNode) -> ScalarNode | None:
+    entry = root.entries.get(KEY)
+    if entry is None:
+        return None
+    node = entry.value
+    if node.broken:
+        raise TableError([])  # its own finding is in the list already
+    if not isinstance(node, ScalarNode) or not isinstance(node.value, str) or not node.text:
+        span = node.span if isinstance(node, ScalarNode) and node.text else entry.key.span
+        raise TableError([Diagnostic(span, Code.WRONG_TYPE, f"'{KEY}' must be the path of another table")])
+    return node
+
+
+def _read_base(path: Path, reference: ScalarNode) -> Source:
+    """The file that a table extends; that there is none is the fault of the line that names it."""
+    try:
+        return read_source(path)
+    except TableError as error:
+        found = error.diagnostics[0]
+        if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
+            raise  # the file is there, a place in it is wrong
+        what = f"'{reference.text}' cannot be extended: {found.message}"
+        hint = f"paths are relative to this file; looked for {shown_path(path)}"
+        raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what, hint)]) from error
+
+
+def _refuse_cycle(path: Path, seen: list[str], reference: ScalarNode) -> None:
+    if (real := os.path.realpath(path)) in seen:
+        names = " -> ".join(shown_path(Path(step)) for step in (*seen[seen.index(real) :], real))
+        what = f"'{reference.text}' extends itself: {names}"
+        raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what)])

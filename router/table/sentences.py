@@ -1,0 +1,156 @@
+"""One jsonschema error as one finding: the code, the place to blame, a sentence in a human's words.
+
+The schema carries the words: `errorMessage` ("must be ...", which editors show as well) beside the keyword.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.table.address import BadAddressError, parse_address
+from router.table.nodes import MappingNode, Node, Path, ScalarNode, key_at, node_at
+
+if TYPE_CHECKING:
+    from jsonschema import ValidationError
+
+_TYPES = {
+    "object": "a mapping",
+    "array": "a list",
+    "string": "text",
+    "integer": "a whole number",
+    "number": "a number",
+    "boolean": "true or false",
+}
+_LONGEST = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """What of jsonschema's error is used: `value` at `path` fails `keyword: limit` of `schema`.
+
+    With `about_name` the value is the name of the last key of the path.
+    """
+
+    path: Path
+    keyword: str
+    limit: Any
+    value: object
+    schema: Mapping[str, Any]
+    message: str
+    about_name: bool
+
+    @classmethod
+    def of(cls, error: ValidationError) -> Misfit:
+        about_name = "propertyNames" in error.absolute_schema_path
+        path: Path = tuple(error.absolute_path)
+        if about_name:
+            path = (*path, str(error.instance))
+        schema = error.schema if isinstance(error.schema, Mapping) else {}
+        return cls(path, str(error.validator), error.validator_value, error.instance, schema, error.message, about_name)
+
+
+def finding(misfit: Misfit, tree: Node) -> Diagnostic:
+    """The finding for anything but an unknown key of a closed mapping."""
+    path, keyword = misfit.path, misfit.keyword
+    key = key_at(tree, path)
+    subject = _subject(path)
+    if misfit.about_name:
+        what = f"the name '{_clipped(str(misfit.value))}' {_expected(misfit)}"
+        return Diagnostic(key.span if key else _first_line(tree), Code.BAD_VALUE, what)
+    span = _blamed(tree, path)
+    if keyword == "required":
+        return _missing_key(misfit, tree)
+    if keyword == "not":
+        return Diagnostic(key.span if key else span, Code.UNKNOWN_KEY, f"{subject} {_expected(misfit)}")
+    if keyword == "type":
+        return Diagnostic(span, Code.WRONG_TYPE, f"{subject} {_expected(misfit)}, not {shown(misfit.value)}")
+    if keyword == "pattern" and path[-1:] == ("address",):
+        return _bad_address(str(misfit.value), span)
+    if keyword == "uniqueItems":
+        return _repeated(misfit, tree)
+    code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
+    hint = did_you_mean(str(misfit.value), misfit.limit) if keyword == "enum" else ""
+    if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
+        return Diagnostic(span, code, f"{subject} must not be empty")
+    return Diagnostic(span, code, f"{subject} {_expected(misfit)}, not {shown(misfit.value)}", hint)
+
+
+def shown(value: object) -> str:
+    """How a sentence speaks of a value."""
+    if value is None:
+        return "empty"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (int, float)):
+        return f"the number {_clipped(str(value))}"
+    if isinstance(value, str):
+        return f"the text '{_clipped(value)}'"
+    return "a mapping" if isinstance(value, dict) else "a list"
+
+
+def _expected(misfit: Misfit) -> str:
+    schema, limit = misfit.schema, misfit.limit
+    if "errorMessage" in schema:
+        return str(schema["errorMessage"])
+    if misfit.keyword == "type":
+        return "must be " + " or ".join(_TYPES[name] for name in ([limit] if isinstance(limit, str) else limit))
+    if misfit.keyword == "enum":
+        return "must be one of " + ", ".join(f"'{word}'" for word in limit)
+    if misfit.keyword in ("minimum", "maximum"):
+        return f"must be from {schema['minimum']} to {schema['maximum']}"
+    return f"must be {limit}"
+
+
+def _missing_key(misfit: Misfit, tree: Node) -> Diagnostic:
+    name = misfit.message.split("'")[1]  # jsonschema has one error for each key and names it nowhere else
+    owner = _subject(misfit.path)
+    key = key_at(tree, misfit.path)
+    span = key.span if key else _first_line(node_at(tree, misfit.path))
+    hint = "or say 'ignore: why'" if name == "source" else ""
+    return Diagnostic(span, Code.MISSING_KEY, f"{owner} lacks the key '{name}'", hint)
+
+
+def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
+    try:
+        parse_address(text)
+    except BadAddressError as error:
+        return Diagnostic(span, Code.BAD_ADDRESS, error.what, error.hint)
+    raise AssertionError(f"the schema refuses the address '{text}', parse_address takes it")
+
+
+def _repeated(misfit: Misfit, tree: Node) -> Diagnostic:
+    items = misfit.value if isinstance(misfit.value, list) else []
+    index = next(index for index, item in enumerate(items) if item in items[:index])
+    what = f"{shown(items[index])} stands in {_subject(misfit.path)} twice"
+    return Diagnostic(node_at(tree, (*misfit.path, index)).span, Code.BAD_VALUE, what)
+
+
+def _blamed(tree: Node, path: Path) -> SourceSpan:
+    """The value if it is a word on a line, else the key that it stands under."""
+    node = node_at(tree, path)
+    key = key_at(tree, path)
+    if key is None or (isinstance(node, ScalarNode) and node.span.end_column > node.span.column):
+        return _first_line(node)
+    return key.span
+
+
+def _first_line(node: Node) -> SourceSpan:
+    """A collection's first key or item stands for it."""
+    if isinstance(node, MappingNode) and node.entries:
+        return next(iter(node.entries.values())).key.span
+    return node.span
+
+
+def _subject(path: Path) -> str:
+    """How a sentence names what stands at a path."""
+    names = [step for step in path if isinstance(step, str)]
+    if not names:
+        return "the table"
+    return f"'{names[-1]}'" if isinstance(path[-1], str) else f"an item of '{names[-1]}'"
+
+
+def _clipped(text: str) -> str:
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."

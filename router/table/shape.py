@@ -1,0 +1,105 @@
+"""The shape of a table: the JSON Schema decides, its findings are told in words.
+
+Knows schemas/route-table.schema.json, no meaning of a key. A misspelt key is one mistake: it is reported
+and then read as the key that was meant, so that nothing is found missing on its account.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from router.assets import asset
+from router.errors import Code, Diagnostic, did_you_mean, nearest
+from router.table.nodes import Entry, MappingNode, Node, Path, key_at, node_at, rewritten, to_data
+from router.table.sentences import Misfit, finding
+
+if TYPE_CHECKING:
+    from jsonschema.protocols import Validator
+
+SCHEMA = "schemas/route-table.schema.json"
+
+
+@functools.lru_cache(maxsize=1)
+def table_schema() -> dict[str, Any]:
+    """The schema as data, for whoever documents keys."""
+    schema: dict[str, Any] = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))
+    return schema
+
+
+def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
+    """The tree with misspelt keys put right and everything that has a finding marked broken."""
+    tree: Node = root
+    misfits = _misfits(tree)
+    while unknown := [misfit for misfit in misfits if misfit.keyword == "additionalProperties"]:
+        repairs = {}
+        for misfit in unknown:
+            known = list(misfit.schema["properties"])
+            findings.extend(_unknown_keys(node_at(tree, misfit.path), misfit.path, known))
+            repairs[misfit.path] = functools.partial(_with_known_keys, known=known)
+        tree = rewritten(tree, repairs)
+        misfits = _misfits(tree)
+    findings.extend(finding(misfit, tree) for misfit in misfits if not _is_broken(tree, misfit.path))
+    tree = rewritten(tree, {misfit.path: _as_broken for misfit in misfits})
+    if not isinstance(tree, MappingNode):
+        raise TypeError("a table's root stays a mapping")
+    return tree
+
+
+@functools.lru_cache(maxsize=1)
+def _validator() -> Validator:
+    from jsonschema import Draft7Validator, validators  # takes as long to import as everything else of `validate`
+
+    with_exact_end: type[Validator] = validators.extend(Draft7Validator, {"pattern": _pattern})  # type: ignore[no-untyped-call]
+    return with_exact_end(table_schema())
+
+
+def _pattern(validator: Validator, pattern: str, instance: object, schema: object) -> Iterator[Exception]:
+    """JSON Schema's `$` is the very end of the text; Python's would let a line end follow."""
+    from jsonschema import ValidationError
+
+    exact = pattern[:-1] + r"\Z" if pattern.endswith("$") else pattern
+    if isinstance(instance, str) and not re.search(exact, instance):
+        yield ValidationError(f"{instance!r} does not match {pattern!r}")
+
+
+def _misfits(tree: Node) -> list[Misfit]:
+    data: Any = to_data(tree)
+    return [Misfit.of(error) for error in _validator().iter_errors(data)]
+
+
+def _as_broken(node: Node) -> Node:
+    return replace(node, broken=True)
+
+
+def _is_broken(tree: Node, path: Path) -> bool:
+    key = key_at(tree, path)
+    return node_at(tree, path).broken or (key is not None and key.broken)
+
+
+def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnostic]:
+    if not isinstance(node, MappingNode):
+        raise TypeError("only a mapping has keys")
+    place = f"'{path[-1]}'" if path and isinstance(path[-1], str) else "this mapping" if path else "a route table"
+    for name, entry in node.entries.items():
+        if name not in known and not entry.key.broken:
+            hint = did_you_mean(name, [key for key in known if key not in node.entries])
+            yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{place} has no key '{name}'", hint)
+
+
+def _with_known_keys(node: Node, known: list[str]) -> Node:
+    if not isinstance(node, MappingNode):
+        raise TypeError("only a mapping has keys")
+    entries: dict[str, Entry] = {}
+    broken = node.broken
+    for name, entry in node.entries.items():
+        meant = name if name in known else nearest(name, [key for key in known if key not in node.entries])
+        if meant is None or (meant != name and meant in entries):
+            broken = True  # what the key was to say is lost
+        else:
+            entries[meant] = entry
+    return replace(node, entries=entries, broken=broken)

@@ -1,0 +1,79 @@
+"""The text of one table file: read, bounded, decoded, free of characters that no editor shows.
+
+Knows no YAML syntax. What cannot be read at all is raised as TableError, one finding each.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
+
+MAX_BYTES = 4 << 20
+_LINE_END = re.compile(r"\r\n|\r|\n")
+_UNUSABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u2028\u2029\ufeff\ud800-\udfff\ufffe\uffff]")
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """`file` is how findings name it; `text` has no byte order mark; `lines` are without their ends."""
+
+    path: Path
+    file: str
+    data: bytes
+    text: str
+    lines: tuple[str, ...]
+
+    def span(self, line: int, column: int, end_line: int, end_column: int) -> SourceSpan:
+        """A span from YAML's marks, which count from 0; several lines are blamed on the first."""
+        if end_line != line:
+            end_column = len(self.lines[line]) if line < len(self.lines) else column
+        return SourceSpan(self.file, line + 1, column + 1, max(end_column, column) + 1)
+
+
+def read_source(path: Path) -> Source:
+    """The file's text. Raises TableError when there is none to be had."""
+    file = shown_path(path)
+    data = _read(path, file)
+    try:
+        text = data.decode("utf-8").removeprefix("\ufeff")
+    except UnicodeDecodeError as error:
+        before = _LINE_END.split(data[: error.start].decode("utf-8"))
+        span = SourceSpan(file, len(before), len(before[-1]) + 1, len(before[-1]) + 2)
+        what = f"the byte 0x{data[error.start]:02x} is not UTF-8"
+        raise TableError([Diagnostic(span, Code.BAD_FILE, what, "save the file as UTF-8")]) from error
+    source = Source(path, file, data, text, tuple(_LINE_END.split(text)))
+    if unusable := unusable_character(text):
+        offset, name = unusable
+        line = len(_LINE_END.split(text[:offset])) - 1
+        column = offset - max(text.rfind("\n", 0, offset), text.rfind("\r", 0, offset)) - 1
+        what = f"the character {name} has no place in a table"
+        raise TableError([Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, what)])
+    return source
+
+
+def unusable_character(text: str) -> tuple[int, str] | None:
+    """Where a control character, a foreign line end or half a surrogate pair is, and its name; None without."""
+    match = _UNUSABLE.search(text)
+    return (match.start(), f"U+{ord(match[0]):04X}") if match else None
+
+
+def _read(path: Path, file: str) -> bytes:
+    try:
+        if path.is_dir():
+            what = "this is a folder, not a route table"
+        elif path.exists() and not path.is_file():
+            what = "this is no ordinary file"
+        else:
+            with path.open("rb") as stream:
+                data = stream.read(MAX_BYTES + 1)
+            if len(data) <= MAX_BYTES:
+                return data
+            what = f"the file is larger than {MAX_BYTES >> 20} MiB"
+    except OSError as error:
+        what = f"the file cannot be read: {(error.strerror or str(error)).lower()}"
+    except ValueError as error:  # a path that no file system takes: NUL, half a surrogate pair
+        what = f"the file cannot be read: {error}"
+    raise TableError([Diagnostic(SourceSpan(file), Code.BAD_FILE, what)])

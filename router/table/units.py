@@ -1,0 +1,57 @@
+"""Numbers with units: durations, sizes, rates. Exact: what does not come to a whole base unit is refused.
+
+Knows text only. Everything raises ValueError with a sentence that says what is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+
+_QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,9}))? ?([A-Za-z]+)")
+_NANOSECONDS = {
+    "ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "min": 60 * 10**9, "h": 3600 * 10**9,
+}  # fmt: skip
+_BYTES = {"B": 1, "kB": 1000, "KiB": 1 << 10, "MB": 10**6, "MiB": 1 << 20}
+_HERTZ = re.compile(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?Hz")
+
+MAX_DURATION = (1 << 63) - 1
+"""ROS durations are 64-bit nanoseconds."""
+
+MAX_SIZE = (1 << 30) - 1
+"""The largest receive buffer that the kernel takes, which doubles what it is asked for."""
+
+
+def parse_duration(text: str) -> int:
+    """`500ms` as nanoseconds."""
+    return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION)
+
+
+def parse_size(text: str) -> int:
+    """`4MiB` or `64kB` as bytes."""
+    return _exact(text, _BYTES, "bytes", MAX_SIZE)
+
+
+def parse_rate(value: str | float) -> float:
+    """`30 Hz` or a plain number as Hz."""
+    if isinstance(value, str):
+        if not (match := _HERTZ.fullmatch(value)):
+            raise ValueError(f"'{value}' is not a rate such as '30 Hz'")
+        value = float(match[1])
+    if not 0 < value < math.inf:
+        raise ValueError("a rate must be above zero")
+    return float(value)
+
+
+def _exact(text: str, units: Mapping[str, int], base: str, largest: int) -> int:
+    match = _QUANTITY.fullmatch(text)
+    if not match or match[3] not in units:
+        raise ValueError(f"'{text}' is not a number with a unit of {', '.join(units)}")
+    fraction = match[2] or ""
+    amount, rest = divmod(int(match[1] + fraction) * units[match[3]], int("1" + "0" * len(fraction)))
+    if rest:
+        raise ValueError(f"'{text}' is not a whole number of {base}")
+    if not 0 < amount <= largest:
+        raise ValueError(f"'{text}' must be above zero and at most {largest} {base}")
+    return amount

@@ -1,0 +1,91 @@
+"""What PyYAML says about text that is not YAML, in words that say what to do, at the line that has the mistake.
+
+Knows libyaml's sentences; one that is not listed here is passed on as it is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import yaml
+
+from router.errors import Code, Diagnostic
+from router.table.source import Source
+
+
+class _Sentence(NamedTuple):
+    """`at_start` blames the place where the thing that went wrong began, not the place where it was noticed."""
+
+    what: str
+    hint: str = ""
+    at_start: bool = False
+
+
+_SENTENCES = {
+    "did not find expected ',' or ']'": _Sentence(
+        "this '[' is not closed by a ']', or a ',' is missing inside", at_start=True
+    ),
+    "did not find expected ',' or '}'": _Sentence(
+        "this '{' is not closed by a '}', or a ',' is missing inside", at_start=True
+    ),
+    "found unexpected end of stream": _Sentence("this quote is never closed", at_start=True),
+    "found unexpected document indicator": _Sentence("this quote is never closed", at_start=True),
+    "found unknown escape character": _Sentence(
+        "this backslash sequence does not exist", "single quotes take backslashes as they are"
+    ),
+    "mapping values are not allowed in this context": _Sentence(
+        "a ':' cannot stand here", "indent keys of one mapping alike; quote text that has ': ' in it"
+    ),
+    "could not find expected ':'": _Sentence("this line has a key without ':'", at_start=True),
+    "did not find expected key": _Sentence(
+        "no key begins here", "indent keys of one mapping alike; quote text that has special characters in it"
+    ),
+    "did not find expected '-' indicator": _Sentence(
+        "this line does not begin with '-' as its neighbours do", "indent what belongs to the item above"
+    ),
+    "block sequence entries are not allowed in this context": _Sentence(
+        "a '-' cannot begin an item here", "items of a sequence begin on lines of their own"
+    ),
+    "did not find expected node content": _Sentence("a value is missing here"),
+    "did not find expected <document start>": _Sentence(
+        "this line is indented less than the first key", "indent keys of one mapping alike"
+    ),
+    "found incompatible YAML document": _Sentence("this is a YAML version that is not understood", "remove the line"),
+}
+_TAB = _Sentence("a tab indents this line", "indent with spaces")
+
+
+def explain(error: yaml.MarkedYAMLError, source: Source) -> Diagnostic:
+    """The finding for one syntax error."""
+    problem = error.problem or str(error)
+    line = error.problem_mark.line if error.problem_mark else 0
+    column = error.problem_mark.column if error.problem_mark else 0
+    sentence = _SENTENCES.get(problem)
+    character = source.lines[line][column : column + 1] if line < len(source.lines) else ""
+    if character == "\t":
+        sentence = _TAB
+    elif problem == "found character that cannot start any token":
+        sentence = _Sentence(f"a value cannot begin with '{character}'", "put quotes around it")
+    elif problem.startswith("mapping values") and (missing := _key_without_colon(source, line)) is not None:
+        line, sentence = missing, _Sentence("this line has a key without ':'")
+        column = len(source.lines[line]) - len(source.lines[line].lstrip())
+    if sentence is None:
+        sentence = _Sentence(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
+    if sentence.at_start and error.context_mark:
+        line, column = error.context_mark.line, error.context_mark.column
+    return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, sentence.what, sentence.hint)
+
+
+def _key_without_colon(source: Source, line: int) -> int | None:
+    """The line before `line` if it is indented alike and lacks the ':' that makes it a key."""
+    before = line - 1
+    while before >= 0 and not source.lines[before].strip():
+        before -= 1
+    if before < 0 or ":" in source.lines[before] or _indent(source.lines[before]) != _indent(source.lines[line]):
+        return None
+    return before
+
+
+def _indent(text: str) -> int:
+    """How far in the first key of a line stands; the dash of an item counts as indentation."""
+    return len(text) - len(text.lstrip(" -"))
