@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from router.types.model import Bool, Float, Int, List, String, Type
 from router.types.msg_values import is_zero, parse_value
 
-PRIMITIVES = {
+PRIMITIVES: dict[str, Type] = {
     "bool": Bool(),
     "byte": Int(8, signed=False, octet=True),
     "char": Int(8, signed=False),

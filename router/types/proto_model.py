@@ -12,6 +12,7 @@ from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescript
 from google.protobuf.descriptor_pool import DescriptorPool
 
 from router.types.board_options import BoardOptions
+from router.types.descriptors import enum_of, message_of
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.proto_source import ProtoSources
 
@@ -41,10 +42,7 @@ def build_types(
     """All messages and enums of the files, nested ones too, by full name and in declared order."""
     files = [pool.FindFileByName(name) for name in file_names]
     descriptors = [
-        message
-        for file in files
-        for top in file.message_types_by_name.values()
-        for message in _with_nested(top)
+        message for file in files for top in file.message_types_by_name.values() for message in _with_nested(top)
     ]
     declared = [enum for file in files for enum in file.enum_types_by_name.values()]
     declared += [enum for message in descriptors for enum in message.enum_types]
@@ -90,9 +88,9 @@ def _element(
     if field.type in _SCALARS:
         return _SCALARS[field.type]
     if field.type == FieldDescriptor.TYPE_ENUM:
-        return enums[field.enum_type.full_name]
+        return enums[enum_of(field).full_name]
     if field.type == FieldDescriptor.TYPE_STRING:
         return String(options.string_size - 1 if options.string_size is not None else None)
     if field.type == FieldDescriptor.TYPE_BYTES:
         return Bytes(options.max_size)
-    return messages[field.message_type.full_name]
+    return messages[message_of(field).full_name]

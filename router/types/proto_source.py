@@ -70,8 +70,10 @@ class ProtoSources:
         for step in place.parts.get(part, (1,)):
             if (location := self._location(place.file, (*place.path, step))) is not None:
                 return self._texts[place.file].span(location.span)
-        whole = self._location(place.file, place.path)
-        return self._texts[place.file].span(whole.span if whole is not None else (0, 0, 0))
+        path = place.path
+        while (around := self._location(place.file, path)) is None:  # as for the entries of a map, written nowhere
+            path = path[:-2]
+        return self._texts[place.file].span(around.span)
 
     def comment(self, name: str) -> str:
         """The comment above and beside a declaration, as one line; empty where there is none."""

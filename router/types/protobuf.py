@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
-from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
@@ -19,11 +19,14 @@ from google.protobuf.message_factory import GetMessageClass
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, shown_path
 from router.table.model import EnvelopeSettings
 from router.types.board_options import NO_OPTIONS, BoardOptions, OptionsFile, read_options
+from router.types.descriptors import container, message_of
 from router.types.model import Enum, MessageType
 from router.types.proto_model import build_types
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, compile_protos
-from router.types.sizes import UnboundedError, field_size, largest_encoding
+from router.types.sizes import framed_size, largest_beside, largest_encoding
+
+MessageClass = type[Message]
 
 _PROTO = ".proto"
 _OPTIONS = ".options"
@@ -57,7 +60,7 @@ class ProtoSchema:
         names = [file.name for file in compiled.file]
         self.messages, self.enums = build_types(self._pool, names, sources, self.board_options)
 
-    def message_class(self, name: str) -> type[Message]:
+    def message_class(self, name: str) -> MessageClass:
         """The Python class of a message, by full name. Raises KeyError."""
         return GetMessageClass(self.descriptor(name))
 
@@ -65,10 +68,20 @@ class ProtoSchema:
         """By full name. Raises KeyError."""
         return self._pool.FindMessageTypeByName(name)
 
+    def is_reserved(self, name: str, number: int) -> bool:
+        """Whether a message or an enum, by full name, says `reserved` for a number."""
+        if name in self.enums:
+            declared = EnumDescriptorProto()
+            self._pool.FindEnumTypeByName(name).CopyToProto(declared)
+            return any(span.start <= number <= span.end for span in declared.reserved_range)
+        message = DescriptorProto()
+        self.descriptor(name).CopyToProto(message)
+        return any(span.start <= number < span.end for span in message.reserved_range)
+
     def board_options(self, field: FieldDescriptor) -> BoardOptions:
         """What the `.options` file beside the field's `.proto` says about it."""
-        options = self._options.get(field.containing_type.file.name)
-        return options.of(field.containing_type.full_name, field.name) if options is not None else NO_OPTIONS
+        options = self._options.get(container(field).file.name)
+        return options.of(container(field).full_name, field.name) if options is not None else NO_OPTIONS
 
     def span(self, message: str, field: str | None = None) -> SourceSpan:
         """The place of a declaration in its `.proto` file: of a message or enum, of a field or enum value."""
@@ -85,7 +98,7 @@ class PayloadCase:
     name: str
     number: int
     type: MessageType
-    message_class: type[Message]
+    message_class: MessageClass
     max_size: int | None
 
 
@@ -93,12 +106,12 @@ class PayloadCase:
 class Envelope:
     """The message around every payload, by full name.
 
-    `max_size` is its largest encoding in bytes over the bounded cases, nanopb's `PBEnvelope_size`.
+    `max_size` is its largest encoding in bytes over the cases that have one, nanopb's `PBEnvelope_size`.
     """
 
     name: str
     oneof: str
-    message_class: type[Message]
+    message_class: MessageClass
     cases: Mapping[str, PayloadCase]
     max_size: int
 
@@ -190,34 +203,19 @@ def find_envelope(schema: ProtoSchema, settings: EnvelopeSettings) -> Envelope:
     if scalars := [field for field in oneof.fields if field.message_type is None]:
         raise TableError([_scalar_finding(schema, field) for field in scalars])
     cases = {field.name: _payload_case(schema, field) for field in oneof.fields}
-    return Envelope(name, oneof.name, schema.message_class(name), cases, _envelope_size(schema, oneof))
+    # A case without a bound is reported where a board shall take it.
+    bounded = [framed_size(case.number, case.max_size) for case in cases.values() if case.max_size is not None]
+    max_size = max(bounded, default=0) + largest_beside(oneof, schema.board_options)
+    return Envelope(name, oneof.name, schema.message_class(name), cases, max_size)
 
 
 def _scalar_finding(schema: ProtoSchema, field: FieldDescriptor) -> Diagnostic:
-    span = schema.span(field.containing_type.full_name, field.name)
+    span = schema.span(container(field).full_name, field.name)
     message = f"'{field.name}' is a payload case and must be a message"
     return Diagnostic(span, Code.BAD_PROTO, message, "wrap the value in a message of its own")
 
 
 def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:
-    name = field.message_type.full_name
-    try:
-        size = largest_encoding(field.message_type, schema.board_options)
-    except UnboundedError:
-        size = None
-    return PayloadCase(field.name, field.number, schema.messages[name], schema.message_class(name), size)
-
-
-def _envelope_size(schema: ProtoSchema, oneof: OneofDescriptor) -> int:
-    """The largest encoding over the cases that have one, with whatever else the envelope holds beside them."""
-    sizes = [0]
-    for field in oneof.fields:
-        try:
-            sizes.append(field_size(field, schema.board_options))
-        except UnboundedError:
-            continue  # the case is reported where a board shall take it
-    beside = 0
-    for field in oneof.containing_type.fields:
-        if field.containing_oneof != oneof:
-            beside += field_size(field, schema.board_options)
-    return max(sizes) + beside
+    message = message_of(field)
+    size = largest_encoding(message, schema.board_options)
+    return PayloadCase(field.name, field.number, schema.messages[message.full_name], GetMessageClass(message), size)

@@ -24,7 +24,8 @@ WELL_KNOWN = Path(grpc_tools.__file__).parent / "_proto"
 _EVERYTHING = "router_every_proto_of_the_folder.proto"
 _IMPORT_FAILED = re.compile(r'Import "(?P<name>.*)" was not found or had errors\.')
 _NUMBER_TAKEN = re.compile(
-    r"Field number \d+ has already been used|uses reserved number|Field name \S+ is reserved|uses the same enum value as"
+    r"Field number \d+ has already been used|uses reserved number|Field name \S+ is reserved"
+    r"|uses the same enum value as"
 )
 _TYPE_TAKEN = re.compile(r'^"[\w.]+" is already defined')
 

@@ -65,7 +65,8 @@ class RosInterfaces:
 
     def _nested(self, name: str, span: SourceSpan, inside: tuple[str, ...]) -> MessageType:
         if name in inside:
-            raise TableError([Diagnostic(span, Code.BAD_FILE, f"{name} contains itself: {' > '.join([*inside, name])}")])
+            chain = " > ".join([*inside[inside.index(name) :], name])
+            raise TableError([Diagnostic(span, Code.BAD_FILE, f"{name} contains itself: {chain}")])
         nested = self._get(name, inside)
         if nested is None:
             message = f"there is no ROS message type '{name}'"
@@ -97,4 +98,6 @@ def _spelled(type_: Type) -> str:
         return "octet" if type_.octet else str(type_)
     if isinstance(type_, String):
         return ("wstring" if type_.wide else "string") + (f"<{type_.bound}>" if type_.bound is not None else "")
+    if not isinstance(type_, MessageType):
+        raise TypeError(f"ROS has no type {type_}")
     return type_.name.replace("/msg/", "/")

@@ -72,7 +72,8 @@ def _read(path: Path, package: str) -> FoundDefinition:
         span = SourceSpan(shown_path(path), error.line, error.column, error.end_column)
         raise TableError([Diagnostic(span, Code.BAD_FILE, error.message)]) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"cannot be read: {error}")]) from None
+        finding = Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"cannot be read: {error}")
+        raise TableError([finding]) from None
 
 
 class RosbagsDefinitions:

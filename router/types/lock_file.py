@@ -1,0 +1,176 @@
+"""The lock file: every field number that was ever given out, and what it was given to.
+
+Reads, writes and builds it; what may follow from a difference is `lock`'s business.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
+from router.types.descriptors import declared_type
+from router.types.protobuf import Envelope, ProtoSchema
+
+LOCK_NAME = "envelope.lock.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A field's or enum value's number and name; `type` as `descriptors.declared_type`, empty for enum values."""
+
+    number: int
+    name: str
+    type: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Declaration:
+    """A message or an enum: the file that declares it, relative to the folder of the protos, and its members."""
+
+    file: str
+    entries: tuple[Entry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Lock:
+    """`max_size` is the envelope's largest encoding in bytes, which the boards were flashed with."""
+
+    message: str
+    oneof: str
+    max_size: int
+    messages: Mapping[str, Declaration]
+    enums: Mapping[str, Declaration]
+
+
+def current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
+    """What the lock would be for the `.proto` files as they are."""
+    messages = {}
+    for name in schema.messages:
+        if (file := schema.sources.file(name)) in schema.files:
+            fields = schema.descriptor(name).fields
+            entries = tuple(Entry(field.number, field.name, declared_type(field)) for field in fields)
+            messages[name] = Declaration(file, entries)
+    enums = {}
+    for name, declared in schema.enums.items():
+        if (file := schema.sources.file(name)) in schema.files:
+            enums[name] = Declaration(file, tuple(Entry(number, value) for value, number in declared.values))
+    return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
+
+
+def read_lock(root: Path) -> Lock | None:
+    """The lock beside the protos, None where there is no such file. Raises TableError for a broken one."""
+    path = root / LOCK_NAME
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates)
+        return _parsed(content)
+    except FileNotFoundError:
+        return None
+    except json.JSONDecodeError as error:
+        span = SourceSpan(shown_path(path), error.lineno, error.colno, error.colno + 1)
+        problem = error.msg
+    except (OSError, ValueError) as error:
+        span = SourceSpan(shown_path(path))
+        problem = str(error)
+    hint = "take the file from version control; without it nobody knows which numbers are taken"
+    raise TableError([Diagnostic(span, Code.BAD_FILE, f"not a lock file: {problem}", hint)])
+
+
+def write_lock(root: Path, lock: Lock) -> None:
+    """Write the lock beside the protos, all of it or nothing. Sorted, one line for each number. Raises OSError."""
+    content = {
+        "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
+        "messages": {
+            name: {"file": message.file, "fields": {str(e.number): f"{e.type} {e.name}" for e in _by_number(message)}}
+            for name, message in sorted(lock.messages.items())
+        },
+        "enums": {
+            name: {"file": enum.file, "values": {entry.name: entry.number for entry in _by_number(enum)}}
+            for name, enum in sorted(lock.enums.items())
+        },
+    }
+    with tempfile.NamedTemporaryFile("w", dir=root, prefix=f".{LOCK_NAME}.", encoding="utf-8", delete=False) as file:
+        scratch = Path(file.name)
+        try:
+            json.dump(content, file, indent=2)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+            scratch.chmod(0o644)
+            scratch.replace(root / LOCK_NAME)
+        except BaseException:
+            scratch.unlink()
+            raise
+
+
+def _by_number(declaration: Declaration) -> list[Entry]:
+    return sorted(declaration.entries, key=lambda entry: (entry.number, entry.name))
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Two branches that gave out one number leave two equal keys after a merge."""
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"the key '{twice}' stands there twice")
+    return content
+
+
+def _parsed(content: object) -> Lock:
+    top = _mapping(content, "the file")
+    envelope = _mapping(top.get("envelope"), "envelope")
+    max_size = envelope.get("max_size")
+    if not isinstance(max_size, int):
+        raise ValueError("envelope.max_size is no number")
+    return Lock(
+        message=_text(envelope.get("message"), "envelope.message"),
+        oneof=_text(envelope.get("oneof"), "envelope.oneof"),
+        max_size=max_size,
+        messages={
+            name: Declaration(file, tuple(_field_entries(members, name)))
+            for name, file, members in _declarations(top, "messages", "fields")
+        },
+        enums={
+            name: Declaration(file, tuple(_value_entries(members, name)))
+            for name, file, members in _declarations(top, "enums", "values")
+        },
+    )
+
+
+def _declarations(top: Mapping[str, Any], kind: str, members: str) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    for name, content in _mapping(top.get(kind), kind).items():
+        declaration = _mapping(content, name)
+        yield name, _text(declaration.get("file"), f"{name}.file"), _mapping(declaration.get(members), name)
+
+
+def _field_entries(fields: Mapping[str, Any], message: str) -> Iterator[Entry]:
+    for number, declared in fields.items():
+        type_, _, name = _text(declared, f"{message}.{number}").rpartition(" ")
+        if not number.isdecimal() or not type_:
+            raise ValueError(f"{message} has '{number}: {declared}' where number, type and name belong")
+        yield Entry(int(number), name, type_)
+
+
+def _value_entries(values: Mapping[str, Any], enum: str) -> Iterator[Entry]:
+    for name, number in values.items():
+        if not isinstance(number, int):
+            raise ValueError(f"{enum}.{name} is no number")
+        yield Entry(number, name)
+
+
+def _mapping(value: object, what: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{what} is no mapping")
+    return value
+
+
+def _text(value: object, what: str) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{what} is no text")
+    return value
