@@ -71,12 +71,21 @@ class _Composer:
         return self._root
 
     def _events(self) -> Iterator[yaml.Event]:
+        event: yaml.Event | None = None
         try:
-            yield from yaml.parse(self._source.text, Loader=LOADER)
+            for event in yaml.parse(self._source.text, Loader=LOADER):
+                yield event
         except yaml.MarkedYAMLError as error:
-            raise TableError([explain(error, self._source)]) from error
+            raise TableError([explain(error, self._source, self._open_quote(event))]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
+
+    def _open_quote(self, event: yaml.Event | None) -> SourceSpan | None:
+        """Where a quoted scalar over several lines begins, if that is what was read last."""
+        if not isinstance(event, yaml.ScalarEvent) or event.style not in ("'", '"'):
+            return None
+        line, column, end_line, _ = _marks(event)
+        return self._source.span(line, column, line, column + 1) if end_line > line else None
 
     def _begin(self, event: yaml.CollectionStartEvent) -> None:
         span = self._span(event)
@@ -123,9 +132,11 @@ class _Composer:
             broken |= self._report(span, f"the text holds the character {unusable[1]}", "")
         if event.style or broken:
             return ScalarNode(span, text, text, column, broken)
-        if meaning := surprise(text):
-            what = f"'{text}' is {meaning} to some YAML readers and something else to others"
-            broken = self._report(span, what, f'put quotes around it if the text is meant: "{text}"', ambiguous=True)
+        if found := surprise(text):
+            what = f"'{text}' is {found.meaning} to some YAML readers and something else to others"
+            hint = (f"{found.remedy}, or " if found.remedy else "") + f'quote it: "{text}"'
+            self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
+            broken = True
         return ScalarNode(span, text, resolve(text), column, broken)
 
     def _text_column(self, event: yaml.ScalarEvent, span: SourceSpan) -> int | None:
@@ -160,10 +171,9 @@ class _Composer:
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
         return self._report(span, f"the tag '{name}' has no place in a table", "remove it; quotes make a value text")
 
-    def _report(self, span: SourceSpan, what: str, hint: str, *, ambiguous: bool = False) -> bool:
+    def _report(self, span: SourceSpan, what: str, hint: str) -> bool:
         """Add a finding; True, because what has one is broken."""
-        code = Code.AMBIGUOUS_SCALAR if ambiguous else Code.BAD_YAML
-        self._findings.append(Diagnostic(span, code, what, hint))
+        self._findings.append(Diagnostic(span, Code.BAD_YAML, what, hint))
         return True
 
     def _span(self, event: yaml.Event) -> SourceSpan:

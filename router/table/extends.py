@@ -87,7 +87,7 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
             raise  # the file is there, a place in it is wrong
         what = f"'{reference.text}' cannot be extended: {found.message}"
-        hint = f"paths are relative to this file; looked for {shown_path(path)}"
+        hint = f"paths are relative to this file; looked for {shown_path(Path(os.path.realpath(path)))}"
         raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what, hint)]) from error
 
 

@@ -6,6 +6,7 @@ Knows text only, no positions and no keys.
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
 from router.table.nodes import Plain
 
@@ -18,15 +19,31 @@ _INT = re.compile(r"[-+]?[0-9]{1,300}")  # Python refuses to read far longer one
 _HEX = re.compile(r"0x[0-9a-fA-F]{1,300}")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 
+
+class Surprise(NamedTuple):
+    """What some YAML readers take a scalar for, and how to say what one means."""
+
+    meaning: str
+    remedy: str
+
+
 _TRUTH = frozenset(spelling for word in ("yes", "no", "on", "off") for spelling in (word, word.title(), word.upper()))
+_OCTAL = Surprise("an octal number", "write a decimal number without leading zeros")
+_BINARY = Surprise("a binary number", "write a decimal number")
+_HEXADECIMAL = Surprise("a hexadecimal number", "write a decimal number")
+_GROUPED = Surprise("a number", "leave out the '_'")
 _SURPRISES = (
-    (re.compile(r"[-+]?0[0-9_]+"), "an octal number"),
-    (re.compile(r"0o[0-7]+"), "an octal number"),
-    (re.compile(r"[-+]?0b[01_]+"), "a binary number"),
-    (re.compile(r"[-+]0x[0-9a-fA-F_]+|0x_*[0-9a-fA-F]+_[0-9a-fA-F_]*|0x_[0-9a-fA-F_]+"), "a hexadecimal number"),
-    (re.compile(r"[-+]?[0-9][0-9_]*(?::[0-5]?[0-9])+(?:\.[0-9_]*)?"), "a number in base 60"),
-    (re.compile(r"[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}(?:(?:[Tt]|[ \t]+)[0-9]{1,2}:[0-9:.]+[ \t]*[-+:0-9Z]*)?"), "a date"),
-    (re.compile(r"(?=.*_)[-+]?(?:[0-9][0-9_]*(?:\.[0-9_]*)?|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?"), "a number"),
+    (re.compile("|".join(_TRUTH)), Surprise("a truth value", "write true or false")),
+    (re.compile("~"), Surprise("an empty value", "write null")),
+    (re.compile(r"[-+]?0[0-9_]+|0o[0-7]+"), _OCTAL),
+    (re.compile(r"[-+]?0b[01_]+"), _BINARY),
+    (re.compile(r"[-+]0x[0-9a-fA-F_]+|0x(?=.*_)[0-9a-fA-F_]+"), _HEXADECIMAL),
+    (re.compile(r"[-+]?[0-9][0-9_]*(?::[0-5]?[0-9])+(?:\.[0-9_]*)?"), Surprise("a number in base 60", "")),
+    (
+        re.compile(r"[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}(?:(?:[Tt]|[ \t]+)[0-9]{1,2}:[0-9:.]+[ \t]*[-+:0-9Z]*)?"),
+        Surprise("a date", ""),
+    ),
+    (re.compile(r"(?=.*_)[-+]?(?:[0-9][0-9_]*(?:\.[0-9_]*)?|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?"), _GROUPED),
 )
 
 
@@ -43,10 +60,6 @@ def resolve(text: str) -> Plain:
     return text
 
 
-def surprise(text: str) -> str | None:
-    """What some YAML readers take the plain scalar for while others take it for something else; else None."""
-    if text in _TRUTH:
-        return "a truth value"
-    if text == "~":
-        return "nothing"
-    return next((meaning for pattern, meaning in _SURPRISES if pattern.fullmatch(text)), None)
+def surprise(text: str) -> Surprise | None:
+    """Why the plain scalar means different things to readers of YAML 1.1 and 1.2; None where it does not."""
+    return next((found for pattern, found in _SURPRISES if pattern.fullmatch(text)), None)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.errors import Code, Diagnostic, SourceSpan, nearest
 from router.table.address import BadAddressError, parse_address
 from router.table.nodes import MappingNode, Node, Path, ScalarNode, key_at, node_at
 
@@ -51,6 +51,11 @@ class Misfit:
         schema = error.schema if isinstance(error.schema, Mapping) else {}
         return cls(path, str(error.validator), error.validator_value, error.instance, schema, error.message, about_name)
 
+    @property
+    def is_about_keys(self) -> bool:
+        """The mapping is one, but some of its keys are missing or too many."""
+        return self.keyword in ("required", "additionalProperties")
+
 
 def finding(misfit: Misfit, tree: Node) -> Diagnostic:
     """The finding for anything but an unknown key of a closed mapping."""
@@ -72,7 +77,8 @@ def finding(misfit: Misfit, tree: Node) -> Diagnostic:
     if keyword == "uniqueItems":
         return _repeated(misfit, tree)
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
-    hint = did_you_mean(str(misfit.value), misfit.limit) if keyword == "enum" else ""
+    near = nearest(str(misfit.value), misfit.limit) if keyword == "enum" else None
+    hint = f"did you mean '{near}'?" if near else ""
     if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
         return Diagnostic(span, code, f"{subject} must not be empty")
     return Diagnostic(span, code, f"{subject} {_expected(misfit)}, not {shown(misfit.value)}", hint)

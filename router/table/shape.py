@@ -68,8 +68,12 @@ def _pattern(validator: Validator, pattern: str, instance: object, schema: objec
 
 
 def _misfits(tree: Node) -> list[Misfit]:
+    """One misfit for each value, that of its type before any other; each missing key is one of its own."""
     data: Any = to_data(tree)
-    return [Misfit.of(error) for error in _validator().iter_errors(data)]
+    misfits = [Misfit.of(error) for error in _validator().iter_errors(data)]
+    misfits.sort(key=lambda misfit: misfit.keyword != "type")
+    first = {(misfit.path, misfit.message if misfit.is_about_keys else ""): misfit for misfit in reversed(misfits)}
+    return list(first.values())
 
 
 def _as_broken(node: Node) -> Node:
@@ -87,7 +91,7 @@ def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnost
     place = f"'{path[-1]}'" if path and isinstance(path[-1], str) else "this mapping" if path else "a route table"
     for name, entry in node.entries.items():
         if name not in known and not entry.key.broken:
-            hint = did_you_mean(name, [key for key in known if key not in node.entries])
+            hint = did_you_mean(name, known)
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{place} has no key '{name}'", hint)
 
 
