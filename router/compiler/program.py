@@ -12,7 +12,7 @@ from types import CodeType
 
 from router.compiler.books import Books
 from router.table.model import Address, Framing, RouteTable
-from router.types.protobuf import Envelope
+from router.types.protobuf import Envelope, PayloadCase
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class ListenerPlan:
 
 @dataclass(frozen=True, slots=True)
 class SenderPlan:
-    """A connected UDP socket to one destination endpoint; `local_ports` are never reused by it."""
+    """A connected UDP socket to one destination endpoint."""
 
     endpoint: str
     address: Address
@@ -61,21 +61,31 @@ class PublisherPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class TargetPlan:
+    """A target of a generated function: `name` is its part of the Python names, `target` its label."""
+
+    name: str
+    target: str
+    is_topic: bool
+    max_rate: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Handler:
     """One inbound or forward route as generated Python.
 
-    `code` defines a function `handle`. Executed in a namespace that holds `constants` and what the
-    engine binds (see engine.binding), it takes a message's payload bytes. `source` is the same as text.
-    `sources` maps an endpoint's name, or None for a stranger when the route takes any, to the slot that
-    counts its messages.
+    `code` defines the function called `function`. Executed in a namespace that holds `constants` and what the
+    engine binds for `targets` (see engine.binding), it serves one parsed message. `source` is the same
+    as text. `sources` are the endpoints that may send it; None among them stands for a stranger.
     """
 
-    case: str
-    number: int
+    case: PayloadCase
+    function: str
     source: str
     code: CodeType
     constants: Mapping[str, object]
-    sources: Mapping[str | None, int]
+    targets: tuple[TargetPlan, ...]
+    sources: frozenset[str | None]
 
 
 @dataclass(frozen=True, slots=True)

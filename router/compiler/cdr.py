@@ -1,0 +1,329 @@
+"""From a mapping's plan to code that fills a ROS message straight into CDR bytes.
+
+Plain CDR, little-endian (XCDR1, as Fast DDS and Cyclone DDS speak it): four bytes of header, then each
+scalar aligned to its own size counted from behind the header. Up to the first string or sequence of
+unknown length all offsets are known now, so that whole stretch is one `struct` call.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Union
+
+from router.compiler.mapping import Each, Items, Leaf, Plan, Record, Unset, zero
+from router.compiler.source import Source
+from router.errors import MappingError, SourceSpan
+from router.types.model import Bool, Float, Int, List, MessageType, String, Type
+
+HEADER = b"\x00\x01\x00\x00"
+"""Representation identifier CDR_LE and two option bytes."""
+
+_INTEGERS = {8: "B", 16: "H", 32: "I", 64: "Q"}
+
+
+@dataclass(frozen=True, slots=True)
+class Put:
+    """A scalar: `format` is its struct letter, so its size and alignment; `node` computes it."""
+
+    format: str
+    node: ast.expr
+    span: SourceSpan
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize(self.format)
+
+    alignment = size
+
+
+@dataclass(frozen=True, slots=True)
+class Blob:
+    """Bytes known now, aligned as their first scalar."""
+
+    data: bytes
+    alignment: int
+
+    @property
+    def size(self) -> int:
+        return len(self.data)
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A string that only the value tells; `wide` for a wstring."""
+
+    node: ast.expr
+    wide: bool
+    span: SourceSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """`body` once for each of `values`; `element` is set when the body is a single scalar."""
+
+    type: List
+    values: ast.expr
+    variable: str
+    body: tuple[Step, ...]
+    span: SourceSpan
+
+
+Step = Union[Put, Blob, Text, Repeat]
+
+
+def scalar_format(declared: Type) -> str:
+    """The struct letter of a primitive type other than a string."""
+    match declared:
+        case Bool():
+            return "?"
+        case Int():
+            letter = _INTEGERS[declared.bits]
+            return letter.lower() if declared.signed else letter
+        case Float():
+            return "f" if declared.bits == 32 else "d"
+        case _:
+            raise AssertionError(f"{declared} is no scalar of a ROS message")
+
+
+def steps(plan: Plan) -> Iterable[Step]:
+    """The message as a flat sequence of what is written, in order."""
+    match plan:
+        case Record():
+            for _, member in plan.members:
+                yield from steps(member)
+            if not plan.type.fields:
+                yield Blob(b"\0", 1)  # structure_needs_at_least_one_member
+        case Unset():
+            yield from _default(plan.type, plan.default)
+        case Leaf(type=String() as declared):
+            if isinstance(plan.constant, str):
+                yield _text(plan.constant, declared)
+            else:
+                yield Text(plan.node, declared.wide, plan.span)
+        case Leaf():
+            yield _leaf(plan)
+        case Items():
+            if plan.type.length is None:
+                yield Blob(struct.pack("<I", len(plan.items)), 4)
+            for item in plan.items:
+                yield from steps(item)
+        case Each():
+            yield Repeat(plan.type, plan.values, plan.variable, tuple(steps(plan.element)), plan.span)
+
+
+def _leaf(leaf: Leaf) -> Step:
+    letter = scalar_format(leaf.type)
+    if leaf.constant is None:
+        return Put(letter, leaf.node, leaf.span)
+    return Blob(struct.pack("<" + letter, leaf.constant), struct.calcsize(letter))
+
+
+def _text(value: str, declared: String) -> Blob:
+    data = bytearray()
+    (put_wide_text if declared.wide else put_text)(data, value)
+    return Blob(bytes(data), 4)
+
+
+def _default(declared: Type, default: object) -> Iterable[Step]:
+    """A field that nothing fills, as rclpy's constructor leaves it."""
+    if isinstance(declared, MessageType):
+        for member in declared.fields:
+            yield from _default(member.type, member.default)
+        if not declared.fields:
+            yield Blob(b"\0", 1)
+    elif isinstance(declared, List):
+        values = default if isinstance(default, Sequence) else [None] * (declared.length or 0)
+        if declared.length is None:
+            yield Blob(struct.pack("<I", len(values)), 4)
+        for value in values:
+            yield from _default(declared.element, value)
+    else:
+        value = zero(declared) if default is None else default
+        if isinstance(declared, String):
+            assert isinstance(value, str)  # noqa: S101 - types.ros reads defaults by their type
+            yield _text(value, declared)
+        else:
+            letter = scalar_format(declared)
+            yield Blob(struct.pack("<" + letter, value), struct.calcsize(letter))
+
+
+# what generated code calls
+
+
+def put_text(data: bytearray, text: str) -> None:
+    """Appends a string: its length with the final NUL, its bytes, the NUL. `data` has no header."""
+    encoded = text.encode()
+    if b"\0" in encoded:
+        raise MappingError("a ROS string cannot hold a NUL")
+    data += _PADDING[-len(data) & 3]
+    data += struct.pack("<I", len(encoded) + 1)
+    data += encoded
+    data += b"\0"
+
+
+def put_wide_text(data: bytearray, text: str) -> None:
+    """Appends a wstring: its length in UTF-16 code units, and those. `data` has no header."""
+    encoded = text.encode("utf-16-le")
+    data += _PADDING[-len(data) & 3]
+    data += struct.pack("<I", len(encoded) // 2)
+    data += encoded
+
+
+def put_numbers(data: bytearray, letter: str, size: int, values: Sequence[object]) -> None:
+    """Appends the elements of a list of scalars, without its length. `data` has no header."""
+    if values:
+        data += _PADDING[-len(data) % size]
+        data += struct.pack(f"<{len(values)}{letter}", *values)
+
+
+def put_length(data: bytearray, length: int, bound: int | None) -> None:
+    """Appends the length of a sequence. `data` has no header."""
+    if bound is not None and length > bound:
+        raise MappingError(f"{length} elements are more than {bound}")
+    data += _PADDING[-len(data) & 3]
+    data += struct.pack("<I", length)
+
+
+def want_length(length: int, wanted: int) -> None:
+    if length != wanted:
+        raise MappingError(f"{length} elements where an array takes {wanted}")
+
+
+_PADDING = tuple(bytes(count) for count in range(8))
+
+RUNTIME = {
+    "HEADER": HEADER,
+    "put_text": put_text,
+    "put_wide_text": put_wide_text,
+    "put_numbers": put_numbers,
+    "put_length": put_length,
+    "want_length": want_length,
+}
+"""Names that generated code may use."""
+
+
+# code generation
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Scalars and known bytes in a row."""
+
+    parts: tuple[Put | Blob, ...]
+
+    def static(self, prefix: bytes) -> tuple[str, list[Put | bytes]]:
+        """Struct format and arguments where the run begins at offset 0, behind `prefix`.
+
+        Known neighbours and the padding between them become one argument.
+        """
+        letters, arguments, known, offset = ["<"], list[Union[Put, bytes]](), bytearray(prefix), 0
+        for part in self.parts:
+            padding = -offset % part.alignment
+            known += bytes(padding)
+            offset += padding + part.size
+            if isinstance(part, Blob):
+                known += part.data
+                continue
+            _add_known(bytes(known), letters, arguments)
+            known.clear()
+            letters.append(part.format)
+            arguments.append(part)
+        _add_known(bytes(known), letters, arguments)
+        return "".join(letters), arguments
+
+    def floating(self, phase: int) -> tuple[str, list[Put | bytes]]:
+        """The same where the run begins at an offset of `phase` modulo 8: equal arguments for each phase."""
+        letters, arguments, offset = ["<"], list[Union[Put, bytes]](), phase
+        for part in self.parts:
+            padding = -offset % part.alignment
+            _add_known(bytes(padding), letters, arguments)
+            offset += padding + part.size
+            if isinstance(part, Blob):
+                _add_known(part.data, letters, arguments)
+            else:
+                letters.append(part.format)
+                arguments.append(part)
+        return "".join(letters), arguments
+
+
+def _add_known(data: bytes, letters: list[str], arguments: list[Put | bytes]) -> None:
+    if any(data):
+        letters.append(f"{len(data)}s")
+        arguments.append(data)
+    elif data:
+        letters.append(f"{len(data)}x")  # zeros, which struct writes by itself
+
+
+def write_message(out: Source, plan: Record, name: str) -> str:
+    """Appends the code that makes the CDR bytes of a message. Returns the expression that is the bytes.
+
+    `name` goes into the names of packers and known bytes; messages of one function have different ones.
+    """
+    runs = _runs(steps(plan))
+    first = runs[0] if isinstance(runs[0], _Run) else _Run(())
+    if runs == [first]:
+        letters, arguments = first.static(HEADER)
+        _call(out, "data = {}", name, out.constant(f"pack_{name}", struct.Struct(letters).pack), arguments, plan.span)
+        return "data"
+    letters, arguments = first.static(b"")
+    _call(out, "data = bytearray({})", name, out.constant(f"pack_{name}", struct.Struct(letters).pack), arguments, plan.span)
+    _write(out, runs[1:] if runs[0] is first else runs, name, plan.span)
+    return "HEADER + data"
+
+
+def _runs(sequence: Iterable[Step]) -> list[_Run | Text | Repeat]:
+    """Never empty; neighbouring scalars and known bytes are one run."""
+    found: list[_Run | Text | Repeat] = []
+    for together, group in itertools.groupby(sequence, lambda step: isinstance(step, (Put, Blob))):
+        found += [_Run(tuple(group))] if together else group  # type: ignore[arg-type]
+    return found or [_Run(())]
+
+
+def _call(
+    out: Source, statement: str, name: str, function: str, arguments: Sequence[Put | bytes], span: SourceSpan
+) -> None:
+    """A statement around a call with one argument a line."""
+    before, _, after = statement.partition("{}")
+    out.line(f"{before}{function}(", span)
+    with out.indented():
+        for argument in arguments:
+            if isinstance(argument, bytes):
+                out.line(f"{out.constant(f'known_{name}', argument)},", span)
+            else:
+                out.line(f"{out.expression(argument.node)},", argument.span)
+    out.line(f"){after}", span)
+
+
+def _write(out: Source, runs: Iterable[_Run | Text | Repeat], name: str, span: SourceSpan) -> None:
+    """What comes after the first string or sequence: offsets are known when it runs, modulo 8."""
+    for run in runs:
+        match run:
+            case _Run():
+                packers = tuple(struct.Struct(run.floating(phase)[0]).pack for phase in range(8))
+                at = out.constant(f"pack_{name}_at", packers)
+                _call(out, "data += {}", name, f"{at}[len(data) & 7]", run.floating(0)[1], span)
+            case Text():
+                put = "put_wide_text" if run.wide else "put_text"
+                out.line(f"{put}(data, {out.expression(run.node)})", run.span)
+            case Repeat():
+                _repeat(out, run, name)
+
+
+def _repeat(out: Source, repeat: Repeat, name: str) -> None:
+    values = out.expression(repeat.values)
+    out.line(f"values = {values}", repeat.span)
+    if repeat.type.length is not None:
+        out.line(f"want_length(len(values), {repeat.type.length})", repeat.span)
+    else:
+        out.line(f"put_length(data, len(values), {repeat.type.bound})", repeat.span)
+    if len(repeat.body) == 1 and isinstance(body := repeat.body[0], Put):
+        plain = isinstance(body.node, ast.Name) and body.node.id == repeat.variable
+        each = "values" if plain else f"[{out.expression(body.node)} for {repeat.variable} in values]"
+        out.line(f"put_numbers(data, {body.format!r}, {body.size}, {each})", repeat.span)
+        return
+    with out.block(f"for {repeat.variable} in values:", repeat.span):
+        _write(out, _runs(repeat.body), name, repeat.span)

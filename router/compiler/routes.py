@@ -1,0 +1,230 @@
+"""Checks routes against what exists: every name resolved, every mapping typed, all findings collected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from router.compiler.definitions import Definitions
+from router.compiler.expressions import Finding, Locals, Scope, Typed, check
+from router.compiler.handlers import Target
+from router.compiler.kinds import BoolKind
+from router.compiler.mapping import Row, build
+from router.compiler.network import loop_finding
+from router.compiler.topics import qos_findings, topic_name_finding
+from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
+from router.table.model import ANY, ROS, Destination, EndpointKind, Expression, FieldMap, Route, RouteTable, Topic
+from router.types.boards import board_findings
+from router.types.model import List, MessageType, Type
+from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedTarget:
+    """A target with what its mapping came to, for `explain`. `type` is None for unchanged forwarding."""
+
+    target: Target
+    topic: Topic | None
+    type: MessageType | None
+    rows: tuple[Row, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedRoute:
+    """A route whose names all exist. Findings that it has beside that keep it out of a program."""
+
+    route: Route
+    case: PayloadCase
+    targets: tuple[CheckedTarget, ...]
+
+
+@dataclass(slots=True)
+class RouteChecker:
+    """Checks the routes of one table; `findings` fills up."""
+
+    table: RouteTable
+    schema: ProtoSchema
+    envelope: Envelope
+    definitions: Definitions
+    board_limit: int
+    findings: list[Diagnostic] = field(default_factory=list)
+
+    def check_all(self) -> tuple[CheckedRoute, ...]:
+        self._coverage()
+        checked = (self._route(route) for route in self.table.routes)
+        return tuple(route for route in checked if route)
+
+    def _report(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
+        self.findings.append(Diagnostic(span, code, message, hint))
+
+    def _coverage(self) -> None:
+        covered = {route.case.value for route in self.table.routes}
+        covered |= {name.removeprefix("routes/") for name in self.table.broken if name.startswith("routes/")}
+        missing = [name for name in self.envelope.cases if name not in covered]
+        if missing:
+            cases = "payload case" if len(missing) == 1 else "payload cases"
+            self._report(self.table.routes_span, Code.UNCOVERED_PAYLOAD_CASE,
+                         f"no route for the {cases} {', '.join(missing)}", "route it, or say `ignore: reason`")  # fmt: skip
+
+    def _route(self, route: Route) -> CheckedRoute | None:
+        case = self.envelope.cases.get(route.case.value)
+        if case is None:
+            message = f"{self.envelope.name} has no payload case '{route.case.value}'"
+            self._report(route.case.span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(route.case.value, self.envelope.cases))
+            return None
+        if route.ignore is not None:
+            return CheckedRoute(route, case, ())
+        self._sources(route)
+        if not route.destinations and not route.topics:
+            self._report(route.case.span, Code.NO_TARGET, f"'{route.case.value}' goes nowhere",
+                         "name destinations or topics, or say `ignore: reason`")  # fmt: skip
+        for topic in route.topics:
+            self.findings += [finding for finding in (topic_name_finding(topic), *qos_findings(topic)) if finding]
+        targets = self._outbound(route, case) if route.is_outbound else self._inbound(route, case)
+        return CheckedRoute(route, case, tuple(targets))
+
+    def _sources(self, route: Route) -> None:
+        for source in route.sources:
+            if source.value not in (ANY, ROS):
+                self._known_endpoint(source.value, source.span, (ANY, ROS))
+            elif len(route.sources) > 1:
+                self._report(source.span, Code.BAD_VALUE, f"'{source.value}' stands alone", "name endpoints, or it, not both")
+
+    def _known_endpoint(self, name: str, span: SourceSpan, also: Iterable[str] = ()) -> bool:
+        if name in self.table.endpoints:
+            return True
+        if f"endpoints/{name}" not in self.table.broken:
+            known = [*self.table.endpoints, *also]
+            self._report(span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name}'", did_you_mean(name, known))
+        return False
+
+    # UDP to ROS and UDP to UDP
+
+    def _inbound(self, route: Route, case: PayloadCase) -> Iterable[CheckedTarget]:
+        if route.fields is not None:
+            self._report(route.fields.span, Code.UNKNOWN_KEY, "'fields' of a route belongs to `source: ros`",
+                         "a topic has its own 'fields'")  # fmt: skip
+        targets: list[CheckedTarget] = []
+        for destination in route.destinations:
+            trim = self._destination(route, case, destination)
+            if destination.fields is not None:
+                self._report(destination.fields.span, Code.UNKNOWN_KEY, "a datagram is forwarded unchanged",
+                             "'fields' of a destination belongs to `source: ros`")  # fmt: skip
+            scope = self._scope(case.type)
+            when = self._when(destination.when, scope)
+            target = Target(destination.endpoint.value, destination.span, scope.locals, when,
+                            destination.max_rate.value if destination.max_rate else None, trim=trim)  # fmt: skip
+            targets.append(CheckedTarget(target, None, None))
+        for topic in route.topics:
+            ros_type = self._ros_type(topic)
+            if ros_type is not None:
+                targets.append(self._publish(topic, ros_type, self._scope(case.type, ros_type)))
+        return targets
+
+    def _publish(self, topic: Topic, ros_type: MessageType, scope: Scope) -> CheckedTarget:
+        when = self._when(topic.when, scope)
+        mapping = build(topic.fields, ros_type, scope, topic.topic.span)
+        self.findings += mapping.findings
+        rate = topic.max_rate.value if topic.max_rate else None
+        target = Target(topic.topic.value, topic.span, scope.locals, when, rate, plan=mapping.plan)
+        return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
+
+    # ROS to UDP
+
+    def _outbound(self, route: Route, case: PayloadCase) -> Iterable[CheckedTarget]:
+        if not route.topics:
+            self._report(route.case.span, Code.NO_TARGET, f"'{route.case.value}' comes from ROS, but from no topic",
+                         "name it under 'topics'")  # fmt: skip
+        if route.topics and not route.destinations:
+            self._report(route.case.span, Code.NO_TARGET, f"'{route.case.value}' goes to no destination",
+                         "name it under 'destinations'")  # fmt: skip
+        for destination in route.destinations:
+            self._destination(route, case, destination)
+        targets: list[CheckedTarget] = []
+        for topic in route.topics:
+            if topic.fields is not None:
+                self._report(topic.fields.span, Code.UNKNOWN_KEY, "with `source: ros` the fields to fill are the payload's",
+                             "move 'fields' up to the route")  # fmt: skip
+            ros_type = self._ros_type(topic)
+            if ros_type is not None:
+                targets += [self._command(route, case, topic, ros_type, to) for to in route.destinations]
+        return targets
+
+    def _command(
+        self, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, destination: Destination
+    ) -> CheckedTarget:
+        scope = self._scope(ros_type, ros_type)
+        self._when(topic.when, scope)
+        when = self._when(destination.when, scope)
+        fields: FieldMap | None = destination.fields or route.fields
+        mapping = build(fields, case.type, scope, route.case.span)
+        self.findings += [finding for finding in mapping.findings if finding not in self.findings]
+        rate = destination.max_rate.value if destination.max_rate else None
+        target = Target(destination.endpoint.value, destination.span, scope.locals, when, rate, plan=mapping.plan)
+        return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
+
+    # names
+
+    def _destination(self, route: Route, case: PayloadCase, destination: Destination) -> bool:
+        """Whether the endpoint wants trailing zeros trimmed; an unknown one is reported."""
+        name = destination.endpoint
+        if not self._known_endpoint(name.value, name.span):
+            return False
+        twice = [other for other in route.destinations if other.endpoint.value == name.value]
+        if twice[0] is not destination:
+            self._report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
+        endpoint = self.table.endpoints[name.value]
+        if finding := loop_finding(self.table, route, destination, endpoint):
+            self.findings.append(finding)
+        if endpoint.kind is EndpointKind.BOARD:
+            self.findings += board_findings(case, self.schema, self.board_limit, name.span)
+        return endpoint.trim_trailing_zeros
+
+    def _ros_type(self, topic: Topic) -> MessageType | None:
+        name = topic.type.value
+        try:
+            found = self.definitions.interfaces.get(name)
+        except TableError as error:
+            self.findings += [finding for finding in error.diagnostics if finding not in self.findings]
+            return None
+        if found is None:
+            hint = did_you_mean(name, self.definitions.interfaces.names())
+            self._report(topic.type.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name}'", hint)
+        return found
+
+    def _scope(self, message: MessageType, ros_type: MessageType | None = None) -> Scope:
+        nested = tuple(_nested(ros_type)) if ros_type else ()
+        return Scope(message, tuple(self.schema.enums.values()), nested, Locals())
+
+    def _when(self, expression: Expression | None, scope: Scope) -> Typed | None:
+        if expression is None:
+            return None
+        try:
+            typed = check(expression, scope)
+            if not isinstance(typed.kind, BoolKind):
+                hint = "compare something, as in fix_quality != GPSFixQuality.NO_FIX"
+                raise Finding(typed.span, Code.TYPE_MISMATCH, f"'when' takes a bool, not {typed.kind}", hint)
+        except Finding as finding:
+            if finding.diagnostic not in self.findings:
+                self.findings.append(finding.diagnostic)
+            return None
+        return typed
+
+
+def _nested(declared: Type) -> Iterable[MessageType]:
+    """A ROS message type and all types in it, each once."""
+    found: dict[str, MessageType] = {}
+    waiting: list[Type] = [declared]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, List):
+            waiting.append(current.element)
+        elif isinstance(current, MessageType) and current.name not in found:
+            found[current.name] = current
+            waiting += [member.type for member in current.fields]
+    return found.values()
+
+
+def sorted_findings(findings: Sequence[Diagnostic]) -> list[Diagnostic]:
+    """Each once, in the order in which a person reads the files."""
+    return sorted(dict.fromkeys(findings), key=lambda finding: (finding.span, finding.code.value, finding.message))

@@ -1,0 +1,104 @@
+"""Generated Python: text for people and a syntax tree for the interpreter, made from the same lines.
+
+Every line knows the stretch of the route table that it comes from, and grafted expressions keep their
+own, so that a traceback points into the YAML file. Values enter by namespace, never by pasting.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import CodeType
+
+from router.compiler.expressions import place
+from router.errors import SourceSpan
+
+INDENT = "    "
+_PLACEHOLDER = re.compile(r"_expression_(\d+)_")
+
+
+class Source:
+    """One function in the making."""
+
+    def __init__(self) -> None:
+        self.constants: dict[str, object] = {}
+        self._lines: list[tuple[str, SourceSpan]] = []
+        self._expressions: list[ast.expr] = []
+        self._depth = 0
+
+    def line(self, text: str, span: SourceSpan) -> None:
+        """Appends one line; `text` may hold what `expression` returned, and a comment."""
+        self._lines.append((INDENT * self._depth + text, span))
+
+    @contextmanager
+    def block(self, text: str, span: SourceSpan) -> Iterator[None]:
+        """Appends a line that ends in a colon, and indents what is appended inside."""
+        self.line(text, span)
+        with self.indented():
+            yield
+
+    @contextmanager
+    def indented(self) -> Iterator[None]:
+        self._depth += 1
+        yield
+        self._depth -= 1
+
+    def expression(self, node: ast.expr) -> str:
+        """A stand-in for a syntax tree, to be put into a line."""
+        self._expressions.append(node)
+        return f"_expression_{len(self._expressions) - 1}_"
+
+    def constant(self, name: str, value: object) -> str:
+        """A name for a value in the function's namespace: `name`, or `name_2` when that is taken."""
+        unique, number = name, 1
+        while unique in self.constants:
+            number += 1
+            unique = f"{name}_{number}"
+        self.constants[unique] = value
+        return unique
+
+    def text(self) -> str:
+        """What `router explain` prints."""
+
+        return "\n".join(self._shown(line) for line, _ in self._lines) + "\n"
+
+    def _shown(self, line: str) -> str:
+        alone = _PLACEHOLDER.fullmatch(line.strip().rstrip(",")) is not None
+
+        def replaced(found: re.Match[str]) -> str:
+            node = self._expressions[int(found[1])]
+            text = ast.unparse(node)
+            return text if alone or isinstance(node, (ast.Constant, ast.Name, ast.Attribute, ast.Call)) else f"({text})"
+
+        return _PLACEHOLDER.sub(replaced, line)
+
+    def tree(self) -> ast.Module:
+        """The same as a syntax tree with the table's positions."""
+        module = ast.parse("\n".join(line for line, _ in self._lines))
+        for node in ast.walk(module):
+            if hasattr(node, "lineno"):
+                place(node, self._lines[node.lineno - 1][1])
+        grafted = _Graft(self._expressions).visit(module)
+        assert isinstance(grafted, ast.Module)  # noqa: S101 - a module stays one
+        return grafted
+
+    def compile(self, file: str) -> CodeType:
+        """Code whose tracebacks name `file`."""
+        return compile(self.tree(), file, "exec", dont_inherit=True, optimize=0)
+
+
+class _Graft(ast.NodeTransformer):
+    def __init__(self, expressions: list[ast.expr]) -> None:
+        self.expressions = expressions
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        found = _PLACEHOLDER.fullmatch(node.id)
+        return copy.deepcopy(self.expressions[int(found[1])]) if found else node
+
+
+def namespace_name(text: str) -> str:
+    """A topic's or endpoint's name as part of a Python name: `imu/data_raw` is `imu_data_raw`."""
+    return re.sub(r"\W", "_", text).strip("_")

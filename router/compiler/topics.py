@@ -1,0 +1,138 @@
+"""ROS topics of a table: names, QoS, and whether those who meet on one topic can hear each other."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from router.compiler.program import QosPlan
+from router.errors import Code, Diagnostic, SourceSpan
+from router.table.model import NodeSettings, Route, RouteTable, Topic
+
+DEFAULT_DEPTH = 10
+LONGEST_NAME = 247
+_NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+
+PROFILES: Mapping[str, QosPlan] = {
+    "default": QosPlan("reliable", "volatile", "keep_last", DEFAULT_DEPTH),
+    "sensor_data": QosPlan("best_effort", "volatile", "keep_last", 5),
+    "services_default": QosPlan("reliable", "volatile", "keep_last", DEFAULT_DEPTH),
+    "parameters": QosPlan("reliable", "volatile", "keep_last", 1000),
+    "parameter_events": QosPlan("reliable", "volatile", "keep_last", 1000),
+    "action_status_default": QosPlan("reliable", "transient_local", "keep_last", 1),
+    "system_default": QosPlan("system_default", "system_default", "system_default", DEFAULT_DEPTH),
+    "best_available": QosPlan("best_available", "best_available", "keep_last", DEFAULT_DEPTH),
+}
+"""rmw's profiles by rclpy's names."""
+
+
+def topic_name_finding(topic: Topic) -> Diagnostic | None:
+    name = topic.topic.value
+    if not _NAME.fullmatch(name):
+        hint = "names are letters, digits and '_' with '/' between; no part begins with a digit"
+        return Diagnostic(topic.topic.span, Code.BAD_TOPIC_NAME, f"'{name}' is not a ROS topic name", hint)
+    if len(name) > LONGEST_NAME:
+        message = f"a ROS topic name has at most {LONGEST_NAME} characters, this one {len(name)}"
+        return Diagnostic(topic.topic.span, Code.BAD_TOPIC_NAME, message)
+    return None
+
+
+def resolved(name: str, node: NodeSettings) -> str:
+    """The absolute name under which ROS knows a topic of this node."""
+    namespace = node.namespace.rstrip("/")
+    if name.startswith("~/"):
+        return f"{namespace}/{node.name}/{name[2:]}"
+    return name if name.startswith("/") else f"{namespace}/{name}"
+
+
+def qos_of(topic: Topic) -> QosPlan:
+    """The complete QoS: the profile, what the table adds to it, and `queue_depth` as its depth."""
+    given = topic.qos
+    plan = PROFILES[given.profile.value if given and given.profile else "default"]
+    words = ("reliability", "durability", "history", "depth", "deadline", "lifespan", "liveliness",
+             "liveliness_lease_duration")  # fmt: skip
+    said = {word: getattr(given, word).value for word in words if given and getattr(given, word) is not None}
+    if topic.queue_depth is not None:
+        said["depth"] = topic.queue_depth.value
+    return replace(plan, **said)
+
+
+def qos_findings(topic: Topic) -> Iterator[Diagnostic]:
+    """What one topic's QoS says twice or can never mean."""
+    given = topic.qos
+    if given is None:
+        return
+    plan = qos_of(topic)
+
+    def conflict(span: SourceSpan, message: str, hint: str) -> Diagnostic:
+        return Diagnostic(span, Code.QOS_CONFLICT, message, hint)
+
+    if given.depth and topic.queue_depth and given.depth.value != topic.queue_depth.value:
+        message = f"depth {given.depth.value} contradicts queue_depth {topic.queue_depth.value}"
+        yield conflict(given.depth.span, message, "say it once")
+    if given.history and given.history.value == "keep_all" and (depth := given.depth or topic.queue_depth):
+        yield conflict(depth.span, "history keep_all has no depth", "leave the depth out, or say keep_last")
+    if plan.durability == "transient_local" and plan.reliability == "best_effort":
+        span = (given.durability or given.reliability or given.profile)
+        yield conflict(span.span if span else given.span, "late joiners get nothing from a best_effort publisher",
+                       "transient_local goes with reliability: reliable")  # fmt: skip
+    if plan.liveliness_lease_duration and plan.deadline and plan.liveliness_lease_duration < plan.deadline:
+        span = given.liveliness_lease_duration or given.deadline
+        yield conflict(span.span if span else given.span, "the liveliness lease ends before the deadline",
+                       "make the lease at least as long as the deadline")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Use:
+    """One mention of a topic in the table."""
+
+    topic: Topic
+    case: str
+    publishes: bool
+    qos: QosPlan
+
+
+def meeting_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
+    """Topics that several routes name: one type, one publisher's QoS, and QoS that matches."""
+    uses: dict[str, list[_Use]] = {}
+    for route in routes:
+        for topic in route.topics:
+            if topic_name_finding(topic) is None:
+                use = _Use(topic, route.case.value, not route.is_outbound, qos_of(topic))
+                uses.setdefault(resolved(topic.topic.value, table.node), []).append(use)
+    for name, together in uses.items():
+        for use in together[1:]:
+            if finding := _disagreement(name, together[0], use):
+                yield finding
+
+
+def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
+    if use.topic.type.value != first.topic.type.value:
+        message = f"topic '{name}' has the type {first.topic.type.value} in route '{first.case}'"
+        hint = f"a topic has one type; see {first.topic.type.span}"
+        return Diagnostic(use.topic.type.span, Code.TOPIC_TYPE_CLASH, message, hint)
+    span = use.topic.qos.span if use.topic.qos else (use.topic.queue_depth or use.topic.topic).span
+    if use.publishes == first.publishes:
+        if use.qos == first.qos:
+            return None
+        message = f"topic '{name}' has another QoS in route '{first.case}'"
+        return Diagnostic(span, Code.QOS_CONFLICT, message, f"a topic has one; see {first.topic.span}")
+    publisher, subscriber = (use, first) if use.publishes else (first, use)
+    if reason := _unheard(publisher.qos, subscriber.qos):
+        message = f"route '{subscriber.case}' hears nothing that route '{publisher.case}' publishes on '{name}': {reason}"
+        return Diagnostic(span, Code.QOS_CONFLICT, message, "give both the same QoS")
+    return None
+
+
+def _unheard(offered: QosPlan, requested: QosPlan) -> str:
+    """Why DDS would not match the two, empty when it does."""
+    if offered.reliability == "best_effort" and requested.reliability == "reliable":
+        return "it wants reliable and gets best_effort"
+    if offered.durability == "volatile" and requested.durability == "transient_local":
+        return "it wants transient_local and gets volatile"
+    if requested.deadline is not None and (offered.deadline is None or offered.deadline > requested.deadline):
+        return "it wants a shorter deadline than is offered"
+    if offered.liveliness == "automatic" and requested.liveliness == "manual_by_topic":
+        return "it wants liveliness manual_by_topic and gets automatic"
+    return ""
