@@ -6,8 +6,6 @@ Reads, writes and builds it; what may follow from a difference is `lock`'s busin
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +80,7 @@ def read_lock(root: Path) -> Lock | None:
 
 
 def write_lock(root: Path, lock: Lock) -> None:
-    """Write the lock beside the protos, all of it or nothing. Sorted, one line for each number. Raises OSError."""
+    """Write the lock beside the protos, all of it or nothing; sorted, one line for each number. Raises TableError."""
     content = {
         "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
         "messages": {
@@ -94,18 +92,15 @@ def write_lock(root: Path, lock: Lock) -> None:
             for name, enum in sorted(lock.enums.items())
         },
     }
-    with tempfile.NamedTemporaryFile("w", dir=root, prefix=f".{LOCK_NAME}.", encoding="utf-8", delete=False) as file:
-        scratch = Path(file.name)
-        try:
-            json.dump(content, file, indent=2)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-            scratch.chmod(0o644)
-            scratch.replace(root / LOCK_NAME)
-        except BaseException:
-            scratch.unlink()
-            raise
+    path = root / LOCK_NAME
+    scratch = root / f".{LOCK_NAME}.new"
+    try:
+        scratch.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        scratch.replace(path)
+    except OSError as error:
+        scratch.unlink(missing_ok=True)
+        message = f"cannot be written: {error.strerror}"
+        raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]) from None
 
 
 def _by_number(declaration: Declaration) -> list[Entry]:

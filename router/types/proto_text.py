@@ -40,6 +40,16 @@ class ProtoText:
         word = _WORD.match(text, start)
         return self._span(line, start, word.end() if word else start)
 
+    def nearest(self, pattern: str, line: int) -> SourceSpan | None:
+        """The match of a regular expression that is nearest to the line."""
+        matches = [
+            (number, match) for number, text in enumerate(self._lines) for match in re.finditer(pattern.encode(), text)
+        ]
+        if not matches:
+            return None
+        number, match = min(matches, key=lambda found: abs(found[0] - line))
+        return self._span(number, match.start(), match.end())
+
     def before(self, line: int, column: int) -> str:
         """What stands before the place on its line, without blanks at its end."""
         text = self._line(line)

@@ -6,6 +6,7 @@ Knows nothing of routes; the names it is asked for come from the table's `envelo
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,8 @@ MessageClass = type[Message]
 
 _PROTO = ".proto"
 _OPTIONS = ".options"
+_HIDDEN = re.compile(r"(^|/)\.")
+_FILE_NAME = re.compile(r"[\w ./+,@-]+", re.ASCII)
 
 
 class ProtoSchema:
@@ -141,12 +144,20 @@ def _read_folder(root: Path, blame: SourceSpan) -> dict[str, bytes]:
     """The bytes of all `.proto` and `.options` files by name relative to `root`, sorted. Raises TableError."""
     if not root.is_dir():
         raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {shown_path(root)}")])
-    found = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.suffix in (_PROTO, _OPTIONS)}
+    found = {
+        name: path
+        for path in root.rglob("*")
+        if path.suffix in (_PROTO, _OPTIONS) and not _HIDDEN.search(name := path.relative_to(root).as_posix())
+    }
     if not any(name.endswith(_PROTO) for name in found):
         raise TableError([Diagnostic(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")])
     files = {}
     findings = []
     for name, path in sorted(found.items()):
+        if not _FILE_NAME.fullmatch(name):
+            hint = "take letters, digits, '_', '-' and '.'"
+            findings.append(Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint))
+            continue
         try:
             files[name] = path.read_bytes()
         except OSError as error:

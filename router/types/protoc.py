@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import grpc_tools
@@ -27,6 +27,7 @@ _NUMBER_TAKEN = re.compile(
     r"Field number \d+ has already been used|uses reserved number|Field name \S+ is reserved"
     r"|uses the same enum value as"
 )
+_RESERVED = re.compile(r'Field "(?P<field>\w+)" uses reserved number (?P<number>\d+)')
 _TYPE_TAKEN = re.compile(r'^"[\w.]+" is already defined')
 
 
@@ -41,16 +42,21 @@ class _Complaint:
 
 
 def compile_protos(root: Path, names: Sequence[str]) -> FileDescriptorSet:
-    """The descriptors of the named files (relative to `root`) and of what they import, dependencies first.
+    """The descriptors of the named files and of what they import, dependencies first.
 
+    Names are relative to `root`, with `/`, in ASCII and without quotes or backslashes.
     Raises TableError with one finding for each error of protoc.
     """
     with tempfile.TemporaryDirectory() as scratch:
         # One file that imports all others makes protoc go through every file although some are broken.
         # Public imports, because protoc prints a warning for an unused private one.
         imports = "".join(f'import public "{name}";\n' for name in names)
-        Path(scratch, _EVERYTHING).write_text(f'syntax = "proto3";\n{imports}', encoding="utf-8")
-        include = [scratch, str(root), str(WELL_KNOWN)]
+        everything = Path(scratch, "everything")
+        everything.mkdir()
+        (everything / _EVERYTHING).write_text(f'syntax = "proto3";\n{imports}', encoding="ascii")
+        folder = Path(scratch, "protos")  # a name without `:` and `=`, at which protoc splits
+        folder.symlink_to(root.absolute(), target_is_directory=True)
+        include = [str(everything), str(folder), str(WELL_KNOWN)]
         _refuse_errors(root, names, include)
         output = Path(scratch, "descriptors")
         options = ["--include_imports", "--include_source_info", f"--descriptor_set_out={output}"]
@@ -80,9 +86,15 @@ def _refuse_errors(root: Path, names: Sequence[str], include: Sequence[str]) -> 
 
 def _findings(root: Path, names: Sequence[str], complaints: Sequence[_Complaint]) -> list[Diagnostic]:
     texts: dict[str, ProtoText] = {}
-    findings = []
+    findings: dict[tuple[str, int, int], Diagnostic] = {}
     for complaint in complaints:
         if complaint.file == _EVERYTHING:
+            continue
+        place = (complaint.file, complaint.line, complaint.column)
+        if (first := findings.get(place)) is not None:  # protoc's advice, or the same again
+            advice = complaint.message.rstrip(".")
+            if not first.hint and advice != first.message:
+                findings[place] = replace(first, hint=advice)
             continue
         missing = _IMPORT_FAILED.fullmatch(complaint.message)
         if missing and missing["name"] in names:
@@ -90,14 +102,16 @@ def _findings(root: Path, names: Sequence[str], complaints: Sequence[_Complaint]
         if complaint.line < 0 and complaint.file not in names:
             continue  # an imported file that does not exist; the import is a finding
         text = texts.setdefault(complaint.file, ProtoText(root / complaint.file))
-        findings.append(_finding(complaint, missing["name"] if missing else None, names, text))
-    return findings
+        findings[place] = _finding(complaint, missing["name"] if missing else None, names, text)
+    return list(findings.values())
 
 
 def _finding(complaint: _Complaint, missing: str | None, names: Sequence[str], text: ProtoText) -> Diagnostic:
     if complaint.line < 0:
         return Diagnostic(SourceSpan(shown_path(text.path)), Code.BAD_PROTO, complaint.message.rstrip("."))
     span = text.word(complaint.line, complaint.column)
+    if reserved := _RESERVED.match(complaint.message):  # protoc blames the `reserved`, not who breaks it
+        span = text.nearest(rf"\b{reserved['field']}\s*=\s*{reserved['number']}\b", complaint.line) or span
     if missing is not None:
         return Diagnostic(span, Code.BAD_PROTO, f"there is no file '{missing}' to import", did_you_mean(missing, names))
     what, _, advice = complaint.message.partition(". ")
