@@ -15,6 +15,7 @@ from rclpy.duration import Duration, Infinite
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
@@ -29,6 +30,9 @@ from router.compiler.program import PublisherPlan, QosPlan
 from router.edges.log import logger
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
+
+PUBLISH_ERRORS = (rclpy_implementation.RCLError,)
+"""What `publish[topic]` may raise."""
 
 _RCL_ERRORS = (RuntimeError, NameValidationException)
 """What rclpy raises for bad arguments, names and settings: its own errors derive from RuntimeError."""
