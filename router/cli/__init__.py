@@ -1,0 +1,87 @@
+"""The command line: which verbs there are. A verb's module is imported once the verb is chosen.
+
+Knows no verb's work. A verb's module offers `add_parser(subparsers)` and `run(args) -> int`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import io
+import os
+import sys
+from collections.abc import Sequence
+
+from router.errors import RouterError, TableError
+
+OK = 0
+BAD_USAGE = 2
+BAD_TABLE = 78
+"""EX_CONFIG: systemd is told not to restart into it."""
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+
+VERBS = {
+    "run": "run a route table between UDP and ROS 2",
+    "validate": "say what is wrong with route tables",
+    "explain": "show what a route does, field by field, and the code that does it",
+    "send": "send envelopes with payloads of your choice",
+    "tap": "decode the envelopes that arrive on a port",
+    "sim": "play the boards and the basestation",
+    "schema": "inspect the wire types and lock their field numbers",
+}
+
+
+class _Version(argparse.Action):
+    """Reads the version only when somebody asks for it: importlib.metadata is slow to import."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *rest: object) -> None:
+        from importlib.metadata import version
+
+        print(f"router {version('rover-router')}")
+        parser.exit()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb; the exit code: 0, 78 for a bad table, 2 for wrong usage."""
+    arguments = sys.argv[1:] if argv is None else list(argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal that lacks a character is no reason to fail
+    try:
+        code = _run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at exit
+        return BROKEN_PIPE
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    return code
+
+
+def _run(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(prog="router", description="Routes messages between protobuf over UDP and ROS 2.")
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
+    module = None
+    for verb, summary in VERBS.items():
+        if verb == chosen:
+            module = importlib.import_module(f"router.cli.{verb}")
+            module.add_parser(subparsers)
+        else:
+            subparsers.add_parser(verb, help=summary)
+    args = parser.parse_args(arguments)
+    if module is None:
+        raise AssertionError("argparse refuses what is no verb")
+    try:
+        code: int = module.run(args)
+    except TableError as error:
+        from router.cli.findings import print_findings
+
+        print_findings(error.diagnostics, sys.stderr)
+        return BAD_TABLE
+    except RouterError as error:
+        print(f"router {chosen}: {error}", file=sys.stderr)
+        return BAD_TABLE
+    return code

@@ -1,0 +1,155 @@
+"""Findings for people and for machines: text with the source line and a caret, JSON, GitHub annotations.
+
+Knows Diagnostic only; what was checked, and what follows from it, is the verb's business.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import re
+import unicodedata
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TextIO
+
+from router.errors import Diagnostic, Severity, SourceSpan
+
+FORMATS = ("text", "json", "github")
+
+_RESET, _BOLD, _RED, _YELLOW, _CYAN = "\x1b[0m", "\x1b[1m", "\x1b[31m", "\x1b[33m", "\x1b[36m"
+_INVISIBLE = re.compile(r"[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]")
+_LONGEST_LINE = 160
+
+
+def print_findings(findings: Sequence[Diagnostic], out: TextIO, style: str = "text", *, strict: bool = False) -> None:
+    """Write all findings in one of FORMATS; `strict` shows warnings as errors."""
+    if style == "json":
+        json.dump([as_data(finding, strict=strict) for finding in findings], out, indent=2)
+        out.write("\n")
+        return
+    coloured = is_coloured(out)
+    for finding in findings:
+        if style == "github":
+            out.write(as_github(finding, strict=strict) + "\n")
+        else:
+            out.write(as_text(finding, coloured=coloured, strict=strict) + "\n")
+
+
+def severity(finding: Diagnostic, *, strict: bool) -> Severity:
+    return Severity.ERROR if strict else finding.severity
+
+
+def count_line(findings: Sequence[Diagnostic], tables: int, *, strict: bool) -> str:
+    """`2 errors, 1 warning in 1 table`."""
+    errors = sum(severity(finding, strict=strict) is Severity.ERROR for finding in findings)
+    counts = [plural(errors, "error")] if errors else []
+    if len(findings) > errors:
+        counts.append(plural(len(findings) - errors, "warning"))
+    return f"{', '.join(counts)} in {plural(tables, 'table')}"
+
+
+def plural(count: int, noun: str) -> str:
+    return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
+def as_data(finding: Diagnostic, *, strict: bool) -> dict[str, str | int]:
+    """Lines and columns count from 1, `end_column` is exclusive."""
+    span = finding.span
+    return {
+        "file": span.file,
+        "line": span.line,
+        "column": span.column,
+        "end_column": span.end_column,
+        "severity": severity(finding, strict=strict).value,
+        "code": finding.code.value,
+        "message": finding.message,
+        "hint": finding.hint,
+    }
+
+
+def as_github(finding: Diagnostic, *, strict: bool) -> str:
+    """A workflow command, which shows the finding beside the line in a pull request."""
+    span = finding.span
+    text = finding.message + (f"; {finding.hint}" if finding.hint else "")
+    properties = {
+        "file": span.file,
+        "line": span.line,
+        "col": span.column,
+        "endColumn": span.end_column,
+        "title": finding.code.value,
+    }
+    listed = ",".join(f"{name}={_github_escaped(str(value), ':,')}" for name, value in properties.items())
+    return f"::{severity(finding, strict=strict).value} {listed}::{_github_escaped(text, '')}"
+
+
+def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
+    """The one-line form, then the source line with a caret where the file still has it."""
+    level = severity(finding, strict=strict)
+    colour = _RED if level is Severity.ERROR else _YELLOW
+    hint = f"; {finding.hint}" if finding.hint else ""
+    if coloured:
+        head = f"{_BOLD}{finding.span}: {colour}{level.value}[{finding.code.value}]{_RESET}{_BOLD}: "
+        first = f"{head}{visible(finding.message)}{_RESET}{visible(hint)}"
+    else:
+        first = visible(f"{finding.span}: {level.value}[{finding.code.value}]: {finding.message}{hint}")
+    return "\n".join((first, *_excerpt(finding.span, colour if coloured else "")))
+
+
+def is_coloured(out: TextIO) -> bool:
+    return out.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def visible(text: str) -> str:
+    """The text on one line: line ends and control characters as escapes."""
+    return _INVISIBLE.sub(lambda match: repr(match[0])[1:-1], text)
+
+
+def _excerpt(span: SourceSpan, colour: str) -> list[str]:
+    lines = _lines(span.file)
+    text = lines[span.line - 1] if span.line <= len(lines) else ""
+    if not text.strip():
+        return []
+    start, text = _window(text, span.column - 1)
+    before = text[: span.column - 1 - start]
+    marked = text[len(before) : span.end_column - 1 - start]
+    gap = "".join("\t" if character == "\t" else " " * _width(character) for character in before)
+    carets = "^" * max(sum(map(_width, marked)), 1)
+    if colour:
+        carets = f"{colour}{carets}{_RESET}"
+    return [f"{span.line:5d} | {visible(text)}", f"      | {gap}{carets}"]
+
+
+def _window(text: str, column: int) -> tuple[int, str]:
+    """What of a long line is shown, and where that begins."""
+    if len(text) <= _LONGEST_LINE:
+        return 0, text
+    start = max(0, min(column - _LONGEST_LINE // 2, len(text) - _LONGEST_LINE))
+    return start, text[start : start + _LONGEST_LINE]
+
+
+def _width(character: str) -> int:
+    """Columns of a terminal that a character takes; control characters are shown as escapes."""
+    if _INVISIBLE.match(character):
+        return len(visible(character))
+    if unicodedata.combining(character):
+        return 0
+    return 2 if unicodedata.east_asian_width(character) in "WF" else 1
+
+
+@functools.lru_cache(maxsize=16)
+def _lines(file: str) -> tuple[str, ...]:
+    """The lines of a file that has a finding; none if it cannot be read, which is the finding then."""
+    try:
+        with Path(file).open("rb") as stream:
+            data = stream.read(4 << 20) if Path(file).is_file() else b""
+    except (OSError, ValueError):
+        return ()
+    return tuple(re.split(r"\r\n|\r|\n", data.decode("utf-8", "replace").removeprefix("\ufeff")))
+
+
+def _github_escaped(text: str, more: str) -> str:
+    for character in "%\r\n" + more:
+        text = text.replace(character, f"%{ord(character):02X}")
+    return text
