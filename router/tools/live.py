@@ -1,0 +1,163 @@
+"""A running router seen from outside: the text of /metrics into rates and rows, one for each route.
+
+Knows the metrics' names from the books and nothing of who shows the rows (see `live_view`).
+"""
+
+from __future__ import annotations
+
+import http.client
+import urllib.request
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from router.compiler.books import METRICS
+from router.errors import TransportError
+from router.table.model import Address
+
+SCRAPE_TIMEOUT = 2.0
+"""Seconds; a router on this machine answers in milliseconds."""
+
+Labels = tuple[str, ...]
+Counts = Mapping[Labels, float]
+
+_LABELS = {metric.name: metric.labels for metric in METRICS}
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The router's metrics at one time. `at` in seconds of any clock; values by the books' metric name
+    and label values, both as the books order them."""
+
+    at: float
+    values: Mapping[str, Counts]
+
+    def counts(self, metric: str) -> Counts:
+        return self.values.get(metric, {})
+
+
+@dataclass(frozen=True, slots=True)
+class TargetRow:
+    """A destination or topic of a route: delivered messages in all and per second, lost and withheld ones."""
+
+    name: str
+    is_topic: bool
+    delivered: int
+    rate: float
+    dropped: Mapping[str, int]
+    filtered: int
+
+
+@dataclass(frozen=True, slots=True)
+class RouteRow:
+    """A route: messages taken in all and per second, and its targets."""
+
+    route: str
+    received: int
+    rate: float
+    targets: tuple[TargetRow, ...]
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Lost messages of all targets by reason."""
+        total: dict[str, int] = defaultdict(int)
+        for target in self.targets:
+            for reason, count in target.dropped.items():
+                total[reason] += count
+        return dict(total)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """All routes, in the order of the metrics, and what no route took, by reason."""
+
+    routes: tuple[RouteRow, ...]
+    received: int
+    rate: float
+    rejected: Mapping[str, int]
+    kernel_drops: int
+
+
+def scrape(address: Address) -> str:
+    """The text of a router's metrics. Raises TransportError when nobody answers there."""
+    url = f"http://{address}/metrics"
+    try:
+        with urllib.request.urlopen(url, timeout=SCRAPE_TIMEOUT) as answer:
+            text: str = answer.read().decode()
+    except (OSError, http.client.HTTPException) as error:
+        raise TransportError(f"no metrics at {url}: {error}") from error
+    return text
+
+
+def parse_metrics(text: str, at: float) -> Snapshot:
+    """The router's own series out of the Prometheus text format."""
+    values: dict[str, dict[Labels, float]] = defaultdict(dict)
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            name = sample.name.removeprefix("router_").removesuffix("_total")
+            if name in _LABELS:
+                values[name][tuple(sample.labels[label] for label in _LABELS[name])] = sample.value
+    return Snapshot(at, values)
+
+
+def view(before: Snapshot, after: Snapshot) -> View:
+    """Totals as of `after`, rates per second since `before`."""
+    routes = dict.fromkeys(route for route, _ in after.counts("messages_received"))
+    received = _total(after, "datagrams_received")
+    return View(
+        routes=tuple(_route_row(route, before, after) for route in routes),
+        received=received,
+        rate=_rate(received, _total(before, "datagrams_received"), before, after),
+        rejected=_by_last_label(after.counts("datagrams_rejected")),
+        kernel_drops=_total(after, "kernel_drops"),
+    )
+
+
+def _route_row(route: str, before: Snapshot, after: Snapshot) -> RouteRow:
+    received = _total(after, "messages_received", route)
+    return RouteRow(
+        route=route,
+        received=received,
+        rate=_rate(received, _total(before, "messages_received", route), before, after),
+        targets=tuple(
+            _target_row(metric, labels, before, after)
+            for metric in ("datagrams_sent", "messages_published")
+            for labels in after.counts(metric)
+            if labels[0] == route
+        ),
+    )
+
+
+def _target_row(metric: str, labels: Labels, before: Snapshot, after: Snapshot) -> TargetRow:
+    delivered = _total(after, metric, *labels)
+    dropped = {key: value for key, value in after.counts("messages_dropped").items() if key[:2] == labels}
+    return TargetRow(
+        name=labels[1],
+        is_topic=metric == "messages_published",
+        delivered=delivered,
+        rate=_rate(delivered, _total(before, metric, *labels), before, after),
+        dropped=_by_last_label(dropped),
+        filtered=_total(after, "messages_filtered", *labels),
+    )
+
+
+def _total(snapshot: Snapshot, metric: str, *labels: str) -> int:
+    """The sum over all series whose first labels are these."""
+    counts = snapshot.counts(metric)
+    return int(sum(value for key, value in counts.items() if key[: len(labels)] == labels))
+
+
+def _rate(now: int, then: int, before: Snapshot, after: Snapshot) -> float:
+    """Per second; a router that was started anew counts from zero."""
+    return (now - then if now >= then else now) / (after.at - before.at)
+
+
+def _by_last_label(counts: Counts) -> dict[str, int]:
+    """Totals by the reason, which is the last label, without those that never happened."""
+    total: dict[str, int] = defaultdict(int)
+    for labels, value in counts.items():
+        if value:
+            total[labels[-1]] += int(value)
+    return dict(total)

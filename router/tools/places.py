@@ -1,0 +1,118 @@
+"""Where to send to, listen on and send from: addresses as typed, or names of the route table; UDP sockets.
+
+Knows the table's endpoints and listeners, no payloads.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+from collections.abc import Callable
+
+from router.errors import did_you_mean
+from router.table.model import Address, RouteTable
+from router.tools import UsageError
+
+ANY_HOST = "0.0.0.0"
+LOOPBACK = "127.0.0.1"
+ANYWHERE = Address(ANY_HOST, 0)
+"""To send from whichever address and port the kernel likes."""
+
+
+def destination(text: str, table: RouteTable | None) -> Address:
+    """`HOST:PORT`, or the name of an endpoint or listener of the table."""
+    if (named := _named(text, table)) is not None:
+        return reachable(named)
+    host, colon, port = text.rpartition(":")
+    if not colon or not host:
+        raise UsageError(_not_a_place(text, table, "HOST:PORT"))
+    return Address(_resolve(host), _port(port, lowest=1))
+
+
+def listening(text: str, table: RouteTable | None) -> Address:
+    """`[HOST:]PORT` (every local address when there is no host), or a name of the table."""
+    if (named := _named(text, table)) is not None:
+        return named
+    host, _, port = text.rpartition(":")
+    if not port.isdigit():
+        raise UsageError(_not_a_place(text, table, "[HOST:]PORT"))
+    return Address(_resolve(host) if host else ANY_HOST, _port(port, lowest=0))
+
+
+def origin(text: str, table: RouteTable | None) -> Address:
+    """`HOST[:PORT]`, or an endpoint of the table: its host, and its `source_port` where it has one."""
+    if table is not None and text in table.endpoints:
+        endpoint = table.endpoints[text]
+        return Address(endpoint.address.value.host, endpoint.source_port.value if endpoint.source_port else 0)
+    host, colon, port = text.partition(":")
+    if not colon and table is not None and not host[:1].isdigit() and host != "localhost":
+        raise UsageError(_not_a_place(text, table, "HOST[:PORT]"))
+    return Address(_resolve(host), _port(port, lowest=0) if colon else 0)
+
+
+def reachable(address: Address) -> Address:
+    """Where to send so that a socket bound to this address receives it."""
+    return address._replace(host=LOOPBACK) if address.host == ANY_HOST else address
+
+
+def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
+    """A function from a peer's address to its endpoint's name, else to the address as text."""
+    by_peer: dict[tuple[str, int | None], str] = {}
+    for name, endpoint in table.endpoints.items() if table is not None else ():
+        port = endpoint.source_port.value if endpoint.source_port else None
+        by_peer[endpoint.address.value.host, port] = name
+
+    def name_of(peer: tuple[str, int]) -> str:
+        host, port = peer
+        return by_peer.get((host, port)) or by_peer.get((host, None)) or f"{host}:{port}"
+
+    return name_of
+
+
+def open_udp(address: Address, purpose: str) -> socket.socket:
+    """A non-blocking UDP socket bound to this address. Raises UsageError; `purpose` begins its message."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        opened.setblocking(False)
+        opened.bind(address)
+    except OSError as error:
+        opened.close()
+        raise UsageError(f"{purpose}: cannot bind {address}: {_bind_hint(error)}") from error
+    return opened
+
+
+def _bind_hint(error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return "another process has this port (see `ss -lunp`)"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return "this machine has no such address"
+    if error.errno == errno.EACCES:
+        return "ports below 1024 need root"
+    return error.strerror or str(error)
+
+
+def _named(text: str, table: RouteTable | None) -> Address | None:
+    if table is None:
+        return None
+    named = table.endpoints.get(text) or table.listeners.get(text)
+    return None if named is None else named.address.value
+
+
+def _not_a_place(text: str, table: RouteTable | None, form: str) -> str:
+    names = () if table is None else (*table.endpoints, *table.listeners)
+    hint = did_you_mean(text, names)
+    return f"'{text}' is neither {form} nor a name of the route table" + (f"; {hint}" if hint else "")
+
+
+def _resolve(host: str) -> str:
+    try:
+        found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
+    except OSError as error:
+        raise UsageError(f"no IPv4 address for '{host}': {error.strerror}") from error
+    return str(found[0][4][0])
+
+
+def _port(text: str, lowest: int) -> int:
+    if not text.isdigit() or not lowest <= int(text) <= 65535:
+        raise UsageError(f"'{text}' is not a UDP port; ports are {lowest} to 65535")
+    return int(text)

@@ -1,0 +1,74 @@
+"""What arrives on a UDP port, datagram by datagram, taken apart for a person or a program.
+
+Knows no command line; `places` opens the socket.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import socket
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from google.protobuf.json_format import MessageToDict
+
+from router.errors import DecodeError
+from router.tools.show import compact
+from router.tools.wire import Decoded, Wire
+
+LARGEST_DATAGRAM = 65_507
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """One datagram: when (local time), from whom, its bytes, and what it means or why it means nothing."""
+
+    at: dt.datetime
+    peer: str
+    data: bytes
+    decoded: Decoded | None
+    problem: str = ""
+
+    def line(self, with_hex: bool) -> str:
+        """`12:00:00.123 sensor_board imu_info accel_x=1.5`."""
+        start = f"{self.at.strftime('%H:%M:%S.%f')[:-3]} {self.peer}"
+        if self.decoded is None:
+            return f"{start} undecodable ({self.problem}): {self.data.hex() or 'no bytes'}"
+        line = f"{start} {self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}"
+        if self.decoded.zeros:
+            line += f" ({self._repair(self.decoded.zeros)})"
+        return f"{line} [{self.data.hex()}]" if with_hex else line
+
+    def _repair(self, zeros: int) -> str:
+        return f"trimmed: {zeros} zeros put back" if zeros > 0 else f"padded: {-zeros} zeros taken off"
+
+    def json(self, with_hex: bool) -> str:
+        """One JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
+        said: dict[str, object] = {"time": self.at.isoformat(), "peer": self.peer, "bytes": len(self.data)}
+        if self.decoded is None:
+            said["problem"] = self.problem
+        else:
+            said["case"] = self.decoded.case.name
+            said["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
+            said["zeros_restored"] = self.decoded.zeros
+        if with_hex or self.decoded is None:
+            said["hex"] = self.data.hex()
+        return json.dumps(said)
+
+
+def listen(receiver: socket.socket, wire: Wire, name_of: Callable[[tuple[str, int]], str]) -> Iterator[Heard]:
+    """Wait for one datagram after the other, for ever."""
+    receiver.setblocking(True)
+    while True:
+        data, peer = receiver.recvfrom(LARGEST_DATAGRAM)
+        yield heard(data, name_of(peer), wire)
+
+
+def heard(data: bytes, peer: str, wire: Wire) -> Heard:
+    """A datagram that has just arrived."""
+    at = dt.datetime.now().astimezone()
+    try:
+        return Heard(at, peer, data, wire.decode(data))
+    except DecodeError as error:
+        return Heard(at, peer, data, None, str(error))

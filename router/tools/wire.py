@@ -1,0 +1,116 @@
+"""The envelope as a tool sees it: which there is, datagrams built and taken apart.
+
+Loads table and `.proto` files once at start; knows no sockets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from google.protobuf.message import DecodeError as ProtobufError
+from google.protobuf.message import Message
+from google.protobuf.unknown_fields import UnknownFieldSet
+
+from router.engine import MAX_DATAGRAM
+from router.engine.framing import restored
+from router.errors import DecodeError, Severity, SourceSpan, TableError, did_you_mean, shown_path
+from router.table import load_table
+from router.table.model import EnvelopeSettings, Located, RouteTable
+from router.tools import UsageError
+from router.tools.fields import set_fields
+from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
+
+ENVELOPE, ONEOF = "PBEnvelope", "payload"
+"""The envelope's names where there is no table to say them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A payload and its case. `zeros` were put back at the end of the datagram; negative: taken off."""
+
+    case: PayloadCase
+    message: Message
+    zeros: int
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """The envelope and its payload cases, for building datagrams and taking them apart."""
+
+    envelope: Envelope
+
+    def case(self, name: str) -> PayloadCase:
+        """Raises UsageError for a payload case that does not exist."""
+        if name not in self.envelope.cases:
+            hint = did_you_mean(name, self.envelope.cases)
+            raise UsageError(f"{self.envelope.name} has no payload case '{name}'; {hint}")
+        return self.envelope.cases[name]
+
+    def encode(self, case: PayloadCase, payload: Message) -> bytes:
+        """The exact encoding of an envelope that holds this payload."""
+        outer = self.envelope.message_class()
+        inner = getattr(outer, case.name)
+        inner.SetInParent()
+        inner.CopyFrom(payload)
+        return outer.SerializeToString()
+
+    def decode(self, datagram: bytes) -> Decoded:
+        """Take a datagram apart as a listener with `framing: zero_trimmed` does.
+
+        Raises DecodeError, which begins with the reason that the router counts such a datagram under.
+        """
+        if not datagram:
+            raise DecodeError("empty")
+        if len(datagram) > MAX_DATAGRAM:
+            raise DecodeError(f"truncated: {len(datagram)} bytes, the router takes {MAX_DATAGRAM}")
+        whole = restored(datagram, MAX_DATAGRAM)
+        try:
+            outer = self.envelope.message_class.FromString(whole)
+        except ProtobufError as error:
+            raise DecodeError(f"malformed: no {self.envelope.name}") from error
+        name = outer.WhichOneof(self.envelope.oneof)
+        if name is None:
+            unknown = ", ".join(str(field.field_number) for field in UnknownFieldSet(outer))  # type: ignore[attr-defined]
+            raise DecodeError(f"unknown_case: field {unknown}" if unknown else "no_payload")
+        return Decoded(self.envelope.cases[name], getattr(outer, name), len(whole) - len(datagram))
+
+
+def read_table(path: Path) -> RouteTable:
+    """Raises TableError when the table has errors: a half-read one would send to the wrong place."""
+    table, findings = load_table(path)
+    if table is None or any(finding.severity is Severity.ERROR for finding in findings):
+        raise TableError(findings)
+    return table
+
+
+def wire_of_table(table: RouteTable) -> Wire:
+    """The envelope that the table names. Raises TableError."""
+    return _wire(table.envelope)
+
+
+def wire_of_protos(root: Path) -> Wire:
+    """The envelope `PBEnvelope.payload` of a folder of `.proto` files. Raises TableError."""
+    span = SourceSpan(shown_path(root))
+    return _wire(EnvelopeSettings(Located(root, span), Located(ENVELOPE, span), Located(ONEOF, span)))
+
+
+def _wire(settings: EnvelopeSettings) -> Wire:
+    schema = load_protos(settings.protos.value, settings.protos.span)
+    return Wire(find_envelope(schema, settings))
+
+
+def payload(case: PayloadCase, words: Sequence[str]) -> Message:
+    """A payload with these `field=value` words set. Raises UsageError."""
+    message = case.message_class()
+    set_fields(message, case.type, words)
+    return message
+
+
+def as_old_boards_send(exact: bytes, trim: bool, pad: int) -> bytes:
+    """Without trailing zero bytes when `trim`; then filled with zeros to `pad` bytes. Raises UsageError."""
+    framed = exact.rstrip(b"\0") if trim else exact
+    if pad and len(framed) > pad:
+        raise UsageError(f"the datagram has {len(framed)} bytes and cannot be padded to {pad}")
+    return framed.ljust(pad, b"\0")
