@@ -1,0 +1,85 @@
+"""`router send CASE field=value ... --to PLACE`: build any payload and send it, once or at a rate."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from typing import TYPE_CHECKING
+
+from router.cli.tool_options import add_wire_options, explained, load_wire, positive, whole
+
+if TYPE_CHECKING:
+    from router.table.model import Address, RouteTable
+    from router.tools.sending import Sent
+
+EPILOG = """\
+examples:
+  router send imu_info accel_x=1.5 state=SENSOR_OPERATING --to 127.0.0.1:5000
+  router send imu_info accel_z=9.81 --table routes/sim.yaml --to rover --from sensor_board --rate 100 --count 1000
+  router send detected_object bbox.x=0x10 type=OBJECT_ROCK --to basestation
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser(
+        "send",
+        help="build a payload and send it to an address",
+        description="Build a payload from field=value words and send it in an envelope.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info")
+    parser.add_argument("fields", nargs="*", metavar="FIELD=VALUE", help="x=1, bbox.x=3, points[1]=2, state=NAME")
+    parser.add_argument("--to", required=True, metavar="PLACE", help="HOST:PORT, or a name of the table")
+    parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table")
+    parser.add_argument("--rate", type=positive, metavar="HZ", help="per second (default: as fast as possible)")
+    parser.add_argument("--count", type=whole, metavar="N", help="how many (default: 1, with --rate until Ctrl-C)")
+    parser.add_argument("--trim", action="store_true", help="remove trailing zero bytes, as the old boards do")
+    parser.add_argument("--pad", type=whole, default=0, metavar="N", help="fill up with zeros to N bytes, as they do")
+    add_wire_options(parser)
+
+
+@explained
+def run(args: argparse.Namespace) -> int:
+    from router.tools import places
+    from router.tools.sending import Sent, send
+    from router.tools.wire import as_old_boards_send, payload
+
+    wire, table = load_wire(args)
+    case = wire.case(args.case)
+    exact = wire.encode(case, payload(case, args.fields))
+    data = as_old_boards_send(exact, args.trim, args.pad)
+    to = places.destination(args.to, table)
+    origin = places.origin(args.origin, table) if args.origin else places.ANYWHERE
+    count = args.count if args.count is not None else None if args.rate else 1
+    sent = Sent()
+    # A flood without --count ends with Ctrl-C; what was sent until then is told below.
+    with places.open_udp(origin, "--from") as sender, contextlib.suppress(KeyboardInterrupt):
+        send(sender, to, data, count, args.rate, sent)
+    print(_told(args.case, data, to, sent))
+    return _advise(args, table, to, sent)
+
+
+def _told(case: str, data: bytes, to: Address, sent: Sent) -> str:
+    if sent.count == 1:
+        return f"sent {case} to {to}: {len(data)} bytes {data.hex()}"
+    rate = f" in {sent.seconds:.2f} s ({sent.rate:.1f}/s)" if sent.rate else ""
+    return f"sent {case} to {to} {sent.count} times{rate}: {len(data)} bytes each"
+
+
+def _advise(args: argparse.Namespace, table: RouteTable | None, to: Address, sent: Sent) -> int:
+    """Say on stderr why nothing may have come of it. The exit code: 1 when the other side refused."""
+    if sent.refused:
+        print(f"router send: nobody listens on {to}", file=sys.stderr)
+        return 1
+    if table is None or args.origin or args.to not in table.listeners:
+        return 0
+    sources = [name.value for route in table.routes if route.case.value == args.case for name in route.sources]
+    if named := [name for name in sources if name in table.endpoints]:
+        print(
+            f"router send: the table takes {args.case} from {' or '.join(named)} only; "
+            f"add --from {named[0]} unless this machine has its address",
+            file=sys.stderr,
+        )
+    return 0

@@ -1,0 +1,91 @@
+"""`router sim [TABLE]`: play all boards and the basestation of a table on this machine."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from router.cli.tool_options import explained, positive
+
+if TYPE_CHECKING:
+    from router.tools.sim_view import SimView
+    from router.tools.simulator import Simulator
+
+TERMINAL_REFRESH = 0.5
+JSON_REFRESH = 1.0
+LINE_REFRESH = 5.0
+"""Seconds between two looks at the statistics, by who looks."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser(
+        "sim",
+        help="play all boards and the basestation",
+        description="Send plausible, moving values from every endpoint of a table and show what comes back to it.",
+    )
+    default = Path("routes/sim.yaml")
+    parser.add_argument("table", nargs="?", type=Path, default=default, metavar="TABLE", help=f"default: {default}")
+    parser.add_argument("--duration", type=positive, metavar="SECONDS", help="default: until Ctrl-C")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="the same seed sends the same values")
+    parser.add_argument("--rate-scale", type=positive, default=1.0, metavar="X", help="2 sends twice as often")
+    parser.add_argument("--json", action="store_true", help="statistics as JSON, one line a second; the last is final")
+
+
+@explained
+def run(args: argparse.Namespace) -> int:
+    from router.tools.sim_view import SimView
+    from router.tools.simulator import Simulator
+    from router.tools.wire import read_table, wire_of_table
+
+    table = read_table(args.table)
+    wire = wire_of_table(table)
+    simulator = Simulator(wire, table, args.seed, args.rate_scale)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: simulator.stop())
+    view = SimView(wire, simulator.statistics)
+    show = _show_json if args.json else _show_terminal if sys.stdout.isatty() else _show_lines
+    try:
+        show(simulator, view, args)
+    finally:
+        simulator.close()
+    return 0
+
+
+def _show_json(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
+    def write(seconds: float, final: bool) -> None:
+        print(json.dumps(view.as_json(seconds, final)), flush=True)
+
+    write(simulator.run(args.duration, JSON_REFRESH, lambda seconds: write(seconds, False)), True)
+
+
+def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
+    def write(seconds: float) -> None:
+        view.look(seconds)
+        print(view.line(), flush=True)
+
+    print(f"simulating {simulator.summary} until Ctrl-C", flush=True)
+    write(simulator.run(args.duration, LINE_REFRESH, write))
+
+
+def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
+    """In place on the whole screen; the summary stays when it ends."""
+    from rich.console import Console, Group
+    from rich.live import Live
+    from rich.text import Text
+
+    console = Console()
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+
+        def draw(seconds: float) -> None:
+            view.look(seconds)
+            title = f"{simulator.summary}; Ctrl-C ends it"
+            live.update(Group(Text(title, style="bold"), view.headline(), view.table(console.height - 3)), refresh=True)
+
+        seconds = simulator.run(args.duration, TERMINAL_REFRESH, draw)
+    view.look(seconds)
+    console.print(view.table(1000))
+    console.print(view.line())
