@@ -327,3 +327,19 @@ def _repeat(out: Source, repeat: Repeat, name: str) -> None:
         return
     with out.block(f"for {repeat.variable} in values:", repeat.span):
         _write(out, _runs(repeat.body), name, repeat.span)
+
+
+def message_size(plan: Record) -> tuple[int, bool]:
+    """The size of the CDR bytes with header, and whether it is exact; else strings and sequences count as empty."""
+    size, exact = 0, True
+    for step in steps(plan):
+        match step:
+            case Put() | Blob():
+                size += -size % step.alignment + step.size
+            case Text():
+                size += -size % 4 + (4 if step.wide else 5)
+                exact = False
+            case Repeat():
+                size += -size % 4 + 4 if step.type.length is None else 0
+                exact = False
+    return len(HEADER) + size, exact

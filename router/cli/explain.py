@@ -1,0 +1,136 @@
+"""`router explain`: a route as the router understands it, down to the code that serves it.
+
+Prints what the compiler found out; finds out nothing itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
+from router.cli.findings import is_coloured, print_findings
+from router.compiler import Checked, check_table, compile_handler
+from router.compiler.books import Books
+from router.compiler.cdr import message_size
+from router.compiler.mapping import Each, Items, Plan, Record, Row, Unset
+from router.compiler.routes import CheckedRoute, CheckedTarget
+from router.compiler.topics import qos_of
+from router.errors import did_you_mean
+from router.table.model import ANY, ROS, RouteTable
+from router.types.sizes import framed_size
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser("explain", help=VERBS["explain"])
+    parser.add_argument("cases", nargs="*", metavar="CASE", help="payload cases; all of the table when none is named")
+    parser.add_argument("--table", type=Path, default=Path("routes/rover.yaml"), help="default: %(default)s")
+    parser.add_argument("--no-code", action="store_true", help="leave the generated code out")
+
+
+def run(args: argparse.Namespace) -> int:
+    checked = check_table(args.table)
+    print_findings(checked.diagnostics, sys.stderr)
+    if checked.has_errors or checked.table is None:
+        return BAD_TABLE
+    routes = {route.case.name: route for route in checked.routes}
+    for name in args.cases:
+        if name not in routes:
+            print(f"router explain: {args.table} has no route '{name}'; {did_you_mean(name, routes)}", file=sys.stderr)
+            return BAD_USAGE
+    for name in args.cases or routes:
+        for line in _explained(routes[name], checked.table, checked):
+            print(line)
+        if not args.no_code and _is_served(routes[name]):
+            _print_code(compile_handler(routes[name], checked.table, Books()).source)
+        print()
+    return OK
+
+
+def _is_served(checked: CheckedRoute) -> bool:
+    return not checked.route.ignore and not checked.route.is_outbound
+
+
+def _explained(checked: CheckedRoute, table: RouteTable, everything: Checked) -> Iterator[str]:
+    route, case = checked.route, checked.case
+    envelope = everything.envelope
+    assert envelope is not None  # noqa: S101 - a table without errors has one
+    yield f"{case.name}: {case.type.name}, field {case.number} of {envelope.name}  ({route.case.span})"
+    if case.max_size is not None:
+        datagram = framed_size(case.number, case.max_size)
+        yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
+    if route.ignore is not None:
+        yield f"  ignored: {route.ignore.value}"
+        return
+    yield f"  source: {', '.join(_source(source.value, table) for source in route.sources)}"
+    for served in checked.targets:
+        yield ""
+        yield from _target(served, table, outbound=route.is_outbound)
+    if route.is_outbound:
+        yield ""
+        yield "  checked only: this version carries no messages from ROS to UDP"
+
+
+def _source(name: str, table: RouteTable) -> str:
+    if name in (ANY, ROS):
+        return name
+    endpoint = table.endpoints[name]
+    port = f":{endpoint.source_port.value}" if endpoint.source_port else ""
+    return f"{name} ({endpoint.address.value.host}{port})"
+
+
+def _target(served: CheckedTarget, table: RouteTable, *, outbound: bool) -> Iterator[str]:
+    target, topic = served.target, served.topic
+    if topic is None or outbound:
+        endpoint = table.endpoints[target.name]
+        how = f"from topic {topic.topic.value} ({topic.type.value})" if topic else "unchanged"
+        trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
+        yield f"  destination {target.name} ({endpoint.address.value}): {how}{trimmed}  ({target.span})"
+    else:
+        qos = {name: value for name, value in asdict(qos_of(topic)).items() if value is not None}
+        yield f"  topic {target.name}: {topic.type.value}  ({target.span})"
+        yield f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"
+        if target.plan is not None:
+            size, exact = message_size(target.plan)
+            yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
+    if target.max_rate is not None:
+        yield f"    at most {target.max_rate:g} Hz"
+    yield from _mapping(served.rows)
+    if target.plan is not None and (unset := list(_unset(target.plan, ""))):
+        yield f"    left at their defaults: {', '.join(unset)}"
+
+
+def _mapping(rows: Sequence[Row]) -> Iterator[str]:
+    cells = [(row.target, row.target_type, "<-", row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells)]
+    for cell in cells:
+        yield ("    " + "  ".join(text.ljust(width) for text, width in zip(cell, widths))).rstrip()
+
+
+def _unset(plan: Plan, prefix: str) -> Iterator[str]:
+    """The fields that nothing fills; a message of which nothing is filled counts as one."""
+    match plan:
+        case Unset():
+            yield prefix
+        case Record():
+            for member, inner in plan.members:
+                yield from _unset(inner, f"{prefix}.{member.name}" if prefix else member.name)
+        case Items():
+            for index, inner in enumerate(plan.items):
+                yield from _unset(inner, f"{prefix}[{index}]")
+        case Each():
+            yield from _unset(plan.element, f"{prefix}[]")
+
+
+def _print_code(source: str) -> None:
+    print()
+    if is_coloured(sys.stdout):
+        from rich.console import Console
+        from rich.syntax import Syntax
+
+        Console().print(Syntax(source, "python", background_color="default"))
+    else:
+        print(source, end="")
