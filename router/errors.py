@@ -41,49 +41,57 @@ class Severity(enum.Enum):
 class Code(enum.Enum):
     """Every kind of finding. Tests match the code, people read the sentence; the list is closed."""
 
+    meaning: str
+
+    def __new__(cls, value: str, meaning: str) -> Code:
+        code = object.__new__(cls)
+        code._value_ = value
+        code.meaning = meaning
+        return code
+
     # the text
-    BAD_FILE = "bad-file"
-    BAD_YAML = "bad-yaml"
-    DUPLICATE_KEY = "duplicate-key"
-    AMBIGUOUS_SCALAR = "ambiguous-scalar"
-    UNDEFINED_VARIABLE = "undefined-variable"
-    BAD_EXTENDS = "bad-extends"
+    BAD_FILE = ("bad-file", "A file cannot be read, or holds something else than it should.")
+    BAD_YAML = ("bad-yaml", "The table is not YAML, or uses YAML that tables do not have (tags, merge keys, several documents).")
+    DUPLICATE_KEY = ("duplicate-key", "A mapping has the same key twice.")
+    AMBIGUOUS_SCALAR = ("ambiguous-scalar", "A plain word or number that YAML parsers read differently (`on`, `0777`, `12:30`).")
+    UNDEFINED_VARIABLE = ("undefined-variable", "`${NAME}` has no value in the environment, and no default.")
+    BAD_EXTENDS = ("bad-extends", "The table that `extends` names is missing, or extends this one.")
     # the shape
-    UNKNOWN_KEY = "unknown-key"
-    MISSING_KEY = "missing-key"
-    WRONG_TYPE = "wrong-type"
-    BAD_VALUE = "bad-value"
-    BAD_ADDRESS = "bad-address"
-    UNKNOWN_QOS_VALUE = "unknown-qos-value"
+    UNKNOWN_KEY = ("unknown-key", "A key that this place does not have.")
+    MISSING_KEY = ("missing-key", "A key that this place must have.")
+    WRONG_TYPE = ("wrong-type", "A value of another kind than the key takes.")
+    BAD_VALUE = ("bad-value", "A value of the right kind that makes no sense here.")
+    BAD_ADDRESS = ("bad-address", "Not an IPv4 address with a port.")
+    UNKNOWN_QOS_VALUE = ("unknown-qos-value", "A word that is no setting of ROS QoS.")
     # the wire definitions
-    BAD_PROTO = "bad-proto"
-    WIRE_NUMBER_CONFLICT = "wire-number-conflict"
-    DUPLICATE_MESSAGE = "duplicate-message"
-    NOT_LOCKED = "not-locked"
+    BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares what cannot be routed.")
+    WIRE_NUMBER_CONFLICT = ("wire-number-conflict", "A field number on the wire was reused, renumbered, retyped or renamed.")
+    DUPLICATE_MESSAGE = ("duplicate-message", "Two protobuf messages have one name.")
+    NOT_LOCKED = ("not-locked", "`envelope.lock.json` does not record this yet: run `router schema lock`.")
     # the names
-    UNKNOWN_PAYLOAD_CASE = "unknown-payload-case"
-    UNCOVERED_PAYLOAD_CASE = "uncovered-payload-case"
-    UNKNOWN_ENDPOINT = "unknown-endpoint"
-    ADDRESS_CLASH = "address-clash"
-    FORWARDING_LOOP = "forwarding-loop"
-    BAD_TOPIC_NAME = "bad-topic-name"
-    TOPIC_TYPE_CLASH = "topic-type-clash"
-    UNKNOWN_ROS_TYPE = "unknown-ros-type"
-    UNKNOWN_FIELD = "unknown-field"
-    UNKNOWN_ENUM_VALUE = "unknown-enum-value"
-    QOS_CONFLICT = "qos-conflict"
-    BOARD_PAYLOAD = "board-payload"
-    NO_TARGET = "no-target"
+    UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that the envelope does not have.")
+    UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
+    UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that `endpoints` does not have.")
+    ADDRESS_CLASH = ("address-clash", "Two listeners want one address, or two endpoints could not be told apart.")
+
+    BAD_TOPIC_NAME = ("bad-topic-name", "Not a ROS topic name.")
+    TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes give one topic different types.")
+    UNKNOWN_ROS_TYPE = ("unknown-ros-type", "No installed package, nor `schemas/`, has this interface.")
+    UNKNOWN_FIELD = ("unknown-field", "A field that the source message or the target does not have.")
+
+    QOS_CONFLICT = ("qos-conflict", "QoS settings that contradict each other, or that keep publisher and subscriber apart.")
+
+    NO_TARGET = ("no-target", "A route that goes nowhere.")
     # the mapping
-    DUPLICATE_FIELD = "duplicate-field"
-    NOTHING_MAPPED = "nothing-mapped"
-    EXPRESSION_SYNTAX = "expression-syntax"
-    FORBIDDEN_EXPRESSION = "forbidden-expression"
-    UNKNOWN_FUNCTION = "unknown-function"
-    WRONG_ARGUMENTS = "wrong-arguments"
-    TYPE_MISMATCH = "type-mismatch"
-    LOSSY_CONVERSION = "lossy-conversion"
-    OUT_OF_RANGE = "out-of-range"
+    DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice.")
+    NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")
+    EXPRESSION_SYNTAX = ("expression-syntax", "Not an expression.")
+    FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python that expressions do not have.")
+    UNKNOWN_FUNCTION = ("unknown-function", "A function that is not listed in [functions](functions.md).")
+    WRONG_ARGUMENTS = ("wrong-arguments", "A call with too many, too few or unsuitable arguments.")
+    TYPE_MISMATCH = ("type-mismatch", "A value of a type that does not fill this field, or that an operator does not take.")
+    LOSSY_CONVERSION = ("lossy-conversion", "A conversion that could lose something without saying so.")
+    OUT_OF_RANGE = ("out-of-range", "A value that can never fit.")
 
     @property
     def severity(self) -> Severity:

@@ -1,0 +1,69 @@
+"""Writes the reference pages that have their truth in the code: `python docs/generate.py`.
+
+tests/test_docs.py fails when a page is not what this would write.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from router.compiler.books import DROP_REASONS, HISTOGRAM_BOUNDS_NS, METRICS, REJECT_REASONS
+from router.compiler.functions import FUNCTIONS
+from router.errors import Code
+
+HERE = Path(__file__).parent
+_MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
+
+
+def functions_page() -> str:
+    """The functions of the expression language, from their declarations."""
+    lines = ["# Functions in expressions", "", _MADE]
+    for function in FUNCTIONS.values():
+        lines += [f"## `{function.signature}`", "", function.summary, ""]
+        lines += [f"- `{expression}` is `{value!r}`" for expression, value in function.examples]
+        lines += [""]
+    lines += ["## `has(field)`", "", "Whether a submessage or an optional field is set, as in `when: has(bbox)`.", ""]
+    return "\n".join(lines)
+
+
+def metrics_page() -> str:
+    """Every metric with its labels, from the books."""
+    bounds = ", ".join(f"{bound / 1000:g}" for bound in HISTOGRAM_BOUNDS_NS)
+    lines = ["# Metrics", "", _MADE, "| metric | type | labels | meaning |", "|---|---|---|---|"]
+    for metric in METRICS:
+        suffix = "_total" if metric.kind == "counter" else ""
+        labels = ", ".join(metric.labels)
+        lines.append(f"| `router_{metric.name}{suffix}` | {metric.kind} | {labels} | {metric.help} |")
+    lines += [
+        "| `router_build_info` | gauge | version, table_sha256, protos_sha256 | Always 1; says what is running. |",
+        "",
+        "Every series exists at 0 from the start. The books balance: per listener, received = rejected + accepted;",
+        "per route and target, accepted = delivered + dropped + filtered.",
+        "",
+        f"Reasons of `router_datagrams_rejected_total`: {', '.join(REJECT_REASONS)}.",
+        "",
+        f"Reasons of `router_messages_dropped_total`: {', '.join(DROP_REASONS)}.",
+        "",
+        f"Upper bounds of `router_route_seconds`, in microseconds: {bounds}.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def findings_page() -> str:
+    """The closed list of codes."""
+    lines = ["# Codes of findings", "", _MADE, "| code | severity | meaning |", "|---|---|---|"]
+    lines += [f"| `{code.value}` | {code.severity.value} | {code.meaning} |" for code in Code]
+    return "\n".join([*lines, ""])
+
+
+PAGES = {"functions.md": functions_page, "metrics.md": metrics_page, "findings.md": findings_page}
+
+
+def main() -> None:
+    for name, page in PAGES.items():
+        (HERE / name).write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
