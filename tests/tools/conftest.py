@@ -1,14 +1,37 @@
 from __future__ import annotations
 
 import shutil
+import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from router.tools.wire import Wire, wire_of_protos
+from router.table.model import RouteTable
+from router.tools.wire import Wire, read_table, wire_of_protos
 from router.types.protobuf import PayloadCase
 
 HERE = Path(__file__).parent
+
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+  rover: {{address: 0.0.0.0:{rover}}}
+endpoints:
+  board: {{address: 127.0.6.30:{board}, kind: board}}
+  station: {{address: 127.0.6.10:{station}, kind: basestation{source_port}}}
+routes:
+  every_kind: {{source: {source}, destinations: [station]}}
+  plain: {{source: station, destinations: [board]}}
+"""
+
+
+def free_port(host: str) -> int:
+    """A UDP port that nobody had a moment ago."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="session")
@@ -27,3 +50,29 @@ def wire(protos: Path) -> Wire:
 @pytest.fixture(scope="session")
 def every_kind(wire: Wire) -> PayloadCase:
     return wire.case("every_kind")
+
+
+@pytest.fixture
+def table_path(protos: Path, tmp_path: Path) -> Callable[..., Path]:
+    """A table of a board and a basestation on free ports; `source` is that of `every_kind`."""
+
+    def write(source: str = "board", source_port: bool = False) -> Path:
+        path = tmp_path / "table.yaml"
+        path.write_text(
+            TABLE.format(
+                protos=protos,
+                rover=free_port("0.0.0.0"),
+                board=free_port("127.0.6.30"),
+                station=free_port("127.0.6.10"),
+                source=source,
+                source_port=f", source_port: {free_port('127.0.6.10')}" if source_port else "",
+            )
+        )
+        return path
+
+    return write
+
+
+@pytest.fixture
+def table(table_path: Callable[..., Path]) -> RouteTable:
+    return read_table(table_path())

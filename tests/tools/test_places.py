@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from router.table.model import Address, RouteTable
+from router.tools import UsageError, places
+from router.tools.wire import read_table
+
+
+def test_addresses_as_typed(table: RouteTable) -> None:
+    assert places.destination("127.0.0.1:5000", table) == Address("127.0.0.1", 5000)
+    assert places.destination("localhost:5000", None) == Address("127.0.0.1", 5000)
+    assert places.listening("5000", None) == Address("0.0.0.0", 5000)
+    assert places.listening("127.0.0.1:5000", table) == Address("127.0.0.1", 5000)
+    assert places.origin("127.0.0.7", table) == Address("127.0.0.7", 0)
+    assert places.origin("127.0.0.7:70", None) == Address("127.0.0.7", 70)
+
+
+def test_names_of_the_table(table: RouteTable) -> None:
+    rover, board = table.listeners["rover"].address.value, table.endpoints["board"].address.value
+    assert places.destination("rover", table) == Address("127.0.0.1", rover.port)
+    assert places.listening("rover", table) == rover
+    assert places.destination("board", table) == board
+    assert places.origin("board", table) == Address(board.host, 0)
+
+
+def test_an_endpoint_known_by_its_source_port_sends_from_it(table_path: Callable[..., Path]) -> None:
+    table = read_table(table_path(source_port=True))
+    source_port = table.endpoints["station"].source_port
+    assert source_port is not None
+    assert places.origin("station", table) == Address("127.0.6.10", source_port.value)
+    name_of = places.peer_names(table)
+    assert name_of(("127.0.6.10", source_port.value)) == "station"
+    assert name_of(("127.0.6.10", 1)) == "127.0.6.10:1"
+
+
+def test_peers_are_named_by_their_address(table: RouteTable) -> None:
+    name_of = places.peer_names(table)
+    assert name_of(("127.0.6.30", 12345)) == "board"
+    assert name_of(("127.0.0.1", 12345)) == "127.0.0.1:12345"
+
+
+@pytest.mark.parametrize(
+    ("resolve", "text", "complaint"),
+    [
+        (places.destination, "boart", "'boart' is neither HOST:PORT nor a name of the route table; did you mean 'board'?"),
+        (places.destination, "127.0.0.1:0", "'0' is not a UDP port; ports are 1 to 65535"),
+        (places.destination, "127.0.0.1:70000", "'70000' is not a UDP port; ports are 1 to 65535"),
+        (places.listening, "127.0.0.1", "'127.0.0.1' is neither [HOST:]PORT nor a name of the route table; known: "),
+        (places.origin, "statio", "'statio' is neither HOST[:PORT] nor a name of the route table; did you mean 'station'?"),
+    ],
+)
+def test_a_place_that_is_none_is_explained(
+    table: RouteTable, resolve: Callable[[str, RouteTable], Address], text: str, complaint: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        resolve(text, table)
+    assert str(caught.value).startswith(complaint)
+
+
+def test_a_port_that_is_taken_and_an_address_that_is_not_ours_are_named() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
+        first.bind(("127.0.0.1", 0))
+        taken = Address(*first.getsockname())
+        with pytest.raises(UsageError, match=f"board: cannot bind {taken}: another process has this port"):
+            places.open_udp(taken, "board")
+    with pytest.raises(UsageError, match="cannot bind 192.0.2.1:5000: this machine has no such address"):
+        places.open_udp(Address("192.0.2.1", 5000), "board")

@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from router.table.model import RouteTable
+from router.tools import UsageError
+from router.tools.places import LOOPBACK, open_udp, reachable
+from router.tools.sim_view import SimView
+from router.tools.simulator import Simulator, streams
+from router.tools.wire import Wire, read_table
+
+FAST = 100.0
+
+
+def simulate(simulator: Simulator, until: Callable[[], bool]) -> None:
+    """Runs until the condition holds; a simulator that never gets there is stopped after 10 s."""
+
+    def look(_: float) -> None:
+        if until():
+            simulator.stop()
+
+    simulator.run(10, 0.01, look)
+    assert until()
+
+
+@pytest.fixture
+def router(table: RouteTable) -> socket.socket:
+    """The address that the simulated endpoints send to."""
+    return open_udp(reachable(table.listeners["rover"].address.value), "router")
+
+
+def received(router: socket.socket, wire: Wire) -> dict[str, set[str]]:
+    """Payload cases by the host that sent them."""
+    cases: dict[str, set[str]] = {}
+    while True:
+        try:
+            data, peer = router.recvfrom(2000)
+        except BlockingIOError:
+            return cases
+        cases.setdefault(peer[0], set()).add(wire.decode(data).case.name)
+
+
+def test_each_endpoint_sends_its_cases_from_its_own_address(wire: Wire, table: RouteTable, router: socket.socket) -> None:
+    with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
+        simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
+        assert received(router, wire) == {"127.0.6.30": {"every_kind"}, "127.0.6.10": {"plain"}}
+
+
+def test_what_comes_back_is_counted_by_endpoint_and_case(wire: Wire, table: RouteTable) -> None:
+    station = table.endpoints["station"].address.value
+    with closing(Simulator(wire, table, seed=1)) as simulator, open_udp(reachable(station)._replace(port=0), "x") as peer:
+        for data in (bytes.fromhex("0a021005"), bytes.fromhex("0a021006"), b"\xff"):
+            peer.sendto(data, station)
+        statistics = simulator.statistics
+        simulate(simulator, lambda: bool(statistics.undecodable))
+        arrivals = statistics.received["station", "every_kind"]
+        assert (arrivals.count, list(statistics.received)) == (2, [("station", "every_kind")])
+        said = json.loads(json.dumps(SimView(wire, statistics).as_json(1.0, final=True)))
+        assert said["received"] == {"station": {"every_kind": {"count": 2, "last": {"i32": 6}}}}
+        assert said["undecodable"] == {"station": 1}
+
+
+def test_an_endpoint_with_a_source_port_sends_from_it(
+    wire: Wire, table_path: Callable[..., Path]
+) -> None:
+    table = read_table(table_path(source_port=True))
+    station = table.endpoints["station"]
+    assert station.source_port is not None
+    router = open_udp(reachable(table.listeners["rover"].address.value), "router")
+    with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
+        simulate(simulator, lambda: simulator.statistics.sent["station", "plain"] > 0)
+        peers = set()
+        while ("127.0.6.10", station.source_port.value) not in peers:
+            peers.add(router.recvfrom(2000)[1])
+
+
+def test_a_case_of_any_source_comes_from_a_stranger(wire: Wire, table_path: Callable[..., Path]) -> None:
+    table = read_table(table_path(source="any"))
+    router = open_udp(reachable(table.listeners["rover"].address.value), "router")
+    with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
+        simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
+        assert received(router, wire)[LOOPBACK] == {"every_kind"}
+
+
+def test_rates_and_offsets_follow_from_seed_and_scale(wire: Wire, table: RouteTable) -> None:
+    first, again = list(streams(wire, table, 5, 2.0)), list(streams(wire, table, 5, 2.0))
+    assert first == again
+    assert first != list(streams(wire, table, 6, 2.0))
+    assert [stream.rate for stream in first] == [4.0, 4.0]
+
+
+def test_an_unknown_source_is_named(wire: Wire, table_path: Callable[..., Path]) -> None:
+    table = read_table(table_path(source="bord"))
+    with pytest.raises(UsageError, match=r"table.yaml:\d+:\d+: there is no endpoint 'bord'; did you mean 'board'\?"):
+        Simulator(wire, table, seed=1)
+
+
+def test_a_taken_address_is_named_and_leaves_nothing_open(wire: Wire, table: RouteTable) -> None:
+    with (
+        open_udp(table.endpoints["station"].address.value, "other"),
+        pytest.raises(UsageError, match="station: cannot bind 127.0.6.10:"),
+    ):
+        Simulator(wire, table, seed=1)
+    with closing(Simulator(wire, table, seed=1)):
+        pass
+
+
+def test_stop_ends_a_run_from_another_thread(wire: Wire, table: RouteTable) -> None:
+    with closing(Simulator(wire, table, seed=1)) as simulator:
+        running = threading.Thread(target=simulator.run, args=(None, 1.0, lambda _: None))
+        running.start()
+        simulator.stop()
+        running.join(10)
+        assert not running.is_alive()

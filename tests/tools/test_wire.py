@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.errors import DecodeError, TableError
+from router.tools import UsageError
+from router.tools.wire import Wire, as_old_boards_send, payload, read_table
+
+
+def test_an_envelope_comes_back_as_it_was_built(wire: Wire) -> None:
+    case = wire.case("every_kind")
+    message = payload(case, ["point.x=3", "text=hello"])
+    decoded = wire.decode(wire.encode(case, message))
+    assert (decoded.case, decoded.message, decoded.zeros) == (case, message, 0)
+
+
+def test_an_empty_payload_is_still_a_payload(wire: Wire) -> None:
+    case = wire.case("plain")
+    assert wire.encode(case, payload(case, [])) == bytes.fromhex("1200")
+
+
+def test_an_unknown_case_gets_the_nearest_name(wire: Wire) -> None:
+    with pytest.raises(UsageError, match=r"PBEnvelope has no payload case 'plane'; did you mean 'plain'\?"):
+        wire.case("plane")
+
+
+def test_trimmed_and_padded_datagrams_are_repaired(wire: Wire) -> None:
+    exact = wire.encode(wire.case("plain"), payload(wire.case("plain"), []))
+    trimmed, padded = as_old_boards_send(exact, trim=True, pad=0), as_old_boards_send(exact, trim=True, pad=40)
+    assert (trimmed.hex(), len(padded)) == ("12", 40)
+    assert wire.decode(trimmed).zeros == 1
+    assert wire.decode(padded).zeros == -38
+
+
+def test_padding_never_cuts() -> None:
+    with pytest.raises(UsageError, match="the datagram has 3 bytes and cannot be padded to 2"):
+        as_old_boards_send(b"abc", trim=False, pad=2)
+
+
+@pytest.mark.parametrize(
+    ("datagram", "problem"),
+    [
+        ("", "empty"),
+        ("ffff", "malformed: no PBEnvelope"),
+        ("1a00", "unknown_case: field 3"),
+        ("0000", "no_payload"),
+    ],
+)
+def test_what_cannot_be_decoded_says_why(wire: Wire, datagram: str, problem: str) -> None:
+    with pytest.raises(DecodeError) as caught:
+        wire.decode(bytes.fromhex(datagram))
+    assert str(caught.value) == problem
+
+
+def test_a_datagram_that_the_router_would_not_take_is_not_decoded(wire: Wire) -> None:
+    with pytest.raises(DecodeError, match="truncated: 20000 bytes"):
+        wire.decode(b"\x12\x00" * 10_000)
+
+
+def test_a_table_with_errors_is_refused(tmp_path: Path) -> None:
+    table = tmp_path / "bad.yaml"
+    table.write_text("version: 1\nendpoint: {}\n")
+    with pytest.raises(TableError):
+        read_table(table)
