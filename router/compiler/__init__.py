@@ -102,7 +102,8 @@ def _program(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes:
         envelope=envelope,
         books=books,
         listeners=tuple(
-            ListenerPlan(one.name, one.address.value, one.framing, one.receive_buffer) for one in table.listeners.values()
+            ListenerPlan(one.name, one.address.value, one.framing, one.receive_buffer)
+            for one in table.listeners.values()
         ),
         senders=tuple(
             SenderPlan(one.name, one.address.value) for one in table.endpoints.values() if one.name in destinations

@@ -270,7 +270,14 @@ def write_message(out: Source, plan: Record, name: str) -> str:
         _call(out, "data = {}", name, out.constant(f"pack_{name}", struct.Struct(letters).pack), arguments, plan.span)
         return "data"
     letters, arguments = first.static(b"")
-    _call(out, "data = bytearray({})", name, out.constant(f"pack_{name}", struct.Struct(letters).pack), arguments, plan.span)
+    _call(
+        out,
+        "data = bytearray({})",
+        name,
+        out.constant(f"pack_{name}", struct.Struct(letters).pack),
+        arguments,
+        plan.span,
+    )
     _write(out, runs[1:] if runs[0] is first else runs, name, plan.span)
     return "HEADER + data"
 

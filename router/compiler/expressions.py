@@ -157,7 +157,9 @@ class _Checker:
     def check(self, node: ast.expr, expected: Type | None = None) -> Typed:
         method = getattr(self, f"check_{type(node).__name__}", None)
         if method is None:
-            hint = _HINTS.get(type(node), "allowed: fields, literals, arithmetic, comparison, and/or/not, if/else, functions")
+            hint = _HINTS.get(
+                type(node), "allowed: fields, literals, arithmetic, comparison, and/or/not, if/else, functions"
+            )
             raise self.finding(node, Code.FORBIDDEN_EXPRESSION, f"{_describe(node)} is not part of the language", hint)
         try:
             typed: Typed = method(node, expected) if isinstance(node, (ast.Call, ast.IfExp)) else method(node)
@@ -273,7 +275,9 @@ class _Checker:
         name, value = ".".join(dotted[:-1]), dotted[-1]
         holders = self.scope.holders(name)
         if not holders:
-            known = {enum.name for enum in self.scope.enums} | {enum.name.rpartition(".")[2] for enum in self.scope.enums}
+            known = {enum.name for enum in self.scope.enums} | {
+                enum.name.rpartition(".")[2] for enum in self.scope.enums
+            }
             known |= {ros.short_name for ros in self.scope.ros_types if ros.constants}
             raise self.finding(node.value, Code.UNKNOWN_FIELD, f"{self.scope.message} has no field or enum '{name}'",
                                did_you_mean(name, known | set(self.scope.field_names())))  # fmt: skip
@@ -298,7 +302,9 @@ class _Checker:
         if not isinstance(index.constant, int) or isinstance(index.constant, bool) or index.constant < 0:
             raise self.finding(node.slice, Code.FORBIDDEN_EXPRESSION, "an index is a literal integer from 0")
         if holder.kind.length is not None and index.constant >= holder.kind.length:
-            raise self.finding(node.slice, Code.OUT_OF_RANGE, f"index {index.constant} of {holder.kind.length} elements")
+            raise self.finding(
+                node.slice, Code.OUT_OF_RANGE, f"index {index.constant} of {holder.kind.length} elements"
+            )
         return self.typed(holder.kind.element, ast.Subscript(holder.node, index.node, ast.Load()), node)
 
     # operators
@@ -330,8 +336,10 @@ class _Checker:
             raise self.finding(node, Code.TYPE_MISMATCH, "times are not computed with", "use seconds(time) and back")
         self._want_number(left)
         self._want_number(right)
-        if isinstance(right.constant, (int, float)) and right.constant == 0 and isinstance(
-            node.op, (ast.Div, ast.FloorDiv, ast.Mod)
+        if (
+            isinstance(right.constant, (int, float))
+            and right.constant == 0
+            and isinstance(node.op, (ast.Div, ast.FloorDiv, ast.Mod))
         ):
             raise self.finding(node, Code.OUT_OF_RANGE, "division by zero")
         if isinstance(node.op, ast.Pow):
@@ -390,7 +398,9 @@ class _Checker:
 
     def _want_comparable(self, node: ast.Compare, op: ast.cmpop, left: Typed, right: Typed) -> None:
         if not isinstance(op, _COMPARISONS):
-            raise self.finding(node, Code.FORBIDDEN_EXPRESSION, f"{_describe(op)} is not part of the language", "use ==")
+            raise self.finding(
+                node, Code.FORBIDDEN_EXPRESSION, f"{_describe(op)} is not part of the language", "use =="
+            )
         other: Kind | None = right.kind
         if isinstance(op, (ast.In, ast.NotIn)):
             if not isinstance(right.kind, ListKind):
@@ -425,7 +435,9 @@ class _Checker:
 
     def check_Call(self, node: ast.Call, expected: Type | None) -> Typed:
         if not isinstance(node.func, ast.Name):
-            raise self.finding(node.func, Code.FORBIDDEN_EXPRESSION, "only listed functions are called", did_you_mean("", FUNCTIONS))
+            raise self.finding(
+                node.func, Code.FORBIDDEN_EXPRESSION, "only listed functions are called", did_you_mean("", FUNCTIONS)
+            )
         name = node.func.id
         if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
             raise self.finding(node, Code.WRONG_ARGUMENTS, f"{name}() takes its arguments by position")

@@ -170,9 +170,7 @@ class _Builder:
         members = [(member, self._member(member, tree.get(member.name), automatic, prefix)) for member in target.fields]
         return Record(target, tuple(members), self.span)
 
-    def _member(
-        self, member: Field, given: _Tree | FieldEntry | None, automatic: Typed | None, prefix: str
-    ) -> Plan:
+    def _member(self, member: Field, given: _Tree | FieldEntry | None, automatic: Typed | None, prefix: str) -> Plan:
         path = prefix + member.name
         source = self._same_named(automatic, member.name)
         if isinstance(given, FieldEntry):

@@ -70,7 +70,9 @@ class RouteChecker:
         case = self.envelope.cases.get(route.case.value)
         if case is None:
             message = f"{self.envelope.name} has no payload case '{route.case.value}'"
-            self._report(route.case.span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(route.case.value, self.envelope.cases))
+            self._report(
+                route.case.span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(route.case.value, self.envelope.cases)
+            )
             return None
         if route.ignore is not None:
             return CheckedRoute(route, case, ())
@@ -88,7 +90,9 @@ class RouteChecker:
             if source.value not in (ANY, ROS):
                 self._known_endpoint(source.value, source.span, (ANY, ROS))
             elif len(route.sources) > 1:
-                self._report(source.span, Code.BAD_VALUE, f"'{source.value}' stands alone", "name endpoints, or it, not both")
+                self._report(
+                    source.span, Code.BAD_VALUE, f"'{source.value}' stands alone", "name endpoints, or it, not both"
+                )
 
     def _known_endpoint(self, name: str, span: SourceSpan, also: Iterable[str] = ()) -> bool:
         if name in self.table.endpoints:

@@ -74,7 +74,7 @@ def qos_findings(topic: Topic) -> Iterator[Diagnostic]:
     if given.history and given.history.value == "keep_all" and (depth := given.depth or topic.queue_depth):
         yield conflict(depth.span, "history keep_all has no depth", "leave the depth out, or say keep_last")
     if plan.durability == "transient_local" and plan.reliability == "best_effort":
-        span = (given.durability or given.reliability or given.profile)
+        span = given.durability or given.reliability or given.profile
         yield conflict(span.span if span else given.span, "late joiners get nothing from a best_effort publisher",
                        "transient_local goes with reliability: reliable")  # fmt: skip
     if plan.liveliness_lease_duration and plan.deadline and plan.liveliness_lease_duration < plan.deadline:
@@ -120,7 +120,9 @@ def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
         return Diagnostic(span, Code.QOS_CONFLICT, message, f"a topic has one; see {first.topic.span}")
     publisher, subscriber = (use, first) if use.publishes else (first, use)
     if reason := _unheard(publisher.qos, subscriber.qos):
-        message = f"route '{subscriber.case}' hears nothing that route '{publisher.case}' publishes on '{name}': {reason}"
+        message = (
+            f"route '{subscriber.case}' hears nothing that route '{publisher.case}' publishes on '{name}': {reason}"
+        )
         return Diagnostic(span, Code.QOS_CONFLICT, message, "give both the same QoS")
     return None
 
