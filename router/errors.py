@@ -51,9 +51,15 @@ class Code(enum.Enum):
 
     # the text
     BAD_FILE = ("bad-file", "A file cannot be read, or holds something else than it should.")
-    BAD_YAML = ("bad-yaml", "The table is not YAML, or uses YAML that tables do not have (tags, merge keys, several documents).")
+    BAD_YAML = (
+        "bad-yaml",
+        "The table is not YAML, or uses YAML that tables do not have (tags, merge keys, several documents).",
+    )
     DUPLICATE_KEY = ("duplicate-key", "A mapping has the same key twice.")
-    AMBIGUOUS_SCALAR = ("ambiguous-scalar", "A plain word or number that YAML parsers read differently (`on`, `0777`, `12:30`).")
+    AMBIGUOUS_SCALAR = (
+        "ambiguous-scalar",
+        "A plain word or number that YAML parsers read differently (`on`, `0777`, `12:30`).",
+    )
     UNDEFINED_VARIABLE = ("undefined-variable", "`${NAME}` has no value in the environment, and no default.")
     BAD_EXTENDS = ("bad-extends", "The table that `extends` names is missing, or extends this one.")
     # the shape
@@ -65,7 +71,10 @@ class Code(enum.Enum):
     UNKNOWN_QOS_VALUE = ("unknown-qos-value", "A word that is no setting of ROS QoS.")
     # the wire definitions
     BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares what cannot be routed.")
-    WIRE_NUMBER_CONFLICT = ("wire-number-conflict", "A field number on the wire was reused, renumbered, retyped or renamed.")
+    WIRE_NUMBER_CONFLICT = (
+        "wire-number-conflict",
+        "A field number on the wire was reused, renumbered, retyped or renamed.",
+    )
     DUPLICATE_MESSAGE = ("duplicate-message", "Two protobuf messages have one name.")
     NOT_LOCKED = ("not-locked", "`envelope.lock.json` does not record this yet: run `router schema lock`.")
     # the names
@@ -73,14 +82,17 @@ class Code(enum.Enum):
     UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
     UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that `endpoints` does not have.")
     ADDRESS_CLASH = ("address-clash", "Two listeners want one address, or two endpoints could not be told apart.")
-
+    FORWARDING_LOOP = ("forwarding-loop", "A destination is the message's own source, or a listener of this router.")
     BAD_TOPIC_NAME = ("bad-topic-name", "Not a ROS topic name.")
     TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes give one topic different types.")
     UNKNOWN_ROS_TYPE = ("unknown-ros-type", "No installed package, nor `schemas/`, has this interface.")
     UNKNOWN_FIELD = ("unknown-field", "A field that the source message or the target does not have.")
-
-    QOS_CONFLICT = ("qos-conflict", "QoS settings that contradict each other, or that keep publisher and subscriber apart.")
-
+    UNKNOWN_ENUM_VALUE = ("unknown-enum-value", "An enum, or a ROS type's constants, have no such name.")
+    QOS_CONFLICT = (
+        "qos-conflict",
+        "QoS settings that contradict each other, or that keep publisher and subscriber apart.",
+    )
+    BOARD_PAYLOAD = ("board-payload", "A board's firmware cannot decode this payload: no fixed size, or too large.")
     NO_TARGET = ("no-target", "A route that goes nowhere.")
     # the mapping
     DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice.")
@@ -89,7 +101,10 @@ class Code(enum.Enum):
     FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python that expressions do not have.")
     UNKNOWN_FUNCTION = ("unknown-function", "A function that is not listed in [functions](functions.md).")
     WRONG_ARGUMENTS = ("wrong-arguments", "A call with too many, too few or unsuitable arguments.")
-    TYPE_MISMATCH = ("type-mismatch", "A value of a type that does not fill this field, or that an operator does not take.")
+    TYPE_MISMATCH = (
+        "type-mismatch",
+        "A value of a type that does not fill this field, or that an operator does not take.",
+    )
     LOSSY_CONVERSION = ("lossy-conversion", "A conversion that could lose something without saying so.")
     OUT_OF_RANGE = ("out-of-range", "A value that can never fit.")
 
@@ -164,8 +179,11 @@ def shown_path(path: Path) -> str:
 def nearest(name: str, known: Iterable[str]) -> str | None:
     """The known name that somebody who wrote `name` most likely meant, None when none is near."""
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
-    close = difflib.get_close_matches(name.lower(), folded, n=1, cutoff=0.6)
-    return folded[close[0]] if close else None
+    close = difflib.get_close_matches(name.lower(), folded, n=8, cutoff=0.6)
+    if not close:
+        return None
+    ratios = [difflib.SequenceMatcher(a=candidate, b=name.lower()).ratio() for candidate in close]
+    return folded[min(candidate for candidate, ratio in zip(close, ratios) if ratio == max(ratios))]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

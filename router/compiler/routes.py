@@ -12,7 +12,7 @@ from router.compiler.kinds import BoolKind
 from router.compiler.mapping import Row, build
 from router.compiler.network import loop_finding
 from router.compiler.topics import qos_findings, topic_name_finding
-from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
+from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, nearest
 from router.table.model import ANY, ROS, Destination, EndpointKind, Expression, FieldMap, Route, RouteTable, Topic
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
@@ -58,7 +58,9 @@ class RouteChecker:
         self.findings.append(Diagnostic(span, code, message, hint))
 
     def _coverage(self) -> None:
-        covered = {route.case.value for route in self.table.routes}
+        names = [route.case.value for route in self.table.routes]
+        # a misspelt case is one finding, not two
+        covered = {name if name in self.envelope.cases else nearest(name, self.envelope.cases) for name in names}
         covered |= {name.removeprefix("routes/") for name in self.table.broken if name.startswith("routes/")}
         missing = [name for name in self.envelope.cases if name not in covered]
         if missing:
