@@ -1,0 +1,231 @@
+"""The tables in `routes/`: who gets what, and whether the standard messages are in SI units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+from geometry_msgs.msg import TwistStamped
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import FluidPressure, Imu, MagneticField, NavSatFix, NavSatStatus, Temperature
+
+from router.compiler import check_table
+from router.compiler.program import Program
+from router.engine import Engine
+from router.table.model import Route, RouteTable
+
+ROUTES = Path(__file__).parent.parent / "routes"
+Publish = Callable[..., dict[str, bytes]]
+WALL_NS = 1_700_000_000_123_456_789
+
+# As the system's list of payload cases has it: H a hardware board, R ROS on the rover, B the basestation.
+DIRECTIONS = """
+    ph_info H to R (and B) sensor
+    arm_ctrl R to H arm
+    arm_diag H to R (and B) arm
+    arm_feedback H to R arm
+    arm_pos H to R (and B) arm
+    arm_target R to H arm
+    arm_obstructions H to R arm
+    drive_diag H to R (and B) driving
+    drive_motor R to H driving
+    drive_progress H to R driving
+    sensor_diag H to R (and B) sensor
+    gps_info H to R (and B) sensor
+    imu_info H to R (and B) sensor
+    load_cell_info H to R (and B) sensor
+    pressure_info H to R (and B) sensor
+    control_mode B to R
+    detected_object R to B
+    object_selection B to R
+    rock_measure_request B to R
+    rock_measure_result R to B
+    rover_localization R to B
+    flow_sensor_info H to R (and B) sensor
+    pump_info H to R (and B) sensor
+    manual_drive B to H (and R) driving
+    manual_brake B to H (and R) driving
+    manual_arm B to H (and R) arm
+"""
+EXISTING_TOPICS = {
+    "imu_data": ("comms/msg/ImuSensorInformation", 10),
+    "gps_data": ("comms/msg/SensorBoardGPSInfo", 10),
+    "ph_data": ("comms/msg/SensorBoardPHInfo", 10),
+    "sensor_board_diagnostics": ("comms/msg/SensorBoardDiagnostics", 10),
+}
+
+
+def program_of(name: str) -> Program:
+    checked = check_table(ROUTES / name, environ={})
+    assert [str(finding) for finding in checked.diagnostics] == []
+    assert checked.program is not None
+    return checked.program
+
+
+@pytest.fixture(scope="module")
+def rover() -> Program:
+    return program_of("rover.yaml")
+
+
+def depths(table: RouteTable) -> dict[str, tuple[str, int | None]]:
+    return {
+        topic.topic.value: (topic.type.value, topic.queue_depth.value if topic.queue_depth else None)
+        for route in table.routes
+        for topic in route.topics
+    }
+
+
+def flow(route: Route) -> tuple[set[str], set[str], bool]:
+    """Sources, destinations, and whether ROS hears of it."""
+    return (
+        {source.value for source in route.sources},
+        {destination.endpoint.value for destination in route.destinations},
+        bool(route.topics) and not route.is_outbound,
+    )
+
+
+@pytest.mark.parametrize("line", DIRECTIONS.strip().splitlines())
+def test_rover_table_follows_the_list_of_directions(rover: Program, line: str) -> None:
+    case, source, _, target, *rest = line.split()
+    ends = {"H": f"{rest[-1] if rest else ''}_board", "B": "basestation", "R": "ros"}
+    also = {ends[rest[1][0]]} if "(and" in rest else set()
+    targets = {ends[target]} | also
+
+    route = next(route for route in rover.table.routes if route.case.value == case)
+    assert flow(route) == ({ends[source]}, targets - {"ros"}, "ros" in targets)
+
+
+def test_rover_table_keeps_the_existing_topics_and_names_the_others_after_their_case(rover: Program) -> None:
+    topics = depths(rover.table)
+    assert topics.items() >= EXISTING_TOPICS.items()
+    for route in rover.table.routes:
+        plain = [topic.topic.value for topic in route.topics if topic.type.value.startswith("comms/")]
+        assert len(plain) == 1
+        assert plain[0] == route.case.value or plain[0] in EXISTING_TOPICS
+
+
+def test_simulation_table_is_the_rover_on_loopback_addresses_of_its_own(rover: Program) -> None:
+    table = program_of("sim.yaml").table
+    addresses = [endpoint.address.value for endpoint in table.endpoints.values()]
+    addresses += [listener.address.value for listener in table.listeners.values()]
+    assert all(address.host.startswith("127.") for address in addresses)
+    assert len({address.host for address in addresses}) == len(addresses)
+    assert list(map(flow, table.routes)) == list(map(flow, rover.table.routes))
+    assert depths(table) == depths(rover.table)
+
+
+def test_legacy_table_sends_everything_to_both_and_publishes_four_topics(rover: Program) -> None:
+    table = program_of("legacy.yaml").table
+    assert {route.case.value for route in table.routes} == {route.case.value for route in rover.table.routes}
+    assert all(flow(route)[:2] == ({"any"}, {"dst_a", "dst_b"}) for route in table.routes)
+    assert depths(table) == EXISTING_TOPICS
+
+
+@pytest.fixture
+def published(rover: Program) -> Publish:
+    """A function that routes one payload and gives what was published, CDR bytes by topic."""
+
+    def route(case: str, **values: object) -> dict[str, bytes]:
+        sent: dict[str, bytes] = {}
+        reports: list[object] = []
+        topics = [plan.topic for plan in rover.publishers]
+        engine = Engine(
+            rover,
+            rover.books.fresh_counts(),
+            send={sender.endpoint: len for sender in rover.senders},
+            publish={topic: partial(sent.__setitem__, topic) for topic in topics},
+            wanted={topic: [True] for topic in topics},
+            report=reports.append,
+            clock_ns=lambda: 0,
+            wall_ns=lambda: WALL_NS,
+        )
+        envelope = rover.envelope.message_class(**{case: values})
+        engine.receiver("rover")(envelope.SerializeToString(), ("192.168.0.30", 8))
+        assert reports == []
+        return sent
+
+    return route
+
+
+def test_imu_is_published_in_si_units(published: Publish) -> None:
+    topics = published("imu_info", accel_x=1.5, accel_y=-2.5, accel_z=9.75, gyro_x=180, gyro_z=-90, mag_x=50, mag_z=-25)
+
+    imu = deserialize_message(topics["imu/data_raw"], Imu)
+    assert (imu.header.frame_id, imu.header.stamp.sec, imu.header.stamp.nanosec) == (
+        "imu_link",
+        1_700_000_000,
+        123_456_789,
+    )
+    acceleration, rotation = imu.linear_acceleration, imu.angular_velocity
+    assert (acceleration.x, acceleration.y, acceleration.z) == (1.5, -2.5, 9.75)
+    assert (rotation.x, rotation.y, rotation.z) == pytest.approx((math.pi, 0, -math.pi / 2))
+    assert imu.orientation_covariance[0] == -1
+
+    field = deserialize_message(topics["imu/mag"], MagneticField).magnetic_field
+    assert (field.x, field.y, field.z) == pytest.approx((50e-6, 0, -25e-6))
+
+
+def test_gps_position_is_published_with_its_uncertainty(published: Publish) -> None:
+    topics = published("gps_info", latitude=48.5, longitude=-9.25, altitude=321.5, hdop=0.5, vdop=2, fix_quality=1)
+
+    fix = deserialize_message(topics["gps/fix"], NavSatFix)
+    assert (fix.latitude, fix.longitude, fix.altitude) == (48.5, -9.25, 321.5)
+    assert fix.header.frame_id == "gps_link"
+    assert fix.status.service == NavSatStatus.SERVICE_GPS
+    assert list(fix.position_covariance) == [4, 0, 0, 0, 4, 0, 0, 0, 64]
+    assert fix.position_covariance_type == NavSatFix.COVARIANCE_TYPE_APPROXIMATED
+
+
+def test_gps_position_of_unknown_quality_is_not_published_as_certain(published: Publish) -> None:
+    fix = deserialize_message(published("gps_info", fix_quality=1)["gps/fix"], NavSatFix)
+    assert fix.position_covariance_type == NavSatFix.COVARIANCE_TYPE_UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("fix_quality", "status"),
+    [
+        ("NO_FIX", NavSatStatus.STATUS_NO_FIX),
+        ("GPS_FIX", NavSatStatus.STATUS_FIX),
+        ("DGPS_FIX", NavSatStatus.STATUS_SBAS_FIX),
+        ("PPS_FIX", NavSatStatus.STATUS_FIX),
+        ("RTK_FIX", NavSatStatus.STATUS_GBAS_FIX),
+        ("RTK_FLOAT", NavSatStatus.STATUS_GBAS_FIX),
+        (99, NavSatStatus.STATUS_NO_FIX),
+    ],
+)
+def test_gps_status_follows_the_fix_quality(published: Publish, fix_quality: str | int, status: int) -> None:
+    fix = deserialize_message(published("gps_info", fix_quality=fix_quality)["gps/fix"], NavSatFix)
+    assert fix.status.status == status
+
+
+@pytest.mark.parametrize(("heading", "east", "north"), [(0, 0, 2), (90, 2, 0), (180, 0, -2), (270, -2, 0)])
+def test_gps_motion_is_published_as_east_and_north(
+    published: Publish, heading: float, east: float, north: float
+) -> None:
+    twist = deserialize_message(published("gps_info", speed=2, heading=heading)["gps/vel"], TwistStamped).twist
+    assert (twist.linear.x, twist.linear.y, twist.linear.z) == pytest.approx((east, north, 0), abs=1e-12)
+
+
+def test_pressure_is_published_in_pascal_in_the_frame_of_its_sensor(published: Publish) -> None:
+    topics = published("pressure_info", sensor_index=3, pressure_kpa=101.5, temperature_c=21.5)
+    pressure = deserialize_message(topics["pressure/data"], FluidPressure)
+    assert (pressure.fluid_pressure, pressure.header.frame_id) == (101_500, "pressure_sensor_3")
+    temperature = deserialize_message(topics["pressure/temperature"], Temperature)
+    assert (temperature.temperature, temperature.header.frame_id) == (21.5, "pressure_sensor_3")
+
+
+@pytest.mark.parametrize(
+    ("case", "field", "topic", "frame"),
+    [
+        ("ph_info", "temperature", "ph/temperature", "ph_probe"),
+        ("sensor_diag", "board_temperature", "sensor_board/temperature", "sensor_board"),
+    ],
+)
+def test_temperatures_are_published_in_their_frames(
+    published: Publish, case: str, field: str, topic: str, frame: str
+) -> None:
+    message = deserialize_message(published(case, **{field: 36.5})[topic], Temperature)
+    assert (message.temperature, message.header.frame_id) == (36.5, frame)
