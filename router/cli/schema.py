@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         print_findings(errors, sys.stdout)
         return BAD_TABLE
     new = extended_lock(schema, envelope)
-    if old is None or findings:
+    if new != old:
         write_lock(root, new)
     print(f"{shown_path(root / LOCK_NAME)}: {_summary(old, new)}")
     return OK

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from router.errors import Code, Diagnostic, TableError
-from router.types.lock_file import Declaration, Entry, Lock, current_lock, read_lock
+from router.types.lock_file import Declaration, Entry, Lock, by_number, current_lock, read_lock
 from router.types.proto_source import Part
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -66,8 +66,7 @@ def locked_size(schema: ProtoSchema) -> int | None:
 def _extended(locked: Mapping[str, Declaration], current: Mapping[str, Declaration]) -> Mapping[str, Declaration]:
     extended = {**locked, **current}
     for name in locked.keys() & current.keys():
-        entries = {*locked[name].entries, *current[name].entries}
-        extended[name] = replace(current[name], entries=tuple(entries))
+        extended[name] = replace(current[name], entries=locked[name].entries | current[name].entries)
     return extended
 
 
@@ -76,8 +75,9 @@ def _compared(
 ) -> Iterator[Diagnostic]:
     for name, declaration in current.items():
         if name in locked:
-            live = [entry for entry in locked[name].entries if not schema.is_reserved(name, entry.number)]
-            yield from _entry_findings(schema, name, live, declaration.entries)
+            reserved = schema.reserved_numbers(name)
+            live = [entry for entry in by_number(locked[name]) if not any(entry.number in span for span in reserved)]
+            yield from _entry_findings(schema, name, live, by_number(declaration))
         else:
             yield Diagnostic(schema.span(name), Code.NOT_LOCKED, f"the lock does not know {name}", _TO_LOCK)
 

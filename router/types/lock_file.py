@@ -32,7 +32,7 @@ class Declaration:
     """A message or an enum: the file that declares it, relative to the folder of the protos, and its members."""
 
     file: str
-    entries: tuple[Entry, ...]
+    entries: frozenset[Entry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +52,12 @@ def current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
     for name in schema.messages:
         if (file := schema.sources.file(name)) in schema.files:
             fields = schema.descriptor(name).fields
-            entries = tuple(Entry(field.number, field.name, declared_type(field)) for field in fields)
+            entries = frozenset(Entry(field.number, field.name, declared_type(field)) for field in fields)
             messages[name] = Declaration(file, entries)
     enums = {}
     for name, declared in schema.enums.items():
         if (file := schema.sources.file(name)) in schema.files:
-            enums[name] = Declaration(file, tuple(Entry(number, value) for value, number in declared.values))
+            enums[name] = Declaration(file, frozenset(Entry(number, value) for value, number in declared.values))
     return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
 
 
@@ -84,11 +84,11 @@ def write_lock(root: Path, lock: Lock) -> None:
     content = {
         "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
         "messages": {
-            name: {"file": message.file, "fields": {str(e.number): f"{e.type} {e.name}" for e in _by_number(message)}}
+            name: {"file": message.file, "fields": {str(e.number): f"{e.type} {e.name}" for e in by_number(message)}}
             for name, message in sorted(lock.messages.items())
         },
         "enums": {
-            name: {"file": enum.file, "values": {entry.name: entry.number for entry in _by_number(enum)}}
+            name: {"file": enum.file, "values": {entry.name: entry.number for entry in by_number(enum)}}
             for name, enum in sorted(lock.enums.items())
         },
     }
@@ -103,7 +103,8 @@ def write_lock(root: Path, lock: Lock) -> None:
         raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]) from None
 
 
-def _by_number(declaration: Declaration) -> list[Entry]:
+def by_number(declaration: Declaration) -> list[Entry]:
+    """The members in an order that does not change from run to run."""
     return sorted(declaration.entries, key=lambda entry: (entry.number, entry.name))
 
 
@@ -128,11 +129,11 @@ def _parsed(content: object) -> Lock:
         oneof=_text(envelope.get("oneof"), "envelope.oneof"),
         max_size=max_size,
         messages={
-            name: Declaration(file, tuple(_field_entries(members, name)))
+            name: Declaration(file, frozenset(_field_entries(members, name)))
             for name, file, members in _declarations(top, "messages", "fields")
         },
         enums={
-            name: Declaration(file, tuple(_value_entries(members, name)))
+            name: Declaration(file, frozenset(_value_entries(members, name)))
             for name, file, members in _declarations(top, "enums", "values")
         },
     )

@@ -71,15 +71,15 @@ class ProtoSchema:
         """By full name. Raises KeyError."""
         return self._pool.FindMessageTypeByName(name)
 
-    def is_reserved(self, name: str, number: int) -> bool:
-        """Whether a message or an enum, by full name, says `reserved` for a number."""
+    def reserved_numbers(self, name: str) -> list[range]:
+        """What a message or an enum, by full name, says to be `reserved`."""
         if name in self.enums:
             declared = EnumDescriptorProto()
             self._pool.FindEnumTypeByName(name).CopyToProto(declared)
-            return any(span.start <= number <= span.end for span in declared.reserved_range)
+            return [range(span.start, span.end + 1) for span in declared.reserved_range]
         message = DescriptorProto()
         self.descriptor(name).CopyToProto(message)
-        return any(span.start <= number < span.end for span in message.reserved_range)
+        return [range(span.start, span.end) for span in message.reserved_range]
 
     def board_options(self, field: FieldDescriptor) -> BoardOptions:
         """What the `.options` file beside the field's `.proto` says about it."""

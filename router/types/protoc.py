@@ -87,9 +87,12 @@ def _refuse_errors(root: Path, names: Sequence[str], include: Sequence[str]) -> 
 def _findings(root: Path, names: Sequence[str], complaints: Sequence[_Complaint]) -> list[Diagnostic]:
     texts: dict[str, ProtoText] = {}
     findings: dict[tuple[str, int, int], Diagnostic] = {}
+    lacking = {complaint.file for complaint in complaints if _IMPORT_FAILED.fullmatch(complaint.message)}
     for complaint in complaints:
         if complaint.file == _EVERYTHING:
             continue
+        if complaint.file in lacking and complaint.message.endswith(" is not defined."):
+            continue  # it would be, by the import
         place = (complaint.file, complaint.line, complaint.column)
         if (first := findings.get(place)) is not None:  # protoc's advice, or the same again
             advice = complaint.message.rstrip(".")

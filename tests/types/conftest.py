@@ -1,0 +1,72 @@
+"""Folders of `.proto` and `.msg` files written by the test, and what the router makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from router.assets import asset
+from router.errors import Diagnostic, SourceSpan, TableError
+from router.table.model import EnvelopeSettings, Located
+from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
+
+Write = Callable[[Mapping[str, str]], Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
+    """Write files by name; the folder is the working directory, so findings name them without a folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def write_files(files: Mapping[str, str]) -> Path:
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8", newline="")
+        return tmp_path
+
+    return write_files
+
+
+@pytest.fixture
+def load(write: Write) -> Callable[[Mapping[str, str]], ProtoSchema]:
+    return lambda files: load_protos(write(files))
+
+
+@pytest.fixture
+def refused(write: Write) -> Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]:
+    """The findings of a folder that cannot be loaded."""
+
+    def findings(files: Mapping[str, str]) -> tuple[Diagnostic, ...]:
+        root = write(files)
+        with pytest.raises(TableError) as caught:
+            load_protos(root)
+        return caught.value.diagnostics
+
+    return findings
+
+
+@pytest.fixture
+def envelope() -> Callable[[ProtoSchema], Envelope]:
+    """The envelope `Envelope.payload` of a schema."""
+    return lambda schema: find_envelope(schema, settings(schema.root))
+
+
+def settings(root: Path, message: str = "Envelope", oneof: str = "payload") -> EnvelopeSettings:
+    return EnvelopeSettings(
+        Located(root, SourceSpan("table.yaml", 2, 1)),
+        Located(message, SourceSpan("table.yaml", 3, 12)),
+        Located(oneof, SourceSpan("table.yaml", 4, 10)),
+    )
+
+
+@pytest.fixture(scope="session")
+def rover_schema() -> ProtoSchema:
+    return load_protos(asset("protos"))
+
+
+@pytest.fixture(scope="session")
+def rover_envelope(rover_schema: ProtoSchema) -> Envelope:
+    return find_envelope(rover_schema, settings(rover_schema.root, "PBEnvelope"))
