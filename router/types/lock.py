@@ -18,7 +18,10 @@ _TO_LOCK = "record it with `router schema lock`"
 
 
 def check_lock(schema: ProtoSchema, envelope: Envelope) -> list[Diagnostic]:
-    """Every difference between the `.proto` files and the lock, and what is wrong with the lock file itself."""
+    """Every difference between the `.proto` files and the lock, and what is wrong with the lock file itself.
+
+    Ordered by place.
+    """
     try:
         lock = read_lock(schema.root)
     except TableError as error:
@@ -35,7 +38,7 @@ def check_lock(schema: ProtoSchema, envelope: Envelope) -> list[Diagnostic]:
     elif lock.max_size != current.max_size:
         message = f"{envelope.name} takes up to {current.max_size} bytes, the lock says {lock.max_size}"
         findings.append(Diagnostic(span, Code.NOT_LOCKED, message, f"flash the boards, then {_TO_LOCK}"))
-    return findings
+    return sorted(findings, key=lambda finding: finding.span)
 
 
 def extended_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:

@@ -1,0 +1,300 @@
+"""Every way to break the field numbers, and the lock file that notices."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.types.lock import check_lock, extended_lock, locked_size
+from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, read_lock, write_lock
+from router.types.protobuf import Envelope, ProtoSchema, load_protos
+
+Write = Callable[[Mapping[str, str]], Path]
+Find = Callable[[ProtoSchema], Envelope]
+
+PROTO = """\
+syntax = "proto3";
+
+enum State {
+  IDLE = 0;
+  BUSY = 1;
+}
+
+message Motor {
+  float rpm = 1;
+  State state = 2;
+  float voltage = 3;
+}
+
+message Envelope {
+  oneof payload {
+    Motor motor = 1;
+  }
+}
+"""
+
+
+@pytest.fixture
+def changed(write: Write, envelope: Find) -> Callable[..., list[Diagnostic]]:
+    """Lock PROTO, replace one text in it by another, and check."""
+
+    def check(old: str, new: str) -> list[Diagnostic]:
+        lock(write({"motor.proto": PROTO}), envelope)
+        assert old in PROTO
+        schema = load_protos(write({"motor.proto": PROTO.replace(old, new)}))
+        return check_lock(schema, envelope(schema))
+
+    return check
+
+
+def lock(root: Path, envelope: Find) -> None:
+    schema = load_protos(root)
+    write_lock(root, extended_lock(schema, envelope(schema)))
+
+
+def test_locked_protos_have_no_findings(write: Write, envelope: Find) -> None:
+    root = write({"motor.proto": PROTO})
+    lock(root, envelope)
+    schema = load_protos(root)
+    assert check_lock(schema, envelope(schema)) == []
+    assert locked_size(schema) == envelope(schema).max_size == 14
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "finding"),
+    [
+        pytest.param(
+            "float rpm = 1", "float rpm = 4",
+            "motor.proto:9:15: error[wire-number-conflict]: Motor.rpm has number 4 instead of 1; "
+            "the lock says `float rpm = 1`",
+            id="renumbered",
+        ),
+        pytest.param(
+            "float rpm = 1", "double rpm = 1",
+            "motor.proto:9:3: error[wire-number-conflict]: Motor.rpm is of type double instead of float; "
+            "the lock says `float rpm = 1`; to change it, reserve 1 and add a field",
+            id="retyped",
+        ),
+        pytest.param(
+            "State state = 2", "repeated State state = 2",
+            "motor.proto:10:12: error[wire-number-conflict]: Motor.state is of type repeated State instead of State; "
+            "the lock says `State state = 2`; to change it, reserve 2 and add a field",
+            id="repeated",
+        ),
+        pytest.param(
+            "float rpm = 1", "float speed = 1",
+            "motor.proto:9:17: error[wire-number-conflict]: number 1 of Motor belongs to 'rpm', not to 'speed'; "
+            "the lock says `float rpm = 1`; call it that, or reserve the number and take a free one",
+            id="renamed",
+        ),
+        pytest.param(
+            "  float rpm = 1;\n", "  bool on = 1;\n",
+            "motor.proto:9:13: error[wire-number-conflict]: number 1 of Motor belongs to 'rpm', not to 'on'; "
+            "the lock says `float rpm = 1`; call it that, or reserve the number and take a free one",
+            id="reused",
+        ),
+        pytest.param(
+            "  float rpm = 1;\n", "",
+            "motor.proto:8:9: error[wire-number-conflict]: Motor has no 'rpm' any more, and number 1 is free to be "
+            "reused; the lock says `float rpm = 1`; write `reserved 1;` there",
+            id="removed",
+        ),
+        pytest.param(
+            "BUSY = 1", "BUSY = 2",
+            "motor.proto:5:10: error[wire-number-conflict]: State.BUSY has number 2 instead of 1; "
+            "the lock says `BUSY = 1`",
+            id="enum value renumbered",
+        ),
+        pytest.param(
+            "BUSY = 1", "WORKING = 1",
+            "motor.proto:5:13: error[wire-number-conflict]: number 1 of State belongs to 'BUSY', not to 'WORKING'; "
+            "the lock says `BUSY = 1`; call it that, or reserve the number and take a free one",
+            id="enum value renamed",
+        ),
+        pytest.param(
+            "  BUSY = 1;\n", "",
+            "motor.proto:3:6: error[wire-number-conflict]: State has no 'BUSY' any more, and number 1 is free to be "
+            "reused; the lock says `BUSY = 1`; write `reserved 1;` there",
+            id="enum value removed",
+        ),
+        pytest.param(
+            "float voltage = 3;", "float voltage = 3;\n  bool on = 4;",
+            "motor.proto:12:8: warning[not-locked]: the lock does not know Motor.on; "
+            "record it with `router schema lock`",
+            id="field added",
+        ),
+        pytest.param(
+            "BUSY = 1;", "BUSY = 1;\n  DONE = 2;",
+            "motor.proto:6:3: warning[not-locked]: the lock does not know State.DONE; "
+            "record it with `router schema lock`",
+            id="enum value added",
+        ),
+        pytest.param(
+            "message Motor {", "message Pump {\n  bool on = 1;\n}\n\nmessage Motor {",
+            "motor.proto:8:9: warning[not-locked]: the lock does not know Pump; record it with `router schema lock`",
+            id="message added",
+        ),
+        pytest.param(
+            "enum State {", "enum Mode {\n  MANUAL = 0;\n}\n\nenum State {",
+            "motor.proto:3:6: warning[not-locked]: the lock does not know Mode; record it with `router schema lock`",
+            id="enum added",
+        ),
+    ],
+)  # fmt: skip
+def test_change_is_one_finding_at_its_line(
+    changed: Callable[..., list[Diagnostic]], old: str, new: str, finding: str
+) -> None:
+    findings = [found for found in changed(old, new) if "takes up to" not in found.message]
+    assert [str(found) for found in findings] == [finding]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("  float rpm = 1;\n", "  reserved 1;\n"),
+        ("  float rpm = 1;\n", "  reserved 1;\n  reserved 5 to 9;\n"),
+        ("  BUSY = 1;\n", "  reserved 1;\n"),
+        ("float rpm = 1;", "float rpm = 1;  // revolutions per minute"),
+        ("  float rpm = 1;\n  State state = 2;\n", "  State state = 2;\n  float rpm = 1;\n"),
+        ("float rpm", "optional float rpm"),
+        ("  BUSY = 1;", "  BUSY = 0x1;"),
+    ],
+)
+def test_change_that_keeps_the_wire_is_no_conflict(
+    changed: Callable[..., list[Diagnostic]], old: str, new: str
+) -> None:
+    assert [found for found in changed(old, new) if found.code is Code.WIRE_NUMBER_CONFLICT] == []
+
+
+def test_swapped_numbers_are_a_finding_at_each_field(changed: Callable[..., list[Diagnostic]]) -> None:
+    findings = changed(
+        "float rpm = 1;\n  State state = 2;\n  float voltage = 3;",
+        "float rpm = 3;\n  State state = 2;\n  float voltage = 1;",
+    )
+    assert [(found.code, found.span.line) for found in findings] == [
+        (Code.WIRE_NUMBER_CONFLICT, 9),
+        (Code.WIRE_NUMBER_CONFLICT, 11),
+    ]
+
+
+def test_reserved_field_may_return_under_another_number(changed: Callable[..., list[Diagnostic]]) -> None:
+    findings = changed("float rpm = 1;", "reserved 1;\n  double rpm = 4;")
+    assert {found.code for found in findings} == {Code.NOT_LOCKED}
+
+
+def test_number_stays_taken_after_its_reservation_is_gone(write: Write, envelope: Find) -> None:
+    root = write({"motor.proto": PROTO})
+    lock(root, envelope)
+    lock(write({"motor.proto": PROTO.replace("float rpm = 1", "reserved 1")}), envelope)
+    schema = load_protos(write({"motor.proto": PROTO.replace("float rpm = 1", "bool on = 1")}))
+    (finding,) = [found for found in check_lock(schema, envelope(schema)) if found.code is Code.WIRE_NUMBER_CONFLICT]
+    assert "belongs to 'rpm'" in finding.message
+
+
+def test_another_name_for_an_enum_value_is_an_addition(changed: Callable[..., list[Diagnostic]]) -> None:
+    findings = changed("BUSY = 1;", "BUSY = 1;\n  option allow_alias = true;\n  WORKING = 1;")
+    assert [found.code for found in findings] == [Code.NOT_LOCKED]
+
+
+def test_envelope_that_grows_says_so(changed: Callable[..., list[Diagnostic]]) -> None:
+    findings = changed("float voltage = 3;", "float voltage = 3;\n  double energy = 4;")
+    (finding,) = [found for found in findings if "bytes" in found.message]
+    assert str(finding) == (
+        "motor.proto:15:9: warning[not-locked]: Envelope takes up to 23 bytes, the lock says 14; "
+        "flash the boards, then record it with `router schema lock`"
+    )
+
+
+def test_lock_of_another_envelope_says_so(write: Write, envelope: Find) -> None:
+    root = write({"motor.proto": PROTO})
+    lock(root, envelope)
+    content = json.loads((root / LOCK_NAME).read_text())
+    content["envelope"]["message"] = "OldEnvelope"
+    (root / LOCK_NAME).write_text(json.dumps(content))
+    schema = load_protos(root)
+    (finding,) = check_lock(schema, envelope(schema))
+    assert (finding.code, "OldEnvelope.payload" in finding.message) == (Code.NOT_LOCKED, True)
+
+
+def test_missing_lock_is_one_warning(write: Write, envelope: Find) -> None:
+    schema = load_protos(write({"motor.proto": PROTO}))
+    (finding,) = check_lock(schema, envelope(schema))
+    assert (finding.code, finding.span) == (Code.NOT_LOCKED, SourceSpan("motor.proto", 14, 9, 17))
+    assert locked_size(schema) is None
+
+
+def lock_text(**changes: object) -> str:
+    envelope = {"message": "Envelope", "oneof": "payload", "max_size": 14}
+    return json.dumps({"envelope": envelope, "messages": {}, "enums": {}, **changes})
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", 1),
+        ("[]", 1),
+        ("{}", 1),
+        ('{\n  "envelope":\n<<<<<<< HEAD\n', 3),
+        ('{"envelope": 1, "envelope": 2}', 1),
+        (lock_text(envelope={"message": "E", "oneof": "o", "max_size": "many"}), 1),
+        (lock_text(messages={"A": {}}), 1),
+        (lock_text(messages={"A": {"file": "a.proto", "fields": {"1": "x"}}}), 1),
+        (lock_text(messages={"A": {"file": "a.proto", "fields": {"one": "float x"}}}), 1),
+        (lock_text(enums={"A": {"file": "a.proto", "values": {"X": "1"}}}), 1),
+    ],
+)
+def test_broken_lock_file_is_a_finding_in_it(write: Write, envelope: Find, text: str, line: int) -> None:
+    schema = load_protos(write({"motor.proto": PROTO, LOCK_NAME: text}))
+    (finding,) = check_lock(schema, envelope(schema))
+    assert (finding.code, finding.span.file, finding.span.line) == (Code.BAD_FILE, LOCK_NAME, line)
+    with pytest.raises(TableError):
+        extended_lock(schema, envelope(schema))
+
+
+def test_lock_file_has_one_line_for_each_number(write: Write, envelope: Find) -> None:
+    root = write({"motor.proto": PROTO})
+    lock(root, envelope)
+    text = (root / LOCK_NAME).read_text()
+    assert '        "1": "float rpm",\n        "2": "State state",\n        "3": "float voltage"\n' in text
+    lock(root, envelope)
+    assert (root / LOCK_NAME).read_text() == text
+    assert {path.name for path in root.iterdir()} == {"motor.proto", LOCK_NAME}, "nothing else is left behind"
+
+
+def test_rovers_protos_are_locked(rover_schema: ProtoSchema, rover_envelope: Envelope) -> None:
+    assert check_lock(rover_schema, rover_envelope) == []
+
+
+names = st.from_regex(r"[a-z_]{1,8}", fullmatch=True)
+messages = st.dictionaries(
+    names,
+    st.builds(
+        Declaration,
+        file=st.text(),
+        entries=st.dictionaries(st.integers(1, 2**29 - 1), st.tuples(names, st.sampled_from(["float", "repeated A.B"])))
+        .map(lambda fields: frozenset(Entry(number, name, type_) for number, (name, type_) in fields.items())),
+    ),
+)  # fmt: skip
+enums = st.dictionaries(
+    names,
+    st.builds(
+        Declaration,
+        file=st.text(),
+        entries=st.dictionaries(names, st.integers(-(2**31), 2**31 - 1)).map(
+            lambda values: frozenset(Entry(number, name) for name, number in values.items())
+        ),
+    ),
+)
+
+
+@given(st.builds(Lock, message=names, oneof=names, max_size=st.integers(0), messages=messages, enums=enums))
+def test_written_lock_reads_back_the_same(tmp_path_factory: pytest.TempPathFactory, written: Lock) -> None:
+    root = tmp_path_factory.mktemp("lock")
+    write_lock(root, written)
+    assert read_lock(root) == written
