@@ -5,6 +5,9 @@ MAKEFLAGS += --no-print-directory
 # To use an interpreter or an installed ROS other than those found: make setup PYTHON=python3.12 ROS=/opt/ros/jazzy
 export PYTHON ROS
 
+# By this the wheels know that their libraries are set up; inherited from another environment it is not true here.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
 # Says what must be sourced; nothing at all unless ROS comes from outside .venv.
 ENV := . .venv/env.sh &&
 
