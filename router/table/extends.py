@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from router.errors import Code, Diagnostic, TableError, shown_path
+from router.errors import Code, Diagnostic, TableError, nearest, shown_path
 from router.table.compose import compose
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode
 from router.table.source import Source, read_source
@@ -87,8 +87,18 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
             raise  # the file is there, a place in it is wrong
         what = f"'{reference.text}' cannot be extended: {found.message}"
-        hint = f"paths are relative to this file; looked for {shown_path(Path(os.path.realpath(path)))}"
+        near = nearest(path.name, _names_beside(path))
+        looked = f"looked for {shown_path(Path(os.path.realpath(path)))}"
+        hint = f"did you mean '{reference.text.removesuffix(path.name)}{near}'?" if near else looked
         raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what, hint)]) from error
+
+
+def _names_beside(path: Path) -> list[str]:
+    """The tables where one was looked for; none where that cannot be known."""
+    try:
+        return [file.name for file in path.parent.iterdir() if file.is_file() and file != path]
+    except OSError:
+        return []
 
 
 def _refuse_cycle(path: Path, seen: list[str], reference: ScalarNode) -> None:

@@ -25,6 +25,7 @@ _TYPES = {
     "boolean": "true or false",
 }
 _LONGEST = 60
+_ROUTE_KEY_DEPTH = len(("routes", "case", "key"))  # the only keys that others of their mapping rule out
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +62,14 @@ def finding(misfit: Misfit, tree: Node) -> Diagnostic:
     """The finding for anything but an unknown key of a closed mapping."""
     path, keyword = misfit.path, misfit.keyword
     key = key_at(tree, path)
-    subject = _subject(path)
+    name = subject(path)
     if misfit.about_name:
-        what = f"the name '{_clipped(str(misfit.value))}' {_expected(misfit)}"
-        return Diagnostic(key.span if key else _first_line(tree), Code.BAD_VALUE, what)
+        return _bad_name(misfit, key.span if key else _first_line(tree))
     span = _blamed(tree, path)
     if keyword == "required":
         return _missing_key(misfit, tree)
-    if keyword == "not":
-        return Diagnostic(key.span if key else span, Code.UNKNOWN_KEY, f"{subject} {_expected(misfit)}")
     if keyword == "type":
-        return Diagnostic(span, Code.WRONG_TYPE, f"{subject} {_expected(misfit)}, not {shown(misfit.value)}")
+        return Diagnostic(span, Code.WRONG_TYPE, f"{name} {_expected(misfit)}, not {shown(misfit.value)}")
     if keyword == "pattern" and path[-1:] == ("address",):
         return _bad_address(str(misfit.value), span)
     if keyword == "uniqueItems":
@@ -80,8 +78,8 @@ def finding(misfit: Misfit, tree: Node) -> Diagnostic:
     near = nearest(str(misfit.value), misfit.limit) if keyword == "enum" else None
     hint = f"did you mean '{near}'?" if near else ""
     if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
-        return Diagnostic(span, code, f"{subject} must not be empty")
-    return Diagnostic(span, code, f"{subject} {_expected(misfit)}, not {shown(misfit.value)}", hint)
+        return Diagnostic(span, code, f"{name} must not be empty")
+    return Diagnostic(span, code, f"{name} {_expected(misfit)}, not {shown(misfit.value)}", hint)
 
 
 def shown(value: object) -> str:
@@ -110,13 +108,19 @@ def _expected(misfit: Misfit) -> str:
     return f"must be {limit}"
 
 
+def _bad_name(misfit: Misfit, span: SourceSpan) -> Diagnostic:
+    name = f"'{_clipped(str(misfit.value))}'"
+    if len(misfit.path) == _ROUTE_KEY_DEPTH:
+        return Diagnostic(span, Code.UNKNOWN_KEY, f"{name} {_expected(misfit)}")
+    return Diagnostic(span, Code.BAD_VALUE, f"the name {name} {_expected(misfit)}")
+
+
 def _missing_key(misfit: Misfit, tree: Node) -> Diagnostic:
-    name = misfit.message.split("'")[1]  # jsonschema has one error for each key and names it nowhere else
-    owner = _subject(misfit.path)
+    missing = misfit.message.split("'")[1]  # jsonschema has one error for each key and names it nowhere else
     key = key_at(tree, misfit.path)
     span = key.span if key else _first_line(node_at(tree, misfit.path))
-    hint = "or say 'ignore: why'" if name == "source" else ""
-    return Diagnostic(span, Code.MISSING_KEY, f"{owner} lacks the key '{name}'", hint)
+    hint = "or say 'ignore: why'" if missing == "source" else ""
+    return Diagnostic(span, Code.MISSING_KEY, f"{subject(misfit.path)} lacks the key '{missing}'", hint)
 
 
 def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
@@ -130,7 +134,7 @@ def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
 def _repeated(misfit: Misfit, tree: Node) -> Diagnostic:
     items = misfit.value if isinstance(misfit.value, list) else []
     index = next(index for index, item in enumerate(items) if item in items[:index])
-    what = f"{shown(items[index])} stands in {_subject(misfit.path)} twice"
+    what = f"{shown(items[index])} stands in {subject(misfit.path)} twice"
     return Diagnostic(node_at(tree, (*misfit.path, index)).span, Code.BAD_VALUE, what)
 
 
@@ -150,7 +154,7 @@ def _first_line(node: Node) -> SourceSpan:
     return node.span
 
 
-def _subject(path: Path) -> str:
+def subject(path: Path) -> str:
     """How a sentence names what stands at a path."""
     names = [step for step in path if isinstance(step, str)]
     if not names:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from router.assets import asset
 from router.errors import Code, Diagnostic, did_you_mean, nearest
 from router.table.nodes import Entry, MappingNode, Node, Path, key_at, node_at, rewritten, to_data
-from router.table.sentences import Misfit, finding
+from router.table.sentences import Misfit, finding, subject
 
 if TYPE_CHECKING:
     from jsonschema.protocols import Validator
@@ -88,11 +88,10 @@ def _is_broken(tree: Node, path: Path) -> bool:
 def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnostic]:
     if not isinstance(node, MappingNode):
         raise TypeError("only a mapping has keys")
-    place = f"'{path[-1]}'" if path and isinstance(path[-1], str) else "this mapping" if path else "a route table"
     for name, entry in node.entries.items():
         if name not in known and not entry.key.broken:
             hint = did_you_mean(name, known)
-            yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{place} has no key '{name}'", hint)
+            yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{subject(path)} has no key '{name}'", hint)
 
 
 def _with_known_keys(node: Node, known: list[str]) -> Node:

@@ -1,0 +1,158 @@
+"""The schema as an editor sees it: the real yaml-language-server, reached through the table's modeline."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.table.language_server import LanguageServer
+
+SERVER = "yaml-language-server"
+VERSION = "1.19.2"
+REPOSITORY = Path(__file__).parents[2]
+NUMBERS = itertools.count()
+GOOD = """\
+# yaml-language-server: $schema=../schemas/route-table.schema.json
+version: 1
+envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
+listen:
+  rover: {address: 0.0.0.0:5000, framing: zero_trimmed, receive_buffer: "${BUFFER:-4MiB}"}
+endpoints:
+  sensor_board: {address: "${SENSOR:-192.168.0.30:8}", kind: board}
+  basestation: {address: 192.168.0.10:9000, kind: basestation}
+routes:
+  imu_info:
+    source: [sensor_board]
+    destinations: [basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]
+    topics:
+      - topic: imu/data_raw
+        type: sensor_msgs/msg/Imu
+        queue_depth: ${DEPTH:-10}
+        qos: {profile: sensor_data, deadline: 500ms}
+        fields:
+          auto: true
+          header.stamp: received_at
+          linear_acceleration: {x: accel_x, y: accel_y, z: 9.81}
+  ph_info: {ignore: nobody needs it}
+"""
+
+
+@pytest.fixture(scope="module")
+def editor() -> Iterator[LanguageServer]:
+    if not shutil.which("node") or not shutil.which("npm"):
+        pytest.skip("needs node and npm")
+    with LanguageServer(installed_server(), REPOSITORY) as server:
+        yield server
+
+
+def installed_server() -> Path:
+    """The server's entry point, installed into the user's cache the first time."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rover-router" / f"{SERVER}-{VERSION}"
+    module = cache / "node_modules" / SERVER / "bin" / SERVER
+    if not module.exists():
+        cache.mkdir(parents=True, exist_ok=True)
+        options = ["--prefix", str(cache), "--no-save", "--no-audit", "--no-fund", "--ignore-scripts"]
+        subprocess.run(["npm", "install", *options, f"{SERVER}@{VERSION}"], check=True, capture_output=True)  # noqa: S607
+    return module
+
+
+def new_table() -> Path:
+    """A place beside the real tables, where the modeline leads to the schema."""
+    return REPOSITORY / "routes" / f"unsaved-{next(NUMBERS)}.yaml"
+
+
+def place(text: str, part: str) -> tuple[int, int]:
+    """Line and column, from 0, of the first occurrence of a part of a text."""
+    before = text[: text.index(part)]
+    return before.count("\n"), len(before) - (before.rfind("\n") + 1)
+
+
+def test_a_good_table_is_underlined_nowhere(editor: LanguageServer) -> None:
+    assert editor.open(new_table(), GOOD) == []
+
+
+@pytest.mark.parametrize("table", sorted((REPOSITORY / "routes").glob("*.yaml")), ids=lambda path: path.name)
+def test_the_tables_of_the_repository_are_underlined_nowhere_but_for_what_they_inherit(
+    editor: LanguageServer, table: Path
+) -> None:
+    text = table.read_text(encoding="utf-8")
+    found = [item["message"] for item in editor.open(table, text)]
+    inherited = [message for message in found if message.startswith("Missing property")]
+    assert found == (inherited if "\nextends:" in text else [])
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "blamed", "message"),
+    [
+        ("kind: board", "kid: board", "kid", "Property kid is not allowed."),
+        ("192.168.0.10:9000", "192.168.0.10", "192.168.0.10", "must be an IPv4 address and a port"),
+        ("192.168.0.10:9000", "192.168.0.10:70000", "192.168.0.10:70000", "must be an IPv4 address and a port"),
+        ("${DEPTH:-10}", "ten", ": ten", 'Incorrect type. Expected "integer"'),
+        ("zero_trimmed", "zero_trimed", "zero_trimed", 'Valid values: "zero_trimmed", "exact"'),
+        ("500ms", "500 millis", "500 millis", "must be a duration with its unit"),
+        ("    source: [sensor_board]\n", "", "imu_info", 'Missing property "source"'),
+        ("ignore: nobody", "source: ros, ignore: nobody", "source: ros", "has no place beside 'ignore'"),
+    ],
+)
+def test_a_mistake_is_underlined_where_it_is(
+    editor: LanguageServer, right: str, wrong: str, blamed: str, message: str
+) -> None:
+    text = GOOD.replace(right, wrong)
+    found = editor.open(new_table(), text)
+    assert [item for item in found if message in item["message"]], found
+    assert {item["range"]["start"]["line"] for item in found} == {place(text, blamed)[0]}
+
+
+@pytest.mark.parametrize(
+    ("word", "title", "part"),
+    [
+        ("version", "Version", "version of the route-table language"),
+        ("protos", "Proto folder", "relative to this file"),
+        ("framing", "Framing", "remove trailing zero bytes"),
+        ("receive_buffer", "Receive buffer", "net.core.rmem_max"),
+        ("kind", "Kind", "microcontroller"),
+        ("source: [", "Source", "'any' for whoever does"),
+        ("when", "When", "boolean expression"),
+        ("queue_depth", "Queue depth", "ROS history"),
+        ("deadline", "Deadline", "longest time between two messages"),
+        ("auto: true", "Auto", "Fields of the same name"),
+    ],
+)
+def test_hovering_over_a_key_tells_what_it_is_for(editor: LanguageServer, word: str, title: str, part: str) -> None:
+    table = new_table()
+    editor.open(table, GOOD)
+    line, character = place(GOOD, word)
+    text = editor.hover(table, line, character + 1)
+    assert title in text
+    assert part in text.replace("\\", "")
+
+
+def test_completion_offers_the_keys_that_are_missing(editor: LanguageServer) -> None:
+    text = GOOD.replace("routes:", "  arm_board:\n    kind: board\n    \nroutes:")
+    table = new_table()
+    editor.open(table, text)
+    line, _ = place(text, "routes:")
+    assert editor.completions(table, line - 1, 4) >= {"address", "source_port", "trim_trailing_zeros"}
+
+
+def test_completion_offers_the_keys_of_a_route(editor: LanguageServer) -> None:
+    text = GOOD + "  gps_info:\n    \n"
+    table = new_table()
+    editor.open(table, text)
+    offered = editor.completions(table, text.count("\n") - 1, 4)
+    assert {"source", "destinations", "topics", "ignore"} <= offered
+
+
+def test_completion_offers_the_words_of_the_quality_of_service(editor: LanguageServer) -> None:
+    text = GOOD.replace("{profile: sensor_data, deadline: 500ms}", "\n          reliability: ")
+    table = new_table()
+    editor.open(table, text)
+    line, character = place(text, "reliability: ")
+    words = {"reliable", "best_effort", "best_available", "system_default"}
+    assert words <= editor.completions(table, line, character + len("reliability: "))
