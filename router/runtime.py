@@ -8,7 +8,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 
 from router.compiler.program import Program
@@ -110,7 +110,7 @@ class Router:
         if settings is None:
             return
         build = {
-            "version": version("rover-router"),
+            "version": _version(),
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
         }
@@ -157,6 +157,13 @@ class Router:
             "a fault in the router itself lost a datagram; please report it",
             error,
         )
+
+
+def _version() -> str:
+    try:
+        return version("rover-router")
+    except PackageNotFoundError:  # run from a checkout that is not installed
+        return "unknown"
 
 
 def tune_interpreter() -> None:

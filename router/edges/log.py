@@ -72,8 +72,8 @@ class FloodLog:
     _floods: dict[Hashable, _Flood] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def note(self, key: Hashable, emit: Emit, event: str, error: BaseException | None = None, **values: Any) -> None:
-        """One more event of the kind `key`. The first line carries the traceback of `error`."""
+    def note(self, key: Hashable, emit: Emit, event: str, exc_info: BaseException | None = None, **values: Any) -> None:
+        """One more event of the kind `key`. The first line carries the traceback of `exc_info`."""
         now = self.clock_ns()
         with self._lock:
             flood = self._floods.get(key)
@@ -86,7 +86,7 @@ class FloodLog:
                     _summarise(flood, now)
                 return
             self._floods[key] = _Flood(emit, event, values, now)
-        emit(event, exc_info=error, **values)
+        emit(event, exc_info=exc_info, **values)
 
     def flush(self, *, final: bool = False) -> None:
         """Writes the summaries that are due; all that are pending when `final`."""

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
-from pathlib import Path
-from time import monotonic, sleep
 
 import pytest
 
@@ -22,6 +17,7 @@ from router.compiler.program import PublisherPlan, QosPlan
 from router.edges.ros import RosEdge
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
+from tests.edges.ros_subscriber import Subscriber, wait_until
 
 RELIABLE = QosPlan("reliable", "volatile", "keep_last", 10)
 SPAN = SourceSpan("routes/rover.yaml", 40, 16, 24)
@@ -36,42 +32,13 @@ def open_ros(*plans: PublisherPlan, args: tuple[str, ...] = ()) -> RosEdge:
     return RosEdge(NodeSettings("router_test", "/"), plans, {plan.topic: SPAN for plan in plans}, args)
 
 
-@pytest.fixture(autouse=True)
-def own_domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(100 + os.getpid() % 100))
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-
-
-class Peer:
-    """A subscriber in another process; `lines` are what it has printed, one per message."""
-
-    def __init__(self, *arguments: str) -> None:
-        command = [sys.executable, str(Path(__file__).with_name("ros_peer.py")), *arguments]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def line(self) -> str:
-        assert self.process.stdout
-        return self.process.stdout.readline().strip()
-
-    def close(self) -> None:
-        self.process.communicate(timeout=20)
-        assert self.process.returncode == 0
-
-
 @pytest.fixture
-def subscribe() -> Iterator[Callable[..., Peer]]:
+def subscribe() -> Iterator[Callable[..., Subscriber]]:
     with ExitStack() as peers:
-        yield lambda *arguments: peers.enter_context(closing(Peer(*arguments)))
+        yield lambda *arguments: peers.enter_context(closing(Subscriber(*arguments)))
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = monotonic() + 20
-    while not condition():
-        assert monotonic() < deadline, "never happened"
-        sleep(0.01)
-
-
-def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: Callable[..., Peer]) -> None:
+def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic())) as ros:
         wanted = ros.wanted["greeting"]
         assert wanted == [False]
@@ -84,7 +51,7 @@ def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: 
         wait_until(lambda: not wanted[0])
 
 
-def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..., Peer]) -> None:
+def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic(QosPlan("reliable", "transient_local", "keep_last", 1)))) as ros:
         assert ros.wanted["greeting"] == [True]
         ros.publish["greeting"](HELLO)
@@ -93,7 +60,7 @@ def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..
         assert ros.wanted["greeting"] == [True]
 
 
-def test_a_subscriber_with_incompatible_qos_is_warned_about(subscribe: Callable[..., Peer]) -> None:
+def test_a_subscriber_with_incompatible_qos_is_warned_about(subscribe: Callable[..., Subscriber]) -> None:
     with capture_logs() as logged, closing(open_ros(string_topic(QosPlan("best_effort", "volatile", "keep_last", 5)))):
         subscribe("greeting", "std_msgs/msg/String")
         wait_until(lambda: bool(logged))
@@ -102,7 +69,7 @@ def test_a_subscriber_with_incompatible_qos_is_warned_about(subscribe: Callable[
     assert logged[0]["log_level"] == "warning"
 
 
-def test_ros_arguments_rename_topics(subscribe: Callable[..., Peer]) -> None:
+def test_ros_arguments_rename_topics(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic(), args=("--ros-args", "-r", "greeting:=salute"))) as ros:
         peer = subscribe("salute", "std_msgs/msg/String")
         wait_until(lambda: ros.wanted["greeting"][0])

@@ -102,7 +102,7 @@ def test_nothing_new_gets_in_after_the_end_of_input(stack: ExitStack, peer: sock
 
 
 def test_a_listener_on_all_interfaces_ends_too(stack: ExitStack) -> None:
-    everywhere = plan(host="0.0.0.0")  # noqa: S104 what boards send to
+    everywhere = plan(host="0.0.0.0")
     listener = stack.enter_context(closing(Listener(everywhere, SPAN)))
     receiving = Receiving([listener])
     receiving.thread.start()

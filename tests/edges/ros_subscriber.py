@@ -1,16 +1,17 @@
-"""The other side of the ROS edge's tests, in a process of its own: subscribes, and prints each message's bytes in hex.
+"""A ROS subscriber in a process of its own: `Subscriber` starts it, and this file run as a script is it.
 
-    python ros_peer.py TOPIC TYPE [--best-effort | --transient-local]
-
-Prints "matched" once a publisher is there; ends when its standard input does.
+It prints "matched" once a publisher is there, then each message's bytes in hex, and ends with its standard input.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from time import monotonic, sleep
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -18,17 +19,40 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 
+class Subscriber:
+    """`Subscriber("imu_data", "comms/msg/ImuSensorInformation", "--transient-local")`; close it."""
+
+    def __init__(self, topic: str, type_name: str, *options: str) -> None:
+        command = [sys.executable, __file__, topic, type_name, *options]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def line(self) -> str:
+        """The next line that it prints; waits for it."""
+        assert self.process.stdout
+        return self.process.stdout.readline().strip()
+
+    def close(self) -> None:
+        self.process.communicate(timeout=20)
+        assert self.process.returncode == 0
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = monotonic() + 20
+    while not condition():
+        assert monotonic() < deadline, "it never happened"
+        sleep(0.01)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("topic")
     parser.add_argument("type")
-    parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--transient-local", action="store_true")
     arguments = parser.parse_args()
     package, _, name = arguments.type.split("/")
     qos = QoSProfile(
         depth=100,
-        reliability=ReliabilityPolicy.BEST_EFFORT if arguments.best_effort else ReliabilityPolicy.RELIABLE,
+        reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if arguments.transient_local else DurabilityPolicy.VOLATILE,
     )
     rclpy.init(args=[])

@@ -1,0 +1,92 @@
+"""`router run` as a process: exit codes, signals, ROS arguments, and what it writes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+  rover: {{address: "127.0.0.1:${{LISTEN_PORT}}"}}
+endpoints:
+  basestation: {{address: "127.0.0.1:{destination}", kind: basestation}}
+routes:
+  ph_info: {{source: any, destinations: [basestation]}}
+"""
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as unused:
+        unused.bind(("127.0.0.1", 0))
+        port: int = unused.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    path = tmp_path / "table.yaml"
+    path.write_text(TABLE.format(protos=ROOT / "protos", destination=free_port()))
+    return path
+
+
+def start(*arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "router", "run", *map(str, arguments)]
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    variables = {**os.environ, "PYTHONPATH": path, **environment}
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=variables)
+
+
+def wait_for_start(process: subprocess.Popen[str]) -> dict[str, object]:
+    assert process.stderr
+    for line in process.stderr:
+        if line.startswith("{") and (entry := json.loads(line))["event"] == "router started":
+            return dict(entry)
+    raise AssertionError("it did not start")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_gracefully(table: Path, number: signal.Signals) -> None:
+    process = start(table, LISTEN_PORT=str(free_port()))
+    wait_for_start(process)
+    process.send_signal(number)
+    _, log = process.communicate(timeout=10)
+    assert process.returncode == 0
+    events = [json.loads(line)["event"] for line in log.splitlines()]
+    assert events == ["router stopping", "router stopped"]
+
+
+def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table: Path) -> None:
+    port = free_port()
+    process = start(table, "--ros-args", "-p", f"listen_port:={port}", LISTEN_PORT=str(free_port()))
+    assert wait_for_start(process)["listening"] == {"rover": f"127.0.0.1:{port}"}
+    process.terminate()
+    process.communicate(timeout=10)
+
+
+def test_a_table_with_errors_is_told_and_ends_with_78(table: Path) -> None:
+    table.write_text(table.read_text().replace("destinations: [basestation]", "destinations: [nobody]"))
+    process = start(table, LISTEN_PORT=str(free_port()))
+    _, text = process.communicate(timeout=10)
+    assert process.returncode == 78
+    assert f"{table}:8:41: error[unknown-endpoint]" in text
+
+
+def test_a_port_in_use_is_told_and_ends_with_78(table: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        process = start(table, LISTEN_PORT=str(taken.getsockname()[1]))
+        _, text = process.communicate(timeout=10)
+    assert process.returncode == 78
+    assert f"router run: {table}:4:20: listener 'rover' cannot use" in text
+    assert f"(pid {os.getpid()}) has the port" in text
