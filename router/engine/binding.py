@@ -13,7 +13,7 @@ from router.engine.limiter import rate_limit
 from router.errors import MappingError, NonFiniteError, TransportError
 
 Handle = Callable[[object, bytes, int, int, str], None]
-"""Takes the parsed message, the datagram, the arrival time (wall clock, ns), the monotonic time and the sender's name."""
+"""Takes the parsed message, the datagram, its arrival by wall clock and by monotonic clock (ns), the sender's name."""
 
 MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
 """What a value can make of a mapping. Everything else is a fault of ours and goes up, loudly."""

@@ -80,7 +80,7 @@ class Engine:
         self._by_host, self._by_address = recognisers(program.table.endpoints)
         outlets = Outlets(counts, send, publish, wanted, report, publish_errors)
         self._routes = {
-            number << 3 | LEN: self._route(handler, bind(handler, program.books, outlets))
+            number: self._route(handler, bind(handler, program.books, outlets))
             for number, handler in program.handlers.items()
         }
 
@@ -106,7 +106,9 @@ class Engine:
         This is the hot path: everything it needs is a local name, and the usual datagram (one payload,
         complete, of a routed case, from its endpoint) goes straight through.
         """
-        books, counts, routes = self._program.books, self._counts, self._routes
+        books, counts = self._program.books, self._counts
+        # By tag, of those whose tag is two bytes at most.
+        routes = {number << 3 | LEN: route for number, route in self._routes.items() if number < 2048}
         clock_ns, wall_ns, bounds = self._clock_ns, self._wall_ns, HISTOGRAM_BOUNDS_NS
         received, received_bytes = books.slot("datagrams_received", listener), books.slot("received_bytes", listener)
         seen = self._seen_slots()
@@ -131,22 +133,17 @@ class Engine:
                     length, start = length & 0x7F | data[start] << 7, start + 1
                 route = routes[tag]
                 if start + length != size or size > MAX_DATAGRAM:
-                    raise LookupError  # not the usual datagram
-                payload = data[start:]
-            except LookupError:
+                    raise LookupError
+                message = route.parse(data[start:])
+            except (LookupError, ProtobufError):  # not the usual datagram
                 try:
-                    route, payload = settle(data)
+                    route, message = settle(data)
                 except _Rejected as rejected:
                     reject(rejected.reason, peer, rejected)
                     return
             sender = route.senders.get(sender_key, route.stranger)
             if sender is None:
                 reject("source_mismatch", peer, None)
-                return
-            try:
-                message = route.parse(payload)
-            except ProtobufError as error:
-                reject("malformed", peer, error)
                 return
             counts[sender.slot] += 1
             route.handle(message, data, received_at, now, sender.name)
@@ -162,14 +159,14 @@ class Engine:
         metric = "endpoint_last_seen_timestamp_seconds"
         return {key: self._program.books.slot(metric, name) for key, name in addresses}
 
-    def _settler(self, listener: str) -> Callable[[bytes], tuple[_Route, bytes]]:
+    def _settler(self, listener: str) -> Callable[[bytes], tuple[_Route, Message]]:
         """The unusual datagram: repaired if the listener's framing says so, then read by the protobuf library."""
         plan = next(plan for plan in self._program.listeners if plan.name == listener)
         repairs = plan.framing is Framing.ZERO_TRIMMED
         padded = self._program.books.slot("datagrams_padded", listener)
         counts, parse = self._counts, self._program.envelope.message_class.FromString
 
-        def settle(data: bytes) -> tuple[_Route, bytes]:
+        def settle(data: bytes) -> tuple[_Route, Message]:
             if len(data) > MAX_DATAGRAM:
                 raise _Rejected("truncated", f"{len(data)} bytes")
             if not data:
@@ -185,21 +182,20 @@ class Engine:
 
         return settle
 
-    def _find(self, message: Message) -> tuple[_Route, bytes]:
+    def _find(self, message: Message) -> tuple[_Route, Message]:
         """The route and the payload of a parsed envelope, whatever else is in it. Raises _Rejected."""
         envelope = self._program.envelope
         case = message.WhichOneof(envelope.oneof)
         if case is None:
-            unknown = [str(field.field_number) for field in UnknownFieldSet(message)]
-            if not unknown:
+            unknown = UnknownFieldSet(message)
+            if not len(unknown):
                 raise _Rejected("no_payload")
             self._count_unhandled(UNKNOWN_CASE)
-            raise _Rejected("unknown_case", f"field {', '.join(unknown[:8])}")
+            raise _Rejected("unknown_case", f"field {unknown[0].field_number}")
         number = envelope.cases[case].number
-        route = self._routes.get(number << 3 | LEN)
+        route = self._routes.get(number)
         if route is not None:
-            payload: Message = getattr(message, case)
-            return route, payload.SerializeToString()
+            return route, getattr(message, case)
         if number in self._program.ignored:
             raise _Rejected("ignored", case)
         self._count_unhandled(case)
