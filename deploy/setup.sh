@@ -29,11 +29,16 @@ is_made() {  # STEP CHECKSUM
 }
 
 step() {  # STEP CHECKSUM TITLE COMMAND...: unless it is made; one line for the person, the rest for the log
-  local name=$1 sum=$2 title=$3 started=$SECONDS
+  local name=$1 sum=$2 title=$3 started=$SECONDS status
   shift 3
   ! is_made "$name" "$sum" || return 0
+  rm -f "$made/$name"
   printf 'setup: %s ... ' "$title"
-  if ! "$@" >>"$log" 2>&1; then
+  set +e  # not `if ! "$@"`: a condition would switch off `set -e` inside the step
+  (set -e; "$@") >>"$log" 2>&1
+  status=$?
+  set -e
+  if [ $status -ne 0 ]; then
     printf 'failed\n'
     tail -n 30 "$log" >&2
     die "$title failed; the whole output is in ${log#"$root"/}"
