@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from router.tools.simulator import Simulator
 
 TERMINAL_REFRESH = 0.5
-JSON_REFRESH = 1.0
+JSON_REFRESH = 0.5
 LINE_REFRESH = 5.0
 """Seconds between two looks at the statistics, by who looks."""
 
@@ -32,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--duration", type=positive, metavar="SECONDS", help="default: until Ctrl-C")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="the same seed sends the same values")
     parser.add_argument("--rate-scale", type=positive, default=1.0, metavar="X", help="2 sends twice as often")
-    parser.add_argument("--json", action="store_true", help="statistics as JSON, one line a second; the last is final")
+    parser.add_argument("--json", action="store_true", help="statistics as JSON lines, the last one final")
 
 
 @explained

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import http.client
 import urllib.request
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -115,6 +115,21 @@ def view(before: Snapshot, after: Snapshot) -> View:
     )
 
 
+class Window:
+    """Snapshots of the last seconds: over a short time, one message in two seconds is no rate but a flicker."""
+
+    def __init__(self, seconds: float = 3.0) -> None:
+        self._seconds = seconds
+        self._snapshots: deque[Snapshot] = deque()
+
+    def add(self, newest: Snapshot) -> View:
+        """Totals as of `newest`, rates over the window; the first snapshot alone has rates of 0."""
+        while len(self._snapshots) > 1 and newest.at - self._snapshots[1].at >= self._seconds:
+            self._snapshots.popleft()
+        self._snapshots.append(newest)
+        return view(self._snapshots[0], newest)
+
+
 def _route_row(route: str, before: Snapshot, after: Snapshot) -> RouteRow:
     received = _total(after, "messages_received", route)
     return RouteRow(
@@ -151,7 +166,8 @@ def _total(snapshot: Snapshot, metric: str, *labels: str) -> int:
 
 def _rate(now: int, then: int, before: Snapshot, after: Snapshot) -> float:
     """Per second; a router that was started anew counts from zero."""
-    return (now - then if now >= then else now) / (after.at - before.at)
+    seconds = after.at - before.at
+    return (now - then if now >= then else now) / seconds if seconds > 0 else 0.0
 
 
 def _by_last_label(counts: Counts) -> dict[str, int]:

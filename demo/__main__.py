@@ -1,0 +1,168 @@
+"""`python -m demo`: simulator, router and a ROS subscriber for 15 seconds; exit 0 when everything arrived."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+
+from rich.console import Console
+from rich.text import Text
+
+from demo.children import Child
+from demo.places import free_ros_domain, taken_places
+from demo.screen import open_screen
+from demo.verdict import Finding, judge
+from router.errors import RouterError, TransportError
+from router.table.model import Address, RouteTable
+from router.tools.live import Snapshot, Window, parse_metrics, scrape
+from router.tools.wire import read_table
+
+ROOT = Path(__file__).parent.parent
+TABLE = Path("routes/sim.yaml")
+SIMULATOR = "simulator"
+DURATION = 15.0
+START_PATIENCE = 30.0
+"""Seconds within which router and ROS listener must be up; a cold start reads a lot from disk."""
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+MATCHING = 0.5
+"""Seconds after the listener has found the router until the router has found the listener."""
+
+REFRESH = 0.5
+SETTLING = 1.5
+"""Seconds after the last datagram was sent, for the listener's last report."""
+
+NEXT_STEPS = f"""\
+Where to look next:
+  routes/rover.yaml                      what goes where
+  .venv/bin/router validate routes/      what is wrong with it, before driving
+  .venv/bin/router explain imu_info      what becomes of one message
+  .venv/bin/router run {TABLE}   all this by hand; in another terminal:
+  .venv/bin/router sim"""
+
+
+class DemoError(RouterError):
+    """The demo cannot go on; the message says why, for a person who has just arrived."""
+
+
+class Demo:
+    """The three processes and what they say. The router starts first, the simulator when all listen."""
+
+    def __init__(self, table: RouteTable) -> None:
+        if table.metrics is None:
+            raise DemoError(f"{TABLE} has no metrics address, and the demo reads its rates there")
+        self._metrics: Address = table.metrics.value
+        self._table = table
+        self._env = os.environ | {
+            "ROS_DOMAIN_ID": str(free_ros_domain()),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONUNBUFFERED": "1",
+        }
+        self.children: list[Child] = []
+
+    def _start(self, name: str, *module: str) -> Child:
+        child = Child(name, self._env, *module)
+        self.children.append(child)
+        return child
+
+    def run(self, console: Console) -> list[Finding]:
+        listener = self._start("listener", "demo.ros_listener", str(TABLE))
+        self._start("router", "router", "run", str(TABLE))
+        self._wait_until_up(listener)
+        simulator = self._start(SIMULATOR, "router", "sim", str(TABLE), "--json", "--duration", str(DURATION))
+        window = Window()
+        start = time.monotonic()
+        with open_screen(console, self._table, DURATION) as screen:
+            while simulator.exit_code is None:
+                time.sleep(REFRESH)
+                screen.show(time.monotonic() - start, window.add(self._snapshot()), listener.latest, simulator.latest)
+        simulator.end()
+        self._check()
+        time.sleep(SETTLING)
+        return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()))
+
+    def _wait_until_up(self, listener: Child) -> None:
+        """Until the ROS listener has found the router's topics: before that, the router withholds messages."""
+        deadline = time.monotonic() + START_PATIENCE
+        while time.monotonic() < deadline:
+            self._check()
+            time.sleep(0.1)
+            if listener.latest and all(topic["publishers"] for topic in listener.latest["topics"].values()):
+                time.sleep(MATCHING)
+                return
+        raise DemoError(f"router and ROS listener did not find each other within {START_PATIENCE:.0f} s")
+
+    def _snapshot(self) -> Snapshot:
+        try:
+            return parse_metrics(scrape(self._metrics), time.monotonic())
+        except TransportError:
+            self._check()  # a router that has ended has better words than a refused connection
+            raise
+
+    def _check(self) -> None:
+        """The simulator ends by itself and well; the others must not end at all."""
+        for child in self.children:
+            if child.exit_code is not None and (child.exit_code or child.name != SIMULATOR):
+                raise DemoError(f"the {child.name} ended with exit code {child.exit_code}:\n{child.last_words()}")
+
+    def end(self) -> None:
+        """All are asked to end before any is waited for; nothing interrupts this."""
+        for number in ENDING:
+            signal.signal(number, signal.SIG_IGN)
+        for child in self.children:
+            child.ask_to_end()
+        for child in self.children:
+            child.end()
+
+
+def leave(number: int, frame: FrameType | None) -> None:
+    """Every signal that ends the demo goes through its `finally`."""
+    raise SystemExit(128 + number)
+
+
+def play(console: Console) -> list[Finding]:
+    """Raises DemoError, or TableError for a broken table."""
+    table = read_table(TABLE)
+    if problems := taken_places(table):
+        told = "\n  ".join(problems)
+        raise DemoError(f"addresses of {TABLE} are taken; does another demo, router or simulator run?\n  {told}")
+    demo = Demo(table)
+    try:
+        return demo.run(console)
+    finally:
+        demo.end()
+
+
+def tell(console: Console, findings: list[Finding]) -> int:
+    """The verdict, and the exit code that belongs to it."""
+    for finding in findings:
+        mark, style = ("ok  ", "green") if finding.ok else ("FAIL", "red")
+        console.print(Text.assemble((mark, style), f"  {finding.text}"))
+    if all(finding.ok for finding in findings):
+        console.print("\nIt works: boards and basestation talked over UDP, the router, and real ROS 2.\n", style="bold")
+        console.print(NEXT_STEPS, highlight=False)
+        return 0
+    console.print("\nThe demo failed: see the lines above.", style="bold red")
+    return 1
+
+
+def main() -> int:
+    os.chdir(ROOT)
+    for number in ENDING:
+        signal.signal(number, leave)
+    console = Console()
+    console.print(f"Starting simulator, router and a ROS 2 listener on {TABLE} ...", highlight=False)
+    try:
+        findings = play(console)
+    except RouterError as error:
+        console.print(f"The demo cannot run: {error}", style="red", highlight=False, markup=False)
+        return 1
+    return tell(console, findings)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

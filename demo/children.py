@@ -1,0 +1,74 @@
+"""Child processes that never outlive the demo, whatever ends it. Knows not what they do."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Mapping
+from typing import IO, Any
+
+PATIENCE = 5.0
+"""Seconds that a child has to end by itself."""
+
+LAST_WORDS = 4000
+"""Bytes of stderr worth showing."""
+
+
+class Child:
+    """A running Python module. Its stdout is JSON lines, of which `latest` is the newest.
+
+    Has a session of its own, so that Ctrl-C reaches the demo alone, which then ends its children in order.
+    """
+
+    def __init__(self, name: str, env: Mapping[str, str], *module: str) -> None:
+        self.name = name
+        self.latest: dict[str, Any] = {}
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the child is of interest
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "demo.tied", *module],
+            env=dict(env),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            start_new_session=True,
+        )
+        if self._process.stdout is None:
+            raise AssertionError("a pipe was asked for")
+        self._reader = threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True)
+        self._reader.start()
+
+    def _read(self, lines: IO[bytes]) -> None:
+        with lines:
+            for line in lines:
+                if line.startswith(b"{"):
+                    self.latest = json.loads(line)
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self._process.poll()
+
+    def ask_to_end(self) -> None:
+        if self.exit_code is None:
+            self._process.send_signal(signal.SIGTERM)
+
+    def end(self) -> None:
+        """Ask, wait, and kill if it must be; afterwards its last line has been read."""
+        self.ask_to_end()
+        try:
+            self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self._reader.join(PATIENCE)
+
+    def last_words(self) -> str:
+        """The end of what it wrote to stderr, read beside the child's own position in the file."""
+        size = os.fstat(self._stderr.fileno()).st_size
+        start = max(0, size - LAST_WORDS)
+        return os.pread(self._stderr.fileno(), size - start, start).decode(errors="replace").strip()

@@ -1,0 +1,50 @@
+"""What the demo needs free on this machine: the table's UDP addresses, the metrics port, a ROS domain."""
+
+from __future__ import annotations
+
+import random
+import socket
+
+from router.table.model import Address, RouteTable
+from router.tools import UsageError
+from router.tools.places import open_udp
+
+DOMAINS = range(1, 102)
+"""ROS 2 domains whose ports lie below Linux's ephemeral ones."""
+
+
+def taken_places(table: RouteTable) -> list[str]:
+    """One line for each address of the table that cannot be had."""
+    wanted = {f"listener {name}": listener.address.value for name, listener in table.listeners.items()}
+    wanted |= {f"endpoint {name}": endpoint.address.value for name, endpoint in table.endpoints.items()}
+    problems = []
+    for purpose, address in wanted.items():
+        try:
+            open_udp(address, purpose).close()
+        except UsageError as error:
+            problems.append(str(error))
+    if table.metrics is not None and _is_taken(table.metrics.value):
+        problems.append(f"metrics: another process has TCP port {table.metrics.value}")
+    return problems
+
+
+def _is_taken(address: Address) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as an HTTP server does: only listeners count
+        try:
+            probe.bind(address)
+        except OSError:
+            return True
+    return False
+
+
+def free_ros_domain() -> int:
+    """A domain in which nobody on this machine takes part: discovery of a domain has a UDP port of its own."""
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", 7400 + 250 * domain))
+            except OSError:
+                continue
+            return domain
+    raise UsageError("all ROS domains of this machine are in use")

@@ -1,0 +1,81 @@
+"""A ROS 2 node that has nothing of the router but the table's topic names: counts what really arrives.
+
+`python -m demo.ros_listener TABLE` prints a JSON object twice a second:
+{"topics": {topic: {"publishers": how many it knows, "count": messages so far,
+                    "sample": the newest one, decoded by rclpy, as text}}}
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+
+from demo.expected import expected_topics
+from router.tools.wire import read_table
+
+REPORT_INTERVAL = 0.5
+"""Seconds."""
+
+ANY_PUBLISHER = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Matches publishers of every QoS."""
+
+
+class Listener:
+    """Subscribes raw: a message is only decoded when it is shown."""
+
+    def __init__(self, node: Node, topics: dict[str, str]) -> None:
+        self._node = node
+        self._counts = dict.fromkeys(topics, 0)
+        self._newest: dict[str, bytes] = {}
+        self._types = {topic: _message_class(name) for topic, name in topics.items()}
+        for topic, message_class in self._types.items():
+            callback = partial(self._take, topic)
+            node.create_subscription(message_class, topic, callback, ANY_PUBLISHER, raw=True)
+
+    def _take(self, topic: str, data: bytes) -> None:
+        self._counts[topic] += 1
+        self._newest[topic] = data
+
+    def report(self) -> None:
+        topics = {
+            topic: {"publishers": self._node.count_publishers(topic), "count": count, "sample": self._sample(topic)}
+            for topic, count in self._counts.items()
+        }
+        print(json.dumps({"topics": topics}), flush=True)
+
+    def _sample(self, topic: str) -> str:
+        data = self._newest.get(topic)
+        return "" if data is None else str(deserialize_message(data, self._types[topic]))
+
+
+def _message_class(name: str) -> Any:
+    package, _, short = name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), short)
+
+
+def main() -> int:
+    table = read_table(Path(sys.argv[1]))
+    rclpy.init()
+    node = rclpy.create_node("demo_listener", namespace=table.node.namespace)
+    listener = Listener(node, expected_topics(table))
+    node.create_timer(REPORT_INTERVAL, listener.report)
+    listener.report()
+    try:
+        rclpy.spin(node)
+    except ExternalShutdownException:
+        listener.report()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
