@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
-from router.errors import Code, Diagnostic, TableError
+from router.errors import Code, Diagnostic, Severity, TableError
 from router.types.lock_file import Declaration, Entry, Lock, by_number, current_lock, read_lock
 from router.types.proto_source import Part
 from router.types.protobuf import Envelope, ProtoSchema
@@ -35,7 +35,7 @@ def check_lock(schema: ProtoSchema, envelope: Envelope) -> list[Diagnostic]:
     if (lock.message, lock.oneof) != (current.message, current.oneof):
         message = f"the lock is for the envelope {lock.message}.{lock.oneof}, not {current.message}.{current.oneof}"
         findings.append(Diagnostic(span, Code.NOT_LOCKED, message, _TO_LOCK))
-    elif lock.max_size != current.max_size:
+    elif lock.max_size != current.max_size and not any(found.severity is Severity.ERROR for found in findings):
         message = f"{envelope.name} takes up to {current.max_size} bytes, the lock says {lock.max_size}"
         findings.append(Diagnostic(span, Code.NOT_LOCKED, message, f"flash the boards, then {_TO_LOCK}"))
     return sorted(findings, key=lambda finding: finding.span)

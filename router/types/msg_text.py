@@ -19,12 +19,14 @@ PRIMITIVES: dict[str, Type] = {
     **{f"{'' if signed else 'u'}int{bits}": Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (True, False)},
     "float32": Float(32),
     "float64": Float(64),
+    "string": String(),
+    "wstring": String(wide=True),
 }
 
 _TYPE = re.compile(
     r"(?P<base>[A-Za-z][\w/]*)"
-    r"(?:<=(?P<string_bound>\d+))?"
-    r"(?P<array>\[(?:(?P<length>\d+)|<=(?P<bound>\d+))?\])?"
+    r"(?:<=(?P<string_bound>[1-9][0-9]{0,8}))?"
+    r"(?P<array>\[(?:(?P<length>[1-9][0-9]{0,8})|<=(?P<bound>[1-9][0-9]{0,8}))?\])?"
 )
 _MESSAGE_NAME = re.compile(r"(?:(?P<package>[a-z](?:_?[a-z0-9])*)/)?(?P<name>[A-Z][A-Za-z0-9]*)")
 _FIELD_NAME = re.compile(r"[a-z](?:_?[a-z0-9])*")
@@ -138,7 +140,7 @@ class _Line:
         name, _, text = (part.strip() for part in self._rest.partition("="))
         if not _CONSTANT_NAME.fullmatch(name):
             raise self.error(f"'{name}' is no name for a constant; write it in upper case", name)
-        type_ = _primitive(self._type)
+        type_ = PRIMITIVES.get(self._type)
         if type_ is None:
             raise self.error(f"a constant cannot be of type {self._type}", self._type)
         return name, self._value(type_, text)
@@ -164,24 +166,20 @@ class _Line:
 
     def _field_type(self, package: str) -> tuple[Type | NamedType, Shape | None]:
         declared = _TYPE.fullmatch(self._type)
-        if declared is None or "0" in (declared["string_bound"], declared["length"], declared["bound"]):
+        if declared is None:
             raise self.error(f"'{self._type}' is no type", self._type)
         shape = Shape(_number(declared["length"]), _number(declared["bound"])) if declared["array"] else None
-        element = _primitive(self._type[: declared.start("array")] if declared["array"] else self._type)
+        element = PRIMITIVES.get(declared["base"])
+        if isinstance(element, String):
+            return String(_number(declared["string_bound"]), element.wide), shape
+        if declared["string_bound"]:
+            raise self.error(f"'{self._type}' is no type; only strings have a bound of their own", self._type)
         if element is not None:
             return element, shape
         named = _MESSAGE_NAME.fullmatch(declared["base"])
-        if named is None or declared["string_bound"]:
+        if named is None:
             raise self.error(f"'{self._type}' is no type", self._type)
         return NamedType(f"{named['package'] or package}/{named['name']}"), shape
-
-
-def _primitive(name: str) -> Type | None:
-    """`uint8`, `string`, `wstring<=10`; None for anything else."""
-    text = re.fullmatch(r"(w?)string(?:<=(\d+))?", name)
-    if text is not None:
-        return String(_number(text[2]), wide=bool(text[1]))
-    return PRIMITIVES.get(name)
 
 
 def _number(digits: str | None) -> int | None:

@@ -79,7 +79,8 @@ def _parse_list(type_: List, text: str) -> tuple[object, ...]:
         element = _ELEMENT.match(inner, at)
         if element is None or not element[1]:
             raise ValueError(f"'{text}' is no list of {type_.element}")
-        items.append(parse_value(type_.element, element[1].rstrip()))
+        item = parse_value(type_.element, element[1].rstrip())
+        items.append(item.strip() if isinstance(item, str) else item)  # even inside quotes, as rosidl_adapter does
         at = element.end()
     if type_.length is not None and len(items) != type_.length:
         raise ValueError(f"the array has {type_.length} elements, its default {len(items)}")
