@@ -8,7 +8,6 @@ unknown length all offsets are known now, so that whole stretch is one `struct` 
 from __future__ import annotations
 
 import ast
-import itertools
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -89,7 +88,7 @@ def scalar_format(declared: Type) -> str:
             raise AssertionError(f"{declared} is no scalar of a ROS message")
 
 
-def steps(plan: Plan) -> Iterable[Step]:
+def steps(plan: Plan) -> Iterable[Step]:  # noqa: C901 - a case a plan
     """The message as a flat sequence of what is written, in order."""
     match plan:
         case Record():
@@ -166,11 +165,14 @@ def put_text(data: bytearray, text: str) -> None:
 
 
 def put_wide_text(data: bytearray, text: str) -> None:
-    """Appends a wstring: its length in UTF-16 code units, and those. `data` has no header."""
+    """Appends a wstring: its length in UTF-16 code units, and each of those in 32 bits, as rmw_fastrtps does it.
+
+    There is no final NUL. `data` has no header.
+    """
     encoded = text.encode("utf-16-le")
+    units = struct.unpack(f"<{len(encoded) // 2}H", encoded)
     data += _PADDING[-len(data) & 3]
-    data += struct.pack("<I", len(encoded) // 2)
-    data += encoded
+    data += struct.pack(f"<I{len(units)}I", len(units), *units)
 
 
 def put_numbers(data: bytearray, letter: str, size: int, values: Sequence[object]) -> None:
@@ -265,19 +267,12 @@ def write_message(out: Source, plan: Record, name: str) -> str:
     """
     runs = _runs(steps(plan))
     first = runs[0] if isinstance(runs[0], _Run) else _Run(())
-    if runs == [first]:
-        letters, arguments = first.static(HEADER)
-        _call(out, "data = {}", name, out.constant(f"pack_{name}", struct.Struct(letters).pack), arguments, plan.span)
+    fixed = runs == [first]
+    letters, arguments = first.static(HEADER if fixed else b"")
+    pack = out.constant(f"pack_{name}", struct.Struct(letters).pack)
+    _call(out, "data = {}" if fixed else "data = bytearray({})", name, pack, arguments, plan.span)
+    if fixed:
         return "data"
-    letters, arguments = first.static(b"")
-    _call(
-        out,
-        "data = bytearray({})",
-        name,
-        out.constant(f"pack_{name}", struct.Struct(letters).pack),
-        arguments,
-        plan.span,
-    )
     _write(out, runs[1:] if runs[0] is first else runs, name, plan.span)
     return "HEADER + data"
 
@@ -285,9 +280,16 @@ def write_message(out: Source, plan: Record, name: str) -> str:
 def _runs(sequence: Iterable[Step]) -> list[_Run | Text | Repeat]:
     """Never empty; neighbouring scalars and known bytes are one run."""
     found: list[_Run | Text | Repeat] = []
-    for together, group in itertools.groupby(sequence, lambda step: isinstance(step, (Put, Blob))):
-        found += [_Run(tuple(group))] if together else group  # type: ignore[arg-type]
-    return found or [_Run(())]
+    together: list[Put | Blob] = []
+    for step in sequence:
+        if isinstance(step, (Put, Blob)):
+            together.append(step)
+            continue
+        if together:
+            found.append(_Run(tuple(together)))
+            together = []
+        found.append(step)
+    return [*found, _Run(tuple(together))] if together or not found else found
 
 
 def _call(
