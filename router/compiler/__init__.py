@@ -13,7 +13,7 @@ from pathlib import Path
 from router.compiler.books import REJECT_REASONS, UNKNOWN_CASE, Books
 from router.compiler.cdr import RUNTIME
 from router.compiler.definitions import Definitions
-from router.compiler.functions import FUNCTIONS, fit, fit_text
+from router.compiler.functions import FUNCTIONS, fit, fit_text, fit_wide_text
 from router.compiler.handlers import HandlerSource
 from router.compiler.network import network_findings
 from router.compiler.program import Handler, ListenerPlan, Program, PublisherPlan, SenderPlan
@@ -30,7 +30,7 @@ STRANGER = None
 """Stands among a handler's sources for a sender that is no endpoint of the table."""
 
 _CALLABLE = {name: function.implementation for name, function in FUNCTIONS.items()}
-_NAMESPACE = {**_CALLABLE, **RUNTIME, "fit": fit, "fit_text": fit_text, "ZERO": b"\0"}
+_NAMESPACE = {**_CALLABLE, **RUNTIME, "fit": fit, "fit_text": fit_text, "fit_wide_text": fit_wide_text, "ZERO": b"\0"}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 
 from router.compiler.expressions import Finding, Typed, placed
-from router.compiler.functions import FLOAT32_MAX, clamp
+from router.compiler.functions import FLOAT32_END, clamp
 from router.compiler.kinds import (
     INT32,
     BoolKind,
@@ -111,7 +111,7 @@ def _to_float(value: Typed, target: Float) -> ast.expr:
     limit = 1 << EXACT_INTEGER_BITS[target.bits]
     match value.kind:
         case FloatKind(bits):
-            if isinstance(value.constant, float) and target.bits == 32 and abs(value.constant) > FLOAT32_MAX:
+            if isinstance(value.constant, float) and target.bits == 32 and abs(value.constant) >= FLOAT32_END:
                 raise Finding(value.span, Code.OUT_OF_RANGE, f"{value.constant!r} does not fit float32")
             if bits > target.bits:
                 hint = "float32() says that losing digits is meant"
@@ -134,13 +134,25 @@ def _to_string(value: Typed, target: String) -> ast.expr:
     if not isinstance(value.kind, StringKind):
         numeric = isinstance(value.kind, (IntKind, FloatKind, EnumKind, BoolKind))
         raise mismatch(value, target, "str() makes text of it" if numeric else "")
+    if isinstance(value.constant, str):
+        _want_text(value, value.constant, target)
+        return value.node
     if target.bound is None:
         return value.node
-    if isinstance(value.constant, str):
-        if (length := len(value.constant.encode())) > target.bound:
-            raise Finding(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
-        return value.node
-    return placed(_call("fit_text", value.node, target.bound), value.span)
+    return placed(_call("fit_wide_text" if target.wide else "fit_text", value.node, target.bound), value.span)
+
+
+def _want_text(value: Typed, text: str, target: String) -> None:
+    """Raises Finding when a literal cannot stand in the field."""
+    try:
+        length = len(text.encode("utf-16-le")) // 2 if target.wide else len(text.encode())
+    except UnicodeEncodeError as error:
+        raise Finding(value.span, Code.OUT_OF_RANGE, f"{error.object[error.start]!a} is no character") from None
+    if not target.wide and "\0" in text:
+        raise Finding(value.span, Code.OUT_OF_RANGE, "a string cannot hold a NUL")
+    if target.bound is not None and length > target.bound:
+        unit = "characters" if target.wide else "bytes"
+        raise Finding(value.span, Code.OUT_OF_RANGE, f"{length} {unit} do not fit {target}")
 
 
 def _to_enum(value: Typed, target: Enum) -> ast.expr:

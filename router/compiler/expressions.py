@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import ast
 import keyword
+import math
 import operator
 import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 from router.compiler.functions import FUNCTIONS, Function
 from router.compiler.kinds import (
@@ -35,7 +37,12 @@ from router.table.model import Expression
 from router.types.model import Enum, Field, Int, MessageType, Type
 
 MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
+ALLOWED = "allowed: fields, literals, arithmetic, comparison, and/or/not, if/else, functions"
 LARGEST_EXPONENT = 8
+DEEPEST = 60
+"""How deep an expression may nest: what handles syntax trees, ours and Python's own, does so recursively."""
+WIDEST = 512
+"""How many bits an integer may have on the way to a field."""
 
 
 class Finding(Exception):
@@ -76,8 +83,13 @@ class Locals:
         """The variable that holds the submessage at this path; the empty path is the message."""
         if not path:
             return self.message
-        self.name(path[:-1])  # a submessage's own holder comes before it
-        return self.bound.setdefault(path, "_".join((self.message, *path)))
+        if path not in self.bound:
+            self.name(path[:-1])  # a submessage's own holder comes before it
+            name = "_".join((self.message, *path))
+            while name in self.bound.values():  # a.b_c and a_b.c
+                name += "_"
+            self.bound[path] = name
+        return self.bound[path]
 
 
 @dataclass(slots=True)
@@ -112,15 +124,16 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
 
 
 def _parse(expression: Expression) -> ast.expr:
-    text = expression.text if expression.verbatim else " ".join(expression.text.split())
+    text = expression.text.replace("\n", " ")
+    indent = len(text) - len(text.lstrip())
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SyntaxWarning)
             warnings.simplefilter("ignore", DeprecationWarning)
-            return ast.parse(text.lstrip(), mode="eval").body
+            return ast.parse(text.strip(), mode="eval").body
     except SyntaxError as error:
-        start = max(error.offset or 1, 1) - 1
-        end = error.end_offset - 1 if error.end_offset and error.end_lineno == error.lineno else start + 1
+        start = max(error.offset or 1, 1) - 1 + indent
+        end = error.end_offset - 1 + indent if error.end_offset and error.end_lineno == error.lineno else start + 1
         reason = (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
         raise Finding(expression.part(start, end), Code.EXPRESSION_SYNTAX, f"not an expression: {reason}") from None
     except (ValueError, RecursionError, MemoryError) as error:
@@ -152,19 +165,20 @@ class _Checker:
     def __init__(self, expression: Expression, scope: Scope) -> None:
         self.expression = expression
         self.scope = scope
-        self.encoded = expression.text.encode()
+        self.indent = len(expression.text) - len(expression.text.lstrip())
+        self.encoded = expression.text.lstrip().encode(errors="replace")
+        self.depth = 0
 
     def check(self, node: ast.expr, expected: Type | None = None) -> Typed:
         method = getattr(self, f"check_{type(node).__name__}", None)
         if method is None:
-            hint = _HINTS.get(
-                type(node), "allowed: fields, literals, arithmetic, comparison, and/or/not, if/else, functions"
-            )
+            hint = _HINTS.get(type(node), ALLOWED)
             raise self.finding(node, Code.FORBIDDEN_EXPRESSION, f"{_describe(node)} is not part of the language", hint)
-        try:
-            typed: Typed = method(node, expected) if isinstance(node, (ast.Call, ast.IfExp)) else method(node)
-        except RecursionError:
-            raise self.finding(node, Code.EXPRESSION_SYNTAX, "not an expression: nested too deeply") from None
+        self.depth += 1
+        if self.depth > DEEPEST:
+            raise self.finding(node, Code.EXPRESSION_SYNTAX, "not an expression: nested too deeply")
+        typed: Typed = method(node, expected) if isinstance(node, (ast.Call, ast.IfExp)) else method(node)
+        self.depth -= 1
         return typed
 
     # positions
@@ -175,7 +189,7 @@ class _Checker:
 
     def _characters(self, offset: int) -> int:
         """ast counts UTF-8 bytes, people count characters."""
-        return len(self.encoded[:offset].decode(errors="replace")) if offset else 0
+        return self.indent + len(self.encoded[:offset].decode(errors="replace"))
 
     def finding(self, node: ast.expr, code: Code, message: str, hint: str = "") -> Finding:
         return Finding(self.span(node), code, message, hint)
@@ -191,8 +205,10 @@ class _Checker:
             case bool():
                 kind: Kind = BoolKind()
             case int(number):
-                kind = IntKind(number, number)
-            case float():
+                kind = self._within_bounds(IntKind(number, number), node)
+            case float(number):
+                if not math.isfinite(number):
+                    raise self.finding(node, Code.OUT_OF_RANGE, "a literal this large is infinite")
                 kind = FloatKind(32)
             case str():
                 kind = StringKind()
@@ -275,9 +291,7 @@ class _Checker:
         name, value = ".".join(dotted[:-1]), dotted[-1]
         holders = self.scope.holders(name)
         if not holders:
-            known = {enum.name for enum in self.scope.enums} | {
-                enum.name.rpartition(".")[2] for enum in self.scope.enums
-            }
+            known = {known for enum in self.scope.enums for known in (enum.name, enum.name.rpartition(".")[2])}
             known |= {ros.short_name for ros in self.scope.ros_types if ros.constants}
             raise self.finding(node.value, Code.UNKNOWN_FIELD, f"{self.scope.message} has no field or enum '{name}'",
                                did_you_mean(name, known | set(self.scope.field_names())))  # fmt: skip
@@ -291,6 +305,7 @@ class _Checker:
             raise self.finding(node, Code.UNKNOWN_ENUM_VALUE, f"'{name}.{value}' may be of {names}",
                                "write the enum's full name")  # fmt: skip
         holder, number = found[0]
+        assert isinstance(number, (int, float, str))  # noqa: S101 - what constants can be
         if isinstance(holder, Enum):
             return self.typed(EnumKind(holder), ast.Constant(number), node)
         return self.check_Constant(ast.copy_location(ast.Constant(number), node))
@@ -302,9 +317,8 @@ class _Checker:
         if not isinstance(index.constant, int) or isinstance(index.constant, bool) or index.constant < 0:
             raise self.finding(node.slice, Code.FORBIDDEN_EXPRESSION, "an index is a literal integer from 0")
         if holder.kind.length is not None and index.constant >= holder.kind.length:
-            raise self.finding(
-                node.slice, Code.OUT_OF_RANGE, f"index {index.constant} of {holder.kind.length} elements"
-            )
+            message = f"index {index.constant} of {holder.kind.length} elements"
+            raise self.finding(node.slice, Code.OUT_OF_RANGE, message)
         return self.typed(holder.kind.element, ast.Subscript(holder.node, index.node, ast.Load()), node)
 
     # operators
@@ -344,7 +358,8 @@ class _Checker:
             raise self.finding(node, Code.OUT_OF_RANGE, "division by zero")
         if isinstance(node.op, ast.Pow):
             self._want_small_exponent(right, node)
-        return self._folded(self.typed(self._arithmetic(node.op, left.kind, right), made, node), left, right)
+        kind = self._within_bounds(self._arithmetic(node, left.kind, right), node)
+        return self._folded(self.typed(kind, made, node), left, right)
 
     def _folded(self, result: Typed, left: Typed, right: Typed) -> Typed:
         """Literals are computed here, so that what they come to is checked against the target."""
@@ -354,13 +369,21 @@ class _Checker:
             value = eval(compile(ast.Expression(result.node), "<literal>", "eval"), {})  # noqa: S307 - two literals
         except ArithmeticError as error:
             raise Finding(result.span, Code.OUT_OF_RANGE, str(error)) from None
+        if isinstance(value, float) and not math.isfinite(value):
+            raise Finding(result.span, Code.OUT_OF_RANGE, f"this is {value}")
         kind: Kind = IntKind(value, value) if isinstance(value, int) else result.kind
         made = ast.Constant(value)
         place(made, result.span)
         return Typed(kind, made, result.span)
 
-    def _arithmetic(self, op: ast.operator, left: Kind, right: Typed) -> Kind:
-        a, b = as_int(left), as_int(right.kind)
+    def _within_bounds(self, kind: Kind, node: ast.expr) -> Kind:
+        """Keeps powers of powers from taking all memory, here and at run time."""
+        if isinstance(kind, IntKind) and max((kind.low or 0).bit_length(), (kind.high or 0).bit_length()) > WIDEST:
+            raise self.finding(node, Code.OUT_OF_RANGE, f"an integer has at most {WIDEST} bits")
+        return kind
+
+    def _arithmetic(self, node: ast.BinOp, left: Kind, right: Typed) -> Kind:
+        op, a, b = node.op, as_int(left), as_int(right.kind)
         if a is None or b is None or isinstance(op, ast.Div):
             return FloatKind(max(float_bits(left), float_bits(right.kind)))
         if a.low is None or a.high is None or b.low is None or b.high is None:
@@ -368,9 +391,12 @@ class _Checker:
         if compute := _ARITHMETIC.get(type(op)):
             corners = [compute(x, y) for x in (a.low, a.high) for y in (b.low, b.high)]
         elif isinstance(op, ast.Pow):
-            corners = [x**b.low for x in (a.low, a.high)] + [0] * (a.low < 0 < a.high)
+            assert isinstance(right.constant, int)  # noqa: S101 - _want_small_exponent() saw to it
+            corners = [x**right.constant for x in (a.low, a.high)] + [0] * (a.low < 0 < a.high)
+        elif b.low == b.high == 0:
+            raise self.finding(node, Code.OUT_OF_RANGE, "division by zero")
         elif isinstance(op, ast.Mod):
-            corners = [0, b.high - 1] if b.low > 0 else [b.low + 1, max(b.high - 1, 0)]
+            corners = [min(b.low + 1, 0), max(b.high - 1, 0)]
         else:
             divisors = [y for y in (b.low, b.high, -1, 1) if b.low <= y <= b.high and y != 0]
             corners = [x // y for x in (a.low, a.high) for y in divisors]
@@ -379,8 +405,8 @@ class _Checker:
     def _want_small_exponent(self, exponent: Typed, node: ast.BinOp) -> None:
         value = exponent.constant
         if not isinstance(value, int) or not 0 <= value <= LARGEST_EXPONENT:
-            raise self.finding(node.right, Code.FORBIDDEN_EXPRESSION,
-                               f"an exponent is a literal integer from 0 to {LARGEST_EXPONENT}", "use sqrt() for roots")  # fmt: skip
+            message = f"an exponent is a literal integer from 0 to {LARGEST_EXPONENT}"
+            raise self.finding(node.right, Code.FORBIDDEN_EXPRESSION, message, "use sqrt() for roots")
 
     def check_BoolOp(self, node: ast.BoolOp) -> Typed:
         word = "and" if isinstance(node.op, ast.And) else "or"
@@ -391,16 +417,15 @@ class _Checker:
 
     def check_Compare(self, node: ast.Compare) -> Typed:
         operands = [self.check(operand) for operand in (node.left, *node.comparators)]
-        for op, left, right in zip(node.ops, operands, operands[1:]):
+        for op, (left, right) in zip(node.ops, pairwise(operands), strict=True):
             self._want_comparable(node, op, left, right)
         made = ast.Compare(operands[0].node, node.ops, [operand.node for operand in operands[1:]])
         return self.typed(BoolKind(), made, node)
 
     def _want_comparable(self, node: ast.Compare, op: ast.cmpop, left: Typed, right: Typed) -> None:
         if not isinstance(op, _COMPARISONS):
-            raise self.finding(
-                node, Code.FORBIDDEN_EXPRESSION, f"{_describe(op)} is not part of the language", "use =="
-            )
+            message = f"{_describe(op)} is not part of the language"
+            raise self.finding(node, Code.FORBIDDEN_EXPRESSION, message, "use ==")
         other: Kind | None = right.kind
         if isinstance(op, (ast.In, ast.NotIn)):
             if not isinstance(right.kind, ListKind):
@@ -435,9 +460,8 @@ class _Checker:
 
     def check_Call(self, node: ast.Call, expected: Type | None) -> Typed:
         if not isinstance(node.func, ast.Name):
-            raise self.finding(
-                node.func, Code.FORBIDDEN_EXPRESSION, "only listed functions are called", did_you_mean("", FUNCTIONS)
-            )
+            hint = did_you_mean("", FUNCTIONS)
+            raise self.finding(node.func, Code.FORBIDDEN_EXPRESSION, "only listed functions are called", hint)
         name = node.func.id
         if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
             raise self.finding(node, Code.WRONG_ARGUMENTS, f"{name}() takes its arguments by position")
@@ -451,25 +475,28 @@ class _Checker:
         if function.optional and len(arguments) == len(function.parameters) - function.optional:
             arguments += self._bounds(node, function, expected)
         self._want_arguments(node, function, arguments)
-        kind = function.result([argument.kind for argument in arguments])
+        try:
+            kind = function.result([argument.kind for argument in arguments])
+        except ValueError as error:
+            raise self.finding(node, Code.WRONG_ARGUMENTS, f"{name}(): {error}") from None
         return self.typed(kind, ast.Call(_name(name), [argument.node for argument in arguments], []), node)
 
     def _want_arguments(self, node: ast.Call, function: Function, arguments: Sequence[Typed]) -> None:
         takes = len(function.parameters)
         if len(arguments) < takes or (len(arguments) > takes and not function.variadic):
-            takes_text = f"{takes} argument{'s' * (takes != 1)}" + " or more" * function.variadic
-            raise self.finding(node, Code.WRONG_ARGUMENTS, f"{function.name}() takes {takes_text}, not {len(node.args)}",
-                               f"write {function.signature}")  # fmt: skip
+            count = f"{takes} argument{'s' * (takes != 1)}" + " or more" * function.variadic
+            message = f"{function.name}() takes {count}, not {len(node.args)}"
+            raise self.finding(node, Code.WRONG_ARGUMENTS, message, f"write {function.signature}")
         parameters = (*function.parameters, *[function.parameters[-1]] * (len(arguments) - takes))
-        for parameter, argument in zip(parameters, arguments):
+        for parameter, argument in zip(parameters, arguments, strict=True):
             if not isinstance(argument.kind, parameter.accepts):
-                raise Finding(argument.span, Code.WRONG_ARGUMENTS,
-                              f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}")  # fmt: skip
+                message = f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}"
+                raise Finding(argument.span, Code.WRONG_ARGUMENTS, message)
 
     def _bounds(self, node: ast.Call, function: Function, expected: Type | None) -> list[Typed]:
         if not isinstance(expected, Int):
-            raise self.finding(node, Code.WRONG_ARGUMENTS, f"{function.name}() needs bounds here, where no integer field is filled",
-                               f"write {function.name}(x, low, high)")  # fmt: skip
+            message = f"{function.name}() needs bounds here, where no integer field is filled"
+            raise self.finding(node, Code.WRONG_ARGUMENTS, message, f"write {function.name}(x, low, high)")
         return [self.typed(IntKind(bound, bound), ast.Constant(bound), node) for bound in (expected.low, expected.high)]
 
     def _has(self, node: ast.Call) -> Typed:
@@ -479,7 +506,8 @@ class _Checker:
         holder: MessageType = self.scope.message
         for name in path[:-1]:
             inner = holder.field(name)
-            assert inner is not None and isinstance(inner.type, MessageType)  # noqa: S101 - check() went this way
+            if inner is None or not isinstance(inner.type, MessageType):
+                raise self.finding(node, Code.WRONG_ARGUMENTS, "has() takes a field of the message")
             holder = inner.type
         member = holder.field(path[-1])
         if member is None or not member.has_presence:
