@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import itertools
-import keyword
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -38,11 +37,11 @@ class Target:
 
 
 class HandlerSource:
-    """Generates `def CASE(m, datagram, received_at, now, source)` for one route."""
+    """Generates `def route_CASE(m, datagram, received_at, now, source)` for one route."""
 
     def __init__(self, case: str, books: Books, span: SourceSpan) -> None:
         self.case = case
-        self.function = f"{case}_" if keyword.iskeyword(case) else case
+        self.function = f"route_{case}"  # a case may be called as a keyword, or as a function of the language
         self.books = books
         self.span = span
         self.out = Source()
