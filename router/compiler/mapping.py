@@ -137,7 +137,7 @@ class _Builder:
 
     def _resolves(self, entry: FieldEntry, target: MessageType) -> bool:
         holder: Type = target
-        for name, span in zip(entry.path, entry.path_spans):
+        for name, span in zip(entry.path, entry.path_spans, strict=True):
             if not isinstance(holder, MessageType):
                 message, hint = f"a {holder} has no fields", "give the whole of it one value"
                 self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, message, hint))

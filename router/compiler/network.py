@@ -8,7 +8,7 @@ from itertools import combinations
 from router.errors import Code, Diagnostic
 from router.table.model import Address, Destination, Endpoint, Listener, Route, RouteTable
 
-WILDCARD = "0.0.0.0"  # noqa: S104 - compared with, not bound
+WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
 
 
@@ -16,9 +16,8 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     for first, second in combinations(table.listeners.values(), 2):
         if _overlap(first.address.value, second.address.value):
             message = f"listener '{second.name}' has the address of listener '{first.name}'"
-            yield Diagnostic(
-                second.address.span, Code.ADDRESS_CLASH, message, "one socket takes it all; give it a port of its own"
-            )
+            hint = "one socket takes it all; give it a port of its own"
+            yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
     sources = {source.value for route in table.routes for source in route.sources}
     blamed: set[str] = set()
     for one, other in combinations(table.endpoints.values(), 2):

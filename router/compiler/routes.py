@@ -65,8 +65,10 @@ class RouteChecker:
         missing = [name for name in self.envelope.cases if name not in covered]
         if missing:
             cases = "payload case" if len(missing) == 1 else "payload cases"
-            self._report(self.table.routes_span, Code.UNCOVERED_PAYLOAD_CASE,
-                         f"no route for the {cases} {', '.join(missing)}", "route it, or say `ignore: reason`")  # fmt: skip
+            message = f"no route for the {cases} {', '.join(missing)}"
+            self._report(
+                self.table.routes_span, Code.UNCOVERED_PAYLOAD_CASE, message, "route it, or say `ignore: reason`"
+            )
 
     def _route(self, route: Route) -> CheckedRoute | None:
         case = self.envelope.cases.get(route.case.value)
@@ -149,8 +151,8 @@ class RouteChecker:
         targets: list[CheckedTarget] = []
         for topic in route.topics:
             if topic.fields is not None:
-                self._report(topic.fields.span, Code.UNKNOWN_KEY, "with `source: ros` the fields to fill are the payload's",
-                             "move 'fields' up to the route")  # fmt: skip
+                message = "with `source: ros` the fields to fill are the payload's"
+                self._report(topic.fields.span, Code.UNKNOWN_KEY, message, "move 'fields' up to the route")
             ros_type = self._ros_type(topic)
             if ros_type is not None:
                 targets += [self._command(route, case, topic, ros_type, to) for to in route.destinations]

@@ -78,8 +78,8 @@ def qos_findings(topic: Topic) -> Iterator[Diagnostic]:
         yield conflict(span.span if span else given.span, "late joiners get nothing from a best_effort publisher",
                        "transient_local goes with reliability: reliable")  # fmt: skip
     if plan.liveliness_lease_duration and plan.deadline and plan.liveliness_lease_duration < plan.deadline:
-        span = given.liveliness_lease_duration or given.deadline
-        yield conflict(span.span if span else given.span, "the liveliness lease ends before the deadline",
+        lease = given.liveliness_lease_duration or given.deadline
+        yield conflict(lease.span if lease else given.span, "the liveliness lease ends before the deadline",
                        "make the lease at least as long as the deadline")  # fmt: skip
 
 
