@@ -1,0 +1,161 @@
+"""The demo's judgement and its processes; that it runs as a whole is what `make demo` shows."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from demo.children import Child
+from demo.places import free_ros_domain, taken_places
+from demo.verdict import judge
+from router.table.model import RouteTable
+from router.tools.live import RouteRow, TargetRow, View
+from router.tools.places import open_udp
+from router.tools.wire import read_table
+
+ROOT = Path(__file__).parent.parent.parent
+LASTING = "import time\nprint('{\"ready\": true}', flush=True)\ntime.sleep(60)\n"
+
+
+def seen(dropped: dict[str, int] | None = None, rejected: dict[str, int] | None = None, kernel_drops: int = 0) -> View:
+    row = RouteRow("imu_info", 9, 1.0, (TargetRow("imu_data", True, 9, 1.0, dropped or {}, 0),))
+    return View((row,), 9, 1.0, rejected or {}, kernel_drops)
+
+
+def all_heard(table: RouteTable) -> dict[str, Any]:
+    topics = (topic.topic.value for route in table.routes if not route.is_outbound for topic in route.topics)
+    return {"topics": {topic: {"count": 3} for topic in topics}}
+
+
+def all_came_back(table: RouteTable) -> dict[str, Any]:
+    received: dict[str, dict[str, Any]] = {}
+    for route in table.routes:
+        for destination in route.destinations if not route.is_outbound else ():
+            received.setdefault(destination.endpoint.value, {})[route.case.value] = {"count": 3}
+    return {"received": received, "undecodable": {}}
+
+
+@pytest.fixture(scope="module")
+def sim_table() -> RouteTable:
+    return read_table(ROOT / "routes" / "sim.yaml")
+
+
+def complaints(table: RouteTable, heard: dict[str, Any], came_back: dict[str, Any], view: View) -> list[str]:
+    return [finding.text for finding in judge(table, heard, came_back, view) if not finding.ok]
+
+
+def test_all_is_well_when_everything_arrived_and_nothing_was_lost(sim_table: RouteTable) -> None:
+    view = seen(dropped={"rate_limited": 5})
+    assert complaints(sim_table, all_heard(sim_table), all_came_back(sim_table), view) == []
+
+
+def test_one_silent_topic_fails(sim_table: RouteTable) -> None:
+    heard = all_heard(sim_table)
+    heard["topics"]["imu/mag"]["count"] = 0
+    (complaint,) = complaints(sim_table, heard, all_came_back(sim_table), seen())
+    assert complaint.startswith("nothing arrived on 1 of ")
+    assert complaint.endswith(" ROS topics: imu/mag")
+
+
+def test_one_missing_forward_fails(sim_table: RouteTable) -> None:
+    came_back = all_came_back(sim_table)
+    del came_back["received"]["driving_board"]["manual_drive"]
+    (complaint,) = complaints(sim_table, all_heard(sim_table), came_back, seen())
+    assert complaint.endswith("never came: manual_drive at driving_board")
+
+
+@pytest.mark.parametrize(
+    ("view", "complaint"),
+    [
+        (seen(dropped={"stale": 2}), "the router lost messages: 2 stale"),
+        (seen(rejected={"malformed": 1}), "the router lost messages: 1 malformed"),
+        (seen(kernel_drops=4), "the router lost messages: 4 kernel_drops"),
+    ],
+)
+def test_any_loss_fails(sim_table: RouteTable, view: View, complaint: str) -> None:
+    assert complaints(sim_table, all_heard(sim_table), all_came_back(sim_table), view) == [complaint]
+
+
+def test_silence_of_the_witnesses_fails(sim_table: RouteTable) -> None:
+    assert len(complaints(sim_table, {}, {}, seen())) == 2
+
+
+def test_addresses_that_are_taken_are_named(table: RouteTable) -> None:
+    assert taken_places(table) == []
+    with open_udp(table.endpoints["board"].address.value, "other"):
+        (problem,) = taken_places(table)
+    assert problem.startswith("endpoint board: cannot bind 127.0.6.30:")
+
+
+def test_a_ros_domain_with_a_participant_is_not_free() -> None:
+    domain = free_ros_domain()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+        participant.bind(("", 7400 + 250 * domain))
+        assert all(free_ros_domain() != domain for _ in range(200))
+
+
+@pytest.fixture
+def lasting(tmp_path: Path) -> dict[str, str]:
+    """The environment in which the module `lasting` prints one JSON line and then stays for a minute."""
+    (tmp_path / "lasting.py").write_text(LASTING)
+    return os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}"}
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    """For 10 s at most."""
+    for _ in range(500):
+        if holds():
+            return
+        time.sleep(0.02)
+    raise AssertionError("it never came to that")
+
+
+def test_a_child_is_read_and_ended(lasting: dict[str, str]) -> None:
+    child = Child("lasting", lasting, "lasting")
+    wait_until(lambda: bool(child.latest))
+    assert (child.latest, child.exit_code) == ({"ready": True}, None)
+    child.end()
+    assert child.exit_code == -signal.SIGTERM
+
+
+def test_the_last_words_of_a_child_that_fails_are_kept(lasting: dict[str, str]) -> None:
+    child = Child("none", lasting, "no_such_module")
+    wait_until(lambda: child.exit_code is not None)
+    assert child.exit_code == 1
+    assert "no_such_module" in child.last_words()
+    child.end()
+
+
+def is_running(pid: int) -> bool:
+    """Not gone, and no zombie that its new parent has yet to bury."""
+    status = Path(f"/proc/{pid}/status")
+    try:
+        return "State:\tZ" not in status.read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_children_do_not_outlive_a_parent_that_is_killed(lasting: dict[str, str]) -> None:
+    program = (
+        "import os, sys\nfrom demo.children import Child\n"
+        "child = Child('lasting', os.environ, 'lasting')\n"
+        "while not child.latest: pass\n"
+        "print(child._process.pid, flush=True)\nsys.stdin.read()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env=lasting, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        parent.kill()
+        parent.wait()
+    wait_until(lambda: not is_running(pid))

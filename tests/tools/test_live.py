@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import http.server
+import socket
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from router.errors import TransportError
+from router.table.model import Address
+from router.tools.live import Snapshot, Window, parse_metrics, scrape, view
+
+METRICS = """\
+# HELP router_datagrams_received_total Datagrams taken from the listener's socket.
+# TYPE router_datagrams_received_total counter
+router_datagrams_received_total{listener="rover"} %(received)d
+# TYPE router_datagrams_rejected_total counter
+router_datagrams_rejected_total{listener="rover",reason="empty"} 0
+router_datagrams_rejected_total{listener="rover",reason="malformed"} 3
+# TYPE router_kernel_drops_total counter
+router_kernel_drops_total{listener="rover"} 0
+# TYPE router_messages_received_total counter
+router_messages_received_total{route="imu_info",source="sensor_board"} %(imu)d
+router_messages_received_total{route="imu_info",source="spare"} 0
+router_messages_received_total{route="gps_info",source="sensor_board"} 0
+# TYPE router_datagrams_sent_total counter
+router_datagrams_sent_total{route="imu_info",destination="basestation"} %(imu)d
+# TYPE router_messages_published_total counter
+router_messages_published_total{route="imu_info",topic="imu_data"} 5
+# TYPE router_messages_dropped_total counter
+router_messages_dropped_total{route="imu_info",target="imu_data",reason="stale"} 2
+router_messages_dropped_total{route="imu_info",target="basestation",reason="stale"} 0
+# TYPE router_messages_filtered_total counter
+router_messages_filtered_total{route="imu_info",target="imu_data"} 4
+# TYPE python_info gauge
+python_info{version="3.12"} 1
+"""
+
+
+def snapshot(at: float, imu: int) -> Snapshot:
+    return parse_metrics(METRICS % {"received": imu + 3, "imu": imu}, at)
+
+
+def test_rates_are_per_second_between_two_snapshots() -> None:
+    seen = view(snapshot(10.0, 100), snapshot(12.0, 200))
+    assert (seen.received, seen.rate) == (203, 50.0)
+    assert [(row.route, row.received, row.rate) for row in seen.routes] == [
+        ("imu_info", 200, 50.0),
+        ("gps_info", 0, 0.0),
+    ]
+
+
+def test_targets_show_what_they_got_lost_and_were_spared() -> None:
+    station, topic = view(snapshot(0, 0), snapshot(1, 7)).routes[0].targets
+    assert (station.name, station.is_topic, station.delivered, station.rate) == ("basestation", False, 7, 7.0)
+    assert (topic.name, topic.is_topic, topic.delivered, topic.filtered) == ("imu_data", True, 5, 4)
+    assert (station.dropped, topic.dropped) == ({}, {"stale": 2})
+
+
+def test_reasons_that_never_happened_are_left_out() -> None:
+    seen = view(snapshot(0, 0), snapshot(1, 0))
+    assert (seen.rejected, seen.routes[0].dropped) == ({"malformed": 3}, {"stale": 2})
+
+
+def test_a_router_that_was_started_anew_has_no_negative_rate() -> None:
+    assert view(snapshot(0, 1000), snapshot(2, 10)).routes[0].rate == 5.0
+
+
+def test_a_window_gives_rates_over_its_last_seconds_only() -> None:
+    window = Window(seconds=3.0)
+    rates = [window.add(snapshot(at, imu)).routes[0].rate for at, imu in ((0, 0), (1, 10), (2, 20), (3, 60), (5, 140))]
+    assert rates == [0.0, 10.0, 10.0, 20.0, 40.0]
+
+
+@pytest.fixture
+def metrics_address() -> Iterator[Address]:
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200 if self.path == "/metrics" else 404)
+            self.end_headers()
+            self.wfile.write(b"# nothing yet\n")
+
+        def log_message(self, *args: object) -> None:
+            """Quiet."""
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield Address("127.0.0.1", server.server_address[1])
+        server.shutdown()
+        thread.join()
+
+
+def test_metrics_are_scraped_over_http(metrics_address: Address) -> None:
+    assert scrape(metrics_address) == "# nothing yet\n"
+
+
+def test_a_router_that_does_not_answer_is_a_network_fault() -> None:
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        address = Address(*nobody.getsockname())
+        with pytest.raises(TransportError, match=f"no metrics at http://{address}/metrics"):
+            scrape(address)

@@ -1,0 +1,151 @@
+"""The verbs send, tap and sim as they are typed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from router.cli import main
+from router.tools.wire import read_table
+
+EMPTY_PLAIN = bytes.fromhex("1200")
+
+
+@pytest.fixture
+def receiver() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", 0))
+        opened.settimeout(5)
+        yield opened
+
+
+def place(receiver: socket.socket) -> str:
+    host, port = receiver.getsockname()
+    return f"{host}:{port}"
+
+
+def test_send_prints_what_it_sent(receiver: socket.socket, protos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["plain", "value=1.5", "--to", place(receiver), "--protos", str(protos)]
+    assert main(["send", *words]) == 0
+    assert receiver.recv(100).hex() == "12050d0000c03f"
+    assert capsys.readouterr().out == f"sent plain to {place(receiver)}: 7 bytes 12050d0000c03f\n"
+
+
+def test_send_repeats_at_a_rate(receiver: socket.socket, protos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--to", place(receiver), "--rate", "500", "--count", "4", "--protos", str(protos)]
+    assert main(["send", "plain", *options]) == 0
+    assert [receiver.recv(100) for _ in range(4)] == [EMPTY_PLAIN] * 4
+    assert f"sent plain to {place(receiver)} 4 times in " in capsys.readouterr().out
+
+
+def test_send_trims_and_pads_as_the_old_boards_do(receiver: socket.socket, protos: Path) -> None:
+    assert main(["send", "plain", "--to", place(receiver), "--trim", "--protos", str(protos)]) == 0
+    assert main(["send", "plain", "--to", place(receiver), "--pad", "5", "--protos", str(protos)]) == 0
+    assert [receiver.recv(100).hex() for _ in range(2)] == ["12", "1200000000"]
+
+
+def test_send_goes_from_endpoint_to_listener_by_their_names(table_path: Callable[..., Path]) -> None:
+    path = table_path()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as router:
+        router.bind(("127.0.0.1", read_table(path).listeners["rover"].address.value.port))
+        router.settimeout(5)
+        assert main(["send", "plain", "--table", str(path), "--to", "rover", "--from", "station"]) == 0
+        data, peer = router.recvfrom(100)
+    assert (data, peer[0]) == (EMPTY_PLAIN, "127.0.6.10")
+
+
+def test_send_says_when_the_router_will_not_take_it(
+    table_path: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = table_path()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as router:
+        router.bind(("127.0.0.1", read_table(path).listeners["rover"].address.value.port))
+        assert main(["send", "plain", "--table", str(path), "--to", "rover"]) == 0
+    assert "the table takes plain from station only; add --from station" in capsys.readouterr().err
+
+
+def test_send_notices_that_nobody_listens(
+    receiver: socket.socket, protos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    nobody = place(receiver)
+    receiver.close()
+    assert main(["send", "plain", "--to", nobody, "--protos", str(protos)]) == 1
+    assert capsys.readouterr().err == f"router send: nobody listens on {nobody}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["plian"], "PBEnvelope has no payload case 'plian'; did you mean 'plain'?"),
+        (["plain", "valu=1"], "Plain has no field 'valu'; did you mean 'value'?"),
+        (["plain", "--pad", "1"], "the datagram has 2 bytes and cannot be padded to 1"),
+        (["plain", "--from", "192.0.2.1"], "--from: cannot bind 192.0.2.1:0: this machine has no such address"),
+    ],
+)
+def test_a_mistake_in_send_is_one_line_and_exit_code_2(
+    words: list[str], complaint: str, protos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["send", *words, "--to", "127.0.0.1:9", "--protos", str(protos)]) == 2
+    assert capsys.readouterr().err == f"router send: {complaint}\n"
+
+
+def test_tap_prints_what_arrives(table_path: Callable[..., Path]) -> None:
+    path = table_path()
+    station = read_table(path).endpoints["station"].address.value
+    command = [sys.executable, "-m", "router", "tap", "station", "--table", str(path), "--count", "1"]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as tap,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
+    ):
+        board.bind(("127.0.6.30", 0))
+        while tap.poll() is None:
+            board.sendto(EMPTY_PLAIN, station)
+            time.sleep(0.02)
+        assert tap.stdout is not None
+        assert tap.stdout.read().split(" ", 1)[1] == "board plain (all default)\n"
+    assert tap.returncode == 0
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_sim_ends_on_a_signal_with_its_final_statistics(
+    table_path: Callable[..., Path], ending: signal.Signals
+) -> None:
+    command = [sys.executable, "-m", "router", "sim", str(table_path()), "--json", "--rate-scale", "50"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as sim:
+        assert sim.stdout is not None
+        first = json.loads(sim.stdout.readline())
+        sim.send_signal(ending)
+        *_, last = map(json.loads, sim.stdout)
+    assert sim.returncode == 0
+    assert (first["final"], last["final"]) == (False, True)
+    assert {endpoint: list(cases) for endpoint, cases in last["sent"].items()} == {
+        "board": ["every_kind"],
+        "station": ["plain"],
+    }
+
+
+def test_sim_writes_lines_where_there_is_no_terminal(
+    table_path: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    assert main(["sim", str(table_path()), "--duration", "0.1"]) == 0
+    title, last = capsys.readouterr().out.splitlines()
+    assert title.startswith("simulating 2 endpoints sending 2 payload cases, 4 datagrams/s, to 127.0.0.1:")
+    assert "came back 0" in last
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_table_with_errors_is_shown_with_its_findings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text("version: 1\nlisten: 5\n")
+    assert main(["sim", str(path)]) == 78
+    assert "error[" in capsys.readouterr().err
