@@ -137,6 +137,14 @@ install_packages() {
 
 build_comms() (
   build=$venv/build/comms
+  names=$(ls schemas/comms/msg)
+  if [ "$names" != "$(cat "$build/names" 2>/dev/null)" ]; then
+    # The generators keep what they made for a message that is no more.
+    if [ -f "$build/install_manifest.txt" ]; then xargs -d '\n' rm -f <"$build/install_manifest.txt"; fi
+    rm -rf "$build"
+    mkdir -p "$build"
+    printf '%s' "$names" >"$build/names"
+  fi
   if [ -n "$ros" ]; then
     set +u  # ROS's script reads variables that nobody set
     # shellcheck disable=SC1091
@@ -149,8 +157,6 @@ build_comms() (
   cmake -S schemas/comms -B "$build" -DCMAKE_BUILD_TYPE=Release -DCMAKE_INSTALL_PREFIX="$venv" \
     -DPython3_EXECUTABLE="$python" -DBUILD_TESTING=OFF
   cmake --build "$build" --parallel "$(nproc)"
-  # A message that is no more leaves nothing behind.
-  if [ -f "$build/install_manifest.txt" ]; then xargs -d '\n' rm -f <"$build/install_manifest.txt"; fi
   cmake --install "$build"
 )
 
