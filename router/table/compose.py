@@ -76,7 +76,7 @@ class _Composer:
             for event in yaml.parse(self._source.text, Loader=LOADER):
                 yield event
         except yaml.MarkedYAMLError as error:
-            raise TableError([explain(error, self._source, self._open_quote(event))]) from error
+            raise TableError([explain(error, self._source, self._open_quote(event), self._open_bracket())]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
 
@@ -86,6 +86,11 @@ class _Composer:
             return None
         line, column, end_line, _ = _marks(event)
         return self._source.span(line, column, line, column + 1) if end_line > line else None
+
+    def _open_bracket(self) -> SourceSpan | None:
+        """Where the innermost '[' or '{' stands that is not closed yet."""
+        flow = [collection for collection in self._open if collection.event.flow_style]
+        return flow[-1].span if flow else None
 
     def _begin(self, event: yaml.CollectionStartEvent) -> None:
         span = self._span(event)

@@ -5,6 +5,7 @@ Knows text only, no positions and no keys.
 
 from __future__ import annotations
 
+import math
 import re
 from typing import NamedTuple
 
@@ -48,15 +49,15 @@ _SURPRISES = (
 
 
 def resolve(text: str) -> Plain:
-    """The value of a plain scalar. Infinities and NaN have no place in a table: `.inf` stays text."""
+    """The value of a plain scalar. Infinities and NaN have no place in a table: `.inf` and `1e999` stay text."""
     if text in _WORDS:
         return _WORDS[text]
     if _INT.fullmatch(text):
         return int(text)
     if _HEX.fullmatch(text):
         return int(text, 16)
-    if _FLOAT.fullmatch(text):
-        return float(text)
+    if _FLOAT.fullmatch(text) and math.isfinite(number := float(text)):
+        return number
     return text
 
 

@@ -60,17 +60,22 @@ _FOLLOW_A_BARE_WORD = ("mapping values are not allowed in this context", "did no
 _COMMENT = re.compile(r"(?:^|\s)#.*")
 
 
-def explain(error: yaml.MarkedYAMLError, source: Source, open_quote: SourceSpan | None) -> Diagnostic:
+def explain(
+    error: yaml.MarkedYAMLError, source: Source, open_quote: SourceSpan | None, open_bracket: SourceSpan | None
+) -> Diagnostic:
     """The finding for one syntax error.
 
     `open_quote` is where the quoted scalar before the error begins, if it goes over several lines: then
-    its closing quote is most likely the next one's opening quote.
+    its closing quote is most likely the next one's opening quote. `open_bracket` is the innermost
+    bracket around the error: where the text ends within it, it lacks its counterpart.
     """
     line = error.problem_mark.line if error.problem_mark else 0
     column = error.problem_mark.column if error.problem_mark else 0
     sentence = _sentence(error, source, line, column)
     if open_quote:
         return Diagnostic(open_quote, Code.BAD_YAML, _OPEN_QUOTE.what)
+    if open_bracket and not any(text.strip() for text in source.lines[line:]):
+        return Diagnostic(open_bracket.part(0, 1), Code.BAD_YAML, "this bracket is never closed")
     if error.problem in _FOLLOW_A_BARE_WORD and (bare := _line_without_colon(source, line)) is not None:
         line, column = bare, _indent(source.lines[bare])
         sentence = _NO_COLON

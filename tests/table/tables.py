@@ -1,0 +1,61 @@
+"""A good table for the tests of this folder, and shortcuts to load texts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from router.errors import Code, Diagnostic
+from router.table import load_table
+from router.table.model import RouteTable
+
+GOOD = """\
+version: 1
+envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
+node: {name: rover_router, namespace: /}
+metrics: {address: 127.0.0.1:9108}
+listen:
+  rover: {address: 0.0.0.0:5000, framing: exact, receive_buffer: 64kB}
+endpoints:
+  sensor_board: {address: 192.168.0.30:8, kind: board, source_port: 9}
+  basestation: {address: "${BASESTATION:-192.168.0.10:9000}", kind: basestation, trim_trailing_zeros: true}
+routes:
+  imu_info:
+    source: sensor_board
+    destinations: [basestation, {endpoint: basestation, when: accel_x > 1, max_rate: 30 Hz}]
+    topics:
+      - topic: imu_data
+        type: comms/msg/ImuSensorInformation
+        queue_depth: 10
+        fields: auto
+      - topic: imu/data_raw
+        type: sensor_msgs/msg/Imu
+        qos: {profile: sensor_data, depth: 5, deadline: 500ms}
+        max_rate: 0.5
+        fields:
+          auto: true
+          header.stamp: received_at
+          header.frame_id: "'imu_link'"
+          linear_acceleration: {x: accel_x, y: 9.81}
+          orientation_covariance: [-1, 0, accel_y]
+  arm_target:
+    source: ros
+    topics: [{topic: arm_target, type: comms/msg/ArmBoardTargetMovement}]
+    fields: auto
+    destinations: [basestation]
+  ph_info: {ignore: nobody needs it}
+"""
+
+
+def load(
+    folder: Path, text: str | bytes, environ: Mapping[str, str] | None = None
+) -> tuple[RouteTable | None, list[Diagnostic]]:
+    """The table of a text, written to `folder`."""
+    path = folder / "table.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
+    return load_table(path, environ or {})
+
+
+def places(findings: list[Diagnostic]) -> list[tuple[Code, int, int]]:
+    """Code, line and column of each finding."""
+    return [(finding.code, finding.span.line, finding.span.column) for finding in findings]

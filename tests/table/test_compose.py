@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.table import compose
+from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.table.source import read_source
+
+
+@pytest.fixture(params=[yaml.CSafeLoader, yaml.SafeLoader], ids=["libyaml", "pure Python"], autouse=True)
+def _loader(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compose, "LOADER", request.param)
+
+
+def composed(folder: Path, text: str) -> tuple[Node | None, list[Diagnostic]]:
+    path = folder / "t.yaml"
+    path.write_bytes(text.encode("utf-8"))
+    findings: list[Diagnostic] = []
+    try:
+        return compose.compose(read_source(path), {"X": "filled"}, findings), findings
+    except TableError as error:
+        return None, [*findings, *error.diagnostics]
+
+
+def scalar(folder: Path, text: str) -> ScalarNode:
+    """The value of the one key of a text."""
+    root, findings = composed(folder, text)
+    assert findings == []
+    assert isinstance(root, MappingNode)
+    [entry] = root.entries.values()
+    assert isinstance(entry.value, ScalarNode)
+    return entry.value
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "columns", "text_column"),
+    [
+        ("k: accel_x  # c\n", "accel_x", (4, 11), 4),
+        ("k: 'a b'\n", "a b", (4, 9), 5),
+        ('k: "a b"\n', "a b", (4, 9), 5),
+        ("k: ü x\n", "ü x", (4, 7), 4),
+        ("k: 'it''s'\n", "it's", (4, 11), None),
+        ('k: "a\\tb"\n', "a\tb", (4, 10), None),
+        ("k: a\n   b\n", "a b", (4, 5), None),
+        ('k: "a\n   b"\n', "a b", (4, 6), None),
+        ("k: |\n   a\n", "a\n", (4, 5), None),
+        ("k: ${X}\n", "filled", (4, 8), None),
+        ("k: a\r\n", "a", (4, 5), 4),
+    ],
+)
+def test_an_expression_knows_where_its_text_stands(
+    tmp_path: Path, text: str, value: str, columns: tuple[int, int], text_column: int | None
+) -> None:
+    found = scalar(tmp_path, text)
+    assert found.value == value
+    assert (found.span.line, found.span.column, found.span.end_column) == (1, *columns)
+    assert found.text_column == text_column
+
+
+def test_quoted_scalars_are_text(tmp_path: Path) -> None:
+    assert [scalar(tmp_path, f"k: {text}\n").value for text in ("'10'", '"no"', "'~'", "''")] == ["10", "no", "~", ""]
+
+
+def test_what_a_variable_holds_is_resolved_again(tmp_path: Path) -> None:
+    assert scalar(tmp_path, "k: ${DEPTH:-10}\n").value == 10
+    assert scalar(tmp_path, 'k: "${DEPTH:-10}"\n').value == "10"
+
+
+def test_aliases_repeat_a_node_with_its_place(tmp_path: Path) -> None:
+    root, findings = composed(tmp_path, "a: &x [1]\nb: *x\n")
+    assert findings == []
+    assert isinstance(root, MappingNode)
+    first, second = root.get("a"), root.get("b")
+    assert isinstance(first, SequenceNode)
+    assert first is second
+    assert first.span.line == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "place"),
+    [
+        ("", Code.BAD_YAML, (1, 1)),
+        ("a: b: c\n", Code.BAD_YAML, (1, 5)),
+        ("a: [1, 2\nb: 3\n", Code.BAD_YAML, (1, 4)),
+        ("a: {b: 1\nc: 3\n", Code.BAD_YAML, (1, 4)),
+        ("a: 'b\nc: 1\n", Code.BAD_YAML, (1, 4)),
+        ("a: \"b\nc: 'd'\ne: \"f\"\n", Code.BAD_YAML, (1, 4)),
+        ("a b\nc: 1\n", Code.BAD_YAML, (1, 1)),
+        ("a:\n  b c  # d: e\n  f: 1\n", Code.BAD_YAML, (2, 3)),
+        ("a:\n\tb: 1\n", Code.BAD_YAML, (2, 1)),
+        ("a: @b\n", Code.BAD_YAML, (1, 4)),
+        ("a: 1\n  b: 2\n", Code.BAD_YAML, (2, 4)),
+        ("a: !!int 1\n", Code.BAD_YAML, (1, 4)),
+        ("a: !x {b: 1}\n", Code.BAD_YAML, (1, 4)),
+        ("a: 1\n---\nb: 2\n", Code.BAD_YAML, (2, 1)),
+        ("a: &x [*x]\n", Code.BAD_YAML, (1, 8)),
+        ("a: &x {b: &x [*x]}\n", Code.BAD_YAML, (1, 15)),
+        ("a: *x\n", Code.BAD_YAML, (1, 4)),
+        ("<<: {a: 1}\n", Code.BAD_YAML, (1, 1)),
+        ("? [a]\n: b\n", Code.BAD_YAML, (1, 3)),
+        ('a: "x\\0y"\n', Code.BAD_YAML, (1, 4)),
+        ('a: "\\UFFFFFFFF"\n', Code.BAD_YAML, (1, 7)),
+        ("a: [\n", Code.BAD_YAML, (1, 4)),
+        ("a: {b: [1, 2],\n\n", Code.BAD_YAML, (1, 4)),
+        ("a: 1\nb: 2\na: 3\n", Code.DUPLICATE_KEY, (3, 1)),
+        ("a: 1\n'a': 2\n", Code.DUPLICATE_KEY, (2, 1)),
+        ("a: yes\n", Code.AMBIGUOUS_SCALAR, (1, 4)),
+        ("on: 1\n", Code.AMBIGUOUS_SCALAR, (1, 1)),
+        ("a: ${Y:-0777}\n", Code.AMBIGUOUS_SCALAR, (1, 4)),
+        ("a: x${Y}\n", Code.UNDEFINED_VARIABLE, (1, 5)),
+        ("a: \"x${Y}\"\n", Code.UNDEFINED_VARIABLE, (1, 6)),
+    ],
+)  # fmt: skip
+def test_one_mistake_is_one_finding_in_its_line(
+    tmp_path: Path, text: str, code: Code, place: tuple[int, int], request: pytest.FixtureRequest
+) -> None:
+    _, [finding] = composed(tmp_path, text)
+    assert finding.code is code
+    if not ("pure Python" in request.node.name and code is Code.BAD_YAML):  # its sentences and places are its own
+        assert (finding.span.line, finding.span.column) == place
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "a: " + "{b: " * 100_000, "- " * 100_000, "[" * 50 + "]" * 50])
+def test_deep_nesting_is_one_finding(tmp_path: Path, text: str) -> None:
+    root, [finding] = composed(tmp_path, text)
+    assert root is None
+    assert finding.code is Code.BAD_YAML
+    assert "nested more than 32 deep" in finding.message
+
+
+def test_an_alias_bomb_is_one_finding(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 31)]
+    root, [finding] = composed(tmp_path, "\n".join(lines))
+    assert root is None
+    assert "more than 20000 values" in finding.message
+
+
+def test_findings_of_one_text_are_collected(tmp_path: Path) -> None:
+    _, findings = composed(tmp_path, "a: yes\nb: {c: 0777, c: 1}\nd: ${Y}\n")
+    codes = [Code.AMBIGUOUS_SCALAR, Code.AMBIGUOUS_SCALAR, Code.DUPLICATE_KEY, Code.UNDEFINED_VARIABLE]
+    assert [finding.code for finding in findings] == codes
+
+
+def test_spans_name_the_file_as_findings_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert scalar(tmp_path, "k: v\n").span == SourceSpan("t.yaml", 1, 4, 5)

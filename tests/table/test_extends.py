@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.errors import Code
+from router.table.model import Address
+from tests.table.tables import GOOD, load
+
+
+@pytest.fixture
+def base(tmp_path: Path) -> Path:
+    (tmp_path / "base.yaml").write_text(GOOD)
+    return tmp_path
+
+
+def test_mappings_merge_key_by_key_and_everything_else_replaces(base: Path) -> None:
+    text = """\
+extends: base.yaml
+endpoints:
+  basestation: {address: 127.0.0.9:1}
+  tool: {address: 127.0.0.8:1, kind: tool}
+routes:
+  imu_info: {destinations: [tool]}
+"""
+    table, findings = load(base, text)
+    assert not findings
+    assert table
+    assert list(table.endpoints) == ["sensor_board", "basestation", "tool"]
+    basestation = table.endpoints["basestation"]
+    assert basestation.address.value == Address("127.0.0.9", 1)
+    assert basestation.trim_trailing_zeros
+    imu = table.routes[0]
+    assert [destination.endpoint.value for destination in imu.destinations] == ["tool"]
+    assert len(imu.topics) == 2
+
+
+def test_values_keep_the_place_where_they_were_written(base: Path) -> None:
+    table, _ = load(base, "extends: base.yaml\nendpoints:\n  basestation: {address: 127.0.0.9:1}\n")
+    assert table
+    address = table.endpoints["basestation"].address.span
+    assert (Path(address.file).name, address.line) == ("table.yaml", 3)
+    assert Path(table.endpoints["sensor_board"].span.file).name == "base.yaml"
+
+
+def test_chains_are_followed_from_file_to_file(base: Path) -> None:
+    (base / "deep").mkdir()
+    (base / "deep" / "middle.yaml").write_text("extends: ../base.yaml\nnode: {name: middle}\n")
+    table, findings = load(base, "extends: deep/middle.yaml\n")
+    assert not findings
+    assert table
+    assert (table.node.name, len(table.files)) == ("middle", 3)
+
+
+def test_variables_are_filled_in_the_path(base: Path) -> None:
+    table, findings = load(base, "extends: ${BASE}.yaml\n", {"BASE": "base"})
+    assert table
+    assert not findings
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "part"),
+    [
+        ("extends: nope.yaml\n", Code.BAD_EXTENDS, "no such file"),
+        ("extends: bse.yaml\n", Code.BAD_EXTENDS, "did you mean 'base.yaml'?"),
+        ("extends: .\n", Code.BAD_EXTENDS, "folder"),
+        ("extends: table.yaml\n", Code.BAD_EXTENDS, "extends itself"),
+        ("extends: link.yaml\n", Code.BAD_EXTENDS, "extends itself"),
+        ("extends: back.yaml\n", Code.BAD_EXTENDS, "extends itself"),
+        ("extends: [base.yaml]\n", Code.WRONG_TYPE, "path of another table"),
+        ("extends: 5\n", Code.WRONG_TYPE, "path of another table"),
+        ("extends:\n", Code.WRONG_TYPE, "path of another table"),
+        ("extends: no\n", Code.AMBIGUOUS_SCALAR, "truth value"),
+        ("extends: ${NOPE}\n", Code.UNDEFINED_VARIABLE, "not set"),
+        ('extends: "a\\0b"\n', Code.BAD_YAML, "U+0000"),
+        (f"extends: {'x' * 300}\n", Code.BAD_EXTENDS, "too long"),
+        ("extends: list.yaml\n", Code.WRONG_TYPE, "mapping of keys"),
+        ("extends: torn.yaml\n", Code.BAD_YAML, "never closed"),
+        ("extends: latin.yaml\n", Code.BAD_FILE, "UTF-8"),
+    ],
+)
+def test_what_cannot_be_extended_is_one_finding(base: Path, text: str, code: Code, part: str) -> None:
+    (base / "back.yaml").write_text("extends: table.yaml\n")
+    (base / "list.yaml").write_text("- 1\n")
+    (base / "torn.yaml").write_text("a: [\n")
+    (base / "latin.yaml").write_bytes(b"# \xff\n")
+    (base / "link.yaml").symlink_to("table.yaml")
+    table, [finding] = load(base, text)
+    assert table is None
+    assert finding.code is code
+    assert part in str(finding)
+    assert finding.span.line == 1

@@ -1,0 +1,56 @@
+"""The schema file itself: valid, strict, and a description for every key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import jsonschema
+
+from router.table.build import DEFAULT_NODE, DEFAULT_RECEIVE_BUFFER
+from router.table.shape import table_schema
+from router.table.units import parse_size
+
+
+def keys(schema: object, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every key that a table may have, with its own schema."""
+    if isinstance(schema, list):
+        for member in schema:
+            yield from keys(member, path)
+    if isinstance(schema, dict):
+        for name, member in schema.get("properties", {}).items():
+            yield f"{path}/{name}", member
+        for name, member in schema.items():
+            if name != "if":  # a condition describes nothing
+                yield from keys(member, f"{path}/{name}")
+
+
+def resolved(schema: dict[str, Any]) -> dict[str, Any]:
+    reference = schema.get("$ref")
+    return table_schema()["definitions"][reference.rpartition("/")[2]] if reference else schema
+
+
+def test_it_is_a_valid_draft_07_schema() -> None:
+    jsonschema.Draft7Validator.check_schema(table_schema())
+
+
+def test_every_key_has_a_title_and_a_description() -> None:
+    bare = [path for path, schema in keys(table_schema()) if not {"title", "description"} <= resolved(schema).keys()]
+    assert bare == []
+
+
+def test_mappings_with_known_keys_refuse_others() -> None:
+    closed = [
+        schema
+        for schema in table_schema()["definitions"].values()
+        if isinstance(schema, dict) and schema.get("type") == "object" and "properties" in schema
+    ]
+    assert closed
+    assert all(schema["additionalProperties"] is False for schema in [table_schema(), *closed])
+
+
+def test_documented_defaults_are_those_of_the_code() -> None:
+    properties = table_schema()["properties"]
+    assert properties["node"]["default"] == {"name": DEFAULT_NODE.name, "namespace": DEFAULT_NODE.namespace}
+    buffer = table_schema()["definitions"]["listener"]["properties"]["receive_buffer"]
+    assert parse_size(buffer["default"]) == DEFAULT_RECEIVE_BUFFER

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from router.errors import Code, Diagnostic, TableError
+from router.table.source import MAX_BYTES, read_source
+
+
+def refused(path: Path) -> Diagnostic:
+    with pytest.raises(TableError) as caught:
+        read_source(path)
+    [finding] = caught.value.diagnostics
+    return finding
+
+
+@pytest.mark.parametrize(
+    ("data", "code", "place"),
+    [
+        (b"a: 1\nb: \xff\n", Code.BAD_FILE, (2, 4)),
+        ("a: ü\nü: ".encode() + b"\xc3", Code.BAD_FILE, (2, 4)),
+        ("a: 1".encode("utf-16"), Code.BAD_FILE, (1, 1)),
+        (b"a: 1\nb: x\0y\n", Code.BAD_YAML, (2, 5)),
+        (b"a: 1\r\nb: \x1b[31m\n", Code.BAD_YAML, (2, 4)),
+        ("a: 1\rb: x\u2028y\n".encode(), Code.BAD_YAML, (2, 5)),
+    ],
+)
+def test_characters_that_no_table_has_are_found(
+    tmp_path: Path, data: bytes, code: Code, place: tuple[int, int]
+) -> None:
+    path = tmp_path / "t.yaml"
+    path.write_bytes(data)
+    finding = refused(path)
+    assert (finding.code, (finding.span.line, finding.span.column)) == (code, place)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
+    path = tmp_path / "t.yaml"
+    path.write_bytes(b"\xef\xbb\xbfa: 1\n")
+    assert read_source(path).text == "a: 1\n"
+
+
+def test_lines_end_as_editors_see_them(tmp_path: Path) -> None:
+    path = tmp_path / "t.yaml"
+    path.write_bytes(b"a\r\nb\rc\nd")
+    assert read_source(path).lines == ("a", "b", "c", "d")
+
+
+def test_what_is_no_file_is_one_finding(tmp_path: Path) -> None:
+    assert "folder" in refused(tmp_path).message
+    assert "no such file" in refused(tmp_path / "nope.yaml").message
+    assert "not a directory" in refused(Path(__file__) / "nope.yaml").message
+    assert "too long" in refused(tmp_path / ("x" * 300)).message
+    assert refused(tmp_path / "a\0b").code is Code.BAD_FILE
+    assert "no ordinary file" in refused(Path(os.devnull)).message
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    assert "no ordinary file" in refused(tmp_path / "pipe.yaml").message
+
+
+def test_a_loop_of_links_is_one_finding(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").symlink_to("b.yaml")
+    (tmp_path / "b.yaml").symlink_to("a.yaml")
+    assert refused(tmp_path / "a.yaml").code is Code.BAD_FILE
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_may_not_be_read_is_one_finding(tmp_path: Path) -> None:
+    path = tmp_path / "t.yaml"
+    path.write_text("a: 1")
+    path.chmod(0)
+    assert "permission denied" in refused(path).message
+
+
+def test_a_file_of_any_size_is_not_read_to_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "t.yaml"
+    with path.open("wb") as stream:
+        stream.truncate(MAX_BYTES + 1)
+    assert "larger than 4 MiB" in refused(path).message

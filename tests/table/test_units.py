@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from router.table.units import parse_duration, parse_rate, parse_size
+
+
+@pytest.mark.parametrize(
+    ("text", "nanoseconds"),
+    [
+        ("500ms", 500_000_000),
+        ("1.5 s", 1_500_000_000),
+        ("7ns", 7),
+        ("0.1us", 100),
+        ("2min", 120 * 10**9),
+        ("1h", 3600 * 10**9),
+    ],
+)
+def test_durations_are_exact(text: str, nanoseconds: int) -> None:
+    assert parse_duration(text) == nanoseconds
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("4MiB", 4 << 20), ("64kB", 64_000), ("64 KiB", 65_536), ("1.5MB", 1_500_000), ("9B", 9)]
+)
+def test_sizes_are_exact(text: str, size: int) -> None:
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize(("value", "hertz"), [("30 Hz", 30.0), ("0.5Hz", 0.5), (10, 10.0), (0.25, 0.25)])
+def test_rates_are_numbers_or_carry_their_unit(value: str | float, hertz: float) -> None:
+    assert parse_rate(value) == hertz
+
+
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [
+        (parse_duration, "500"),
+        (parse_duration, "5 parsecs"),
+        (parse_duration, "-1s"),
+        (parse_duration, "0s"),
+        (parse_duration, "0.5ns"),
+        (parse_duration, "999999999999999h"),
+        (parse_duration, "1e3s"),
+        (parse_size, "4"),
+        (parse_size, "4Mib"),
+        (parse_size, "0B"),
+        (parse_size, "1.5B"),
+        (parse_size, "1024MiB"),
+        (parse_rate, "30"),
+        (parse_rate, "0 Hz"),
+        (parse_rate, 0),
+        (parse_rate, float("inf")),
+        (parse_rate, float("nan")),
+    ],
+)
+def test_what_means_nothing_is_refused(parse: Callable[[object], object], text: object) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        parse(text)
