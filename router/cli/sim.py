@@ -67,7 +67,7 @@ def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -
         view.look(seconds)
         print(view.line(), flush=True)
 
-    print(f"simulating {simulator.summary} until Ctrl-C", flush=True)
+    print(f"{simulator.summary}; Ctrl-C ends it", flush=True)
     write(simulator.run(args.duration, LINE_REFRESH, write))
 
 

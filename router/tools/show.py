@@ -29,9 +29,15 @@ def _printable(word: str) -> str:
 
 
 def float_text(value: float, bits: int, digits: int | None = None) -> str:
-    """The shortest decimal that reads back as the same float of this width, or `digits` significant ones."""
-    if digits is not None or not math.isfinite(value):
-        return f"{value:.{digits or 6}g}"
+    """The shortest decimal that reads back as the same float of this width.
+
+    With `digits`, rounded to that many, and to twice as many where somebody chose 64 bits: a degree of
+    latitude has 111 km.
+    """
+    if digits is not None:
+        return f"{value:.{digits * bits // 32}g}"
+    if not math.isfinite(value):
+        return str(value)
     if bits == 64:
         return repr(value)
     packed = struct.pack("<f", value)

@@ -1,11 +1,11 @@
 """How the simulator's statistics look: a table for a terminal, lines for a log, JSON for programs.
 
-Remembers the counts of the last look, so that rates are those since then.
+Remembers the counts of the last looks, to tell rates.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from typing import Any
 
 from google.protobuf.json_format import MessageToDict
@@ -16,8 +16,12 @@ from router.tools.show import compact, rate_text
 from router.tools.simulator import Statistics
 from router.tools.wire import Wire
 
-DIGITS = 6
-"""Of floats; enough to see a GPS position move."""
+DIGITS = 4
+
+RATE_WINDOW = 3.0
+"""Seconds; over less, one message in two seconds is no rate but a flicker."""
+
+Counts = dict[tuple[str, str], int]
 
 PATIENCE = 2.0
 """Seconds without an answer after which a missing router is the likely reason."""
@@ -29,24 +33,26 @@ class SimView:
     def __init__(self, wire: Wire, statistics: Statistics) -> None:
         self._wire = wire
         self._statistics = statistics
-        self._seen: dict[tuple[str, str], int] = {}
+        self._looks: deque[tuple[float, Counts]] = deque([(0.0, {})])
         self._rates: dict[tuple[str, str], float] = {}
-        self._seen_at = 0.0
 
     def look(self, seconds: float) -> None:
-        """Compute the rates since the last look; `seconds` since the start."""
+        """Compute the rates over the last RATE_WINDOW seconds, or since the last look; `seconds` since the start."""
         counts = {key: arrivals.count for key, arrivals in self._statistics.received.items()}
-        elapsed = seconds - self._seen_at
-        self._rates = {key: (count - self._seen.get(key, 0)) / elapsed for key, count in counts.items()}
-        self._seen, self._seen_at = counts, seconds
+        while len(self._looks) > 1 and seconds - self._looks[1][0] >= RATE_WINDOW:
+            self._looks.popleft()
+        before_at, before = self._looks[0]
+        self._rates = {key: (count - before.get(key, 0)) / (seconds - before_at) for key, count in counts.items()}
+        self._looks.append((seconds, counts))
 
     def headline(self) -> str:
         """What went out and what came back, in one line."""
         statistics = self._statistics
         sent = sum(statistics.sent.values())
         received = sum(arrivals.count for arrivals in statistics.received.values())
-        line = f"{self._seen_at:.0f} s: sent {sent}, came back {received}"
-        if not received and self._seen_at > PATIENCE:
+        seconds = self._looks[-1][0]
+        line = f"{seconds:.0f} s: sent {sent}, came back {received}"
+        if not received and seconds > PATIENCE:
             line += " (is the router running with this table?)"
         if statistics.unsent:
             line += f", refused by the kernel {statistics.unsent}"
@@ -56,11 +62,12 @@ class SimView:
 
     def line(self) -> str:
         """The headline, and what each endpoint received."""
-        by_endpoint: dict[str, list[float]] = defaultdict(lambda: [0, 0.0])
-        for (endpoint, case), count in self._seen.items():
-            by_endpoint[endpoint][0] += count
-            by_endpoint[endpoint][1] += self._rates[endpoint, case]
-        parts = [f"{name} {count} ({rate_text(rate)}/s)" for name, (count, rate) in sorted(by_endpoint.items())]
+        counts: dict[str, int] = defaultdict(int)
+        rates: dict[str, float] = defaultdict(float)
+        for (endpoint, case), count in self._looks[-1][1].items():
+            counts[endpoint] += count
+            rates[endpoint] += self._rates[endpoint, case]
+        parts = [f"{endpoint} {counts[endpoint]} ({rate_text(rates[endpoint])}/s)" for endpoint in sorted(counts)]
         return self.headline() + (f"; {', '.join(parts)}" if parts else "")
 
     def table(self, height: int) -> Table:

@@ -112,7 +112,7 @@ class Simulator:
         """What is simulated, for people."""
         endpoints, cases = len(self._senders) - 1, len(self._streams)
         rate = sum(stream.rate for stream in self._streams)
-        return f"{endpoints} endpoints sending {cases} payload cases, {rate:.0f} datagrams/s, to {self._router}"
+        return f"{endpoints} endpoints send {cases} payload cases, {rate:.0f}/s, to {self._router}"
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """One socket for both ways; a second one to send when the router knows the endpoint by its source port."""

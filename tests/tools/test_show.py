@@ -64,3 +64,8 @@ def test_a_float_is_written_so_that_it_reads_back(value: float) -> None:
 @pytest.mark.parametrize(("rate", "text"), [(0, "0"), (0.51, "0.5"), (9.97, "10"), (49.7, "50"), (1234.5, "1234")])
 def test_rates_are_short(rate: float, text: str) -> None:
     assert rate_text(rate) == text
+
+
+def test_rounding_leaves_a_double_twice_the_digits() -> None:
+    assert (float_text(51.099312345, 32, digits=4), float_text(51.099312345, 64, digits=4)) == ("51.1", "51.099312")
+    assert float_text(float("nan"), 32, digits=4) == "nan"

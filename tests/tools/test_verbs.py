@@ -138,7 +138,7 @@ def test_sim_writes_lines_where_there_is_no_terminal(
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     assert main(["sim", str(table_path()), "--duration", "0.1"]) == 0
     title, last = capsys.readouterr().out.splitlines()
-    assert title.startswith("simulating 2 endpoints sending 2 payload cases, 4 datagrams/s, to 127.0.0.1:")
+    assert title.startswith("2 endpoints send 2 payload cases, 4/s, to 127.0.0.1:")
     assert "came back 0" in last
     for number, handler in before.items():
         signal.signal(number, handler)
