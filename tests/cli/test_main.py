@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+
+from router.cli import BAD_TABLE, BAD_USAGE, BROKEN_PIPE, INTERRUPTED, VERBS, main, validate
+from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def test_help_lists_every_verb_and_imports_none(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["--help"])
+    assert caught.value.code == 0
+    words = capsys.readouterr().out.split()
+    assert set(VERBS) <= set(words)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_its_module_and_help(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert importlib.import_module(f"router.cli.{verb}")
+    with pytest.raises(SystemExit) as caught:
+        main([verb, "--help"])
+    assert caught.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: router {verb}")
+
+
+@pytest.mark.parametrize("arguments", [[], ["valdate"], ["validate", "--colour"], ["validate", "--format", "xml"]])
+def test_wrong_usage_ends_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == BAD_USAGE
+    assert "usage: router" in capsys.readouterr().err
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        installed = version("rover-router")
+    except PackageNotFoundError:
+        pytest.skip("needs the package to be installed")
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"router {installed}\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "shown"),
+    [
+        (TableError([Diagnostic(SourceSpan("t.yaml", 3, 4), Code.BAD_YAML, "what")]), BAD_TABLE, "t.yaml:3:4: error"),
+        (StartError("port 5000 is taken"), BAD_TABLE, "router validate: port 5000 is taken"),
+        (KeyboardInterrupt(), INTERRUPTED, ""),
+    ],
+)
+def test_what_a_verb_raises_becomes_an_exit_code(
+    error: BaseException,
+    code: int,
+    shown: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(args: object) -> int:
+        raise error
+
+    monkeypatch.setattr(validate, "run", fail)
+    assert main(["validate", "x.yaml"]) == code
+    assert shown in capsys.readouterr().err
+
+
+def test_a_reader_that_leaves_early_is_no_reason_to_complain() -> None:
+    command = [sys.executable, "-m", "router", "validate", "--format", "json", *["nope.yaml"], *map(str, range(3000))]
+    process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout
+    process.stdout.close()
+    assert process.stderr
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait() == BROKEN_PIPE
+
+
+def test_validate_imports_neither_ros_nor_what_a_person_looks_at() -> None:
+    script = "import sys; from router.cli import main; main(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+    command = [sys.executable, "-c", script, "validate", "routes"]
+    result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    unwanted = {"rclpy", "rich", "structlog", "prometheus_client", "router.runtime", "router.cli.run"}
+    assert unwanted.isdisjoint(result.stderr.split())
