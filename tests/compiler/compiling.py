@@ -1,0 +1,152 @@
+"""The compiler's real path in small: one expression, one mapping, one handler, ready to be called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+from router.compiler import _NAMESPACE
+from router.compiler.cdr import write_message
+from router.compiler.expressions import Locals, Scope, Typed, attribute, check, placed
+from router.compiler.mapping import build
+from router.compiler.program import Handler, Program
+from router.compiler.reference import fill
+from router.compiler.reference_cdr import cdr
+from router.compiler.reference_expressions import Context, View
+from router.compiler.source import Source
+from router.engine.binding import MAPPING_FAILURES, Outlets, Report, bind
+from router.errors import Diagnostic, SourceSpan
+from router.table.model import Expression, FieldEntry, FieldMap
+from router.types.model import Enum, MessageType, Type
+
+SPAN = SourceSpan("table.yaml", 7, 3, 9)
+RECEIVED_AT = 1_700_000_000_123_456_789
+SOURCE = "sensor_board"
+
+Handle = Callable[[Any, bytes, int, int, str], None]
+
+
+def written(text: str) -> Expression:
+    """An expression that stands in line 7 of a table, from column 3."""
+    return Expression(text, SourceSpan("table.yaml", 7, 3, 3 + len(text)), verbatim=True, text_column=3)
+
+
+def field_map(auto: bool = False, **entries: str) -> FieldMap:
+    """`header__stamp="received_at"` is the entry `header.stamp: received_at`."""
+    paths = {tuple(name.split("__")): text for name, text in entries.items()}
+    return FieldMap(
+        SPAN, auto, tuple(FieldEntry(path, (SPAN,) * len(path), written(text)) for path, text in paths.items())
+    )
+
+
+AUTO = field_map(auto=True)
+
+
+def scope_of(message: MessageType, enums: Collection[Enum] = (), ros_types: Collection[MessageType] = ()) -> Scope:
+    return Scope(message, enums, ros_types, Locals())
+
+
+def context_of(
+    message: Any, declared: MessageType, enums: Collection[Enum] = (), ros_types: Collection[MessageType] = ()
+) -> Context:
+    return Context(View(message, declared), SOURCE, RECEIVED_AT, enums, ros_types)
+
+
+def compiled(text: str, scope: Scope, expected: Type | None = None) -> tuple[Typed, Callable[[Any], Any]]:
+    """A checked expression, and as a function of the message. Raises Finding."""
+    typed = check(written(text), scope, expected)
+    out = Source()
+    with out.block("def evaluate(m, source, received_at):", SPAN):
+        bind_locals(out, scope)
+        out.line(f"return {out.expression(typed.node)}", SPAN)
+    namespace: dict[str, Any] = dict(_NAMESPACE)
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    return typed, lambda message: namespace["evaluate"](message, SOURCE, RECEIVED_AT)
+
+
+def bind_locals(out: Source, scope: Scope) -> None:
+    import ast
+
+    for path, local in scope.locals.bound.items():
+        holder = ast.Name(scope.locals.name(path[:-1]), ast.Load())
+        out.line(f"{local} = {out.expression(placed(attribute(holder, path[-1]), SPAN))}", SPAN)
+
+
+def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[[Any], bytes]:
+    """A function from a message to the CDR bytes of the topic that `fields` fills."""
+    mapping = build(fields, target, scope, SPAN)
+    assert mapping.findings == []
+    out = Source()
+    with out.block("def serialize(m, source, received_at):", SPAN):
+        bind_locals(out, scope)
+        out.line(f"return {write_message(out, mapping.plan, 'it')}", SPAN)
+    namespace: dict[str, Any] = {**_NAMESPACE, **out.constants}
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    return lambda message: bytes(namespace["serialize"](message, SOURCE, RECEIVED_AT))
+
+
+def findings_of(fields: FieldMap, target: MessageType, scope: Scope) -> list[Diagnostic]:
+    return build(fields, target, scope, SPAN).findings
+
+
+def reference_bytes(fields: FieldMap, target: MessageType, context: Context, padding: int = 0) -> bytes:
+    return cdr(target, fill(fields, target, context), padding)
+
+
+def outcome(make: Callable[[], Any]) -> Any:
+    """What `make` gives, or the class of the failure: every one that the engine counts is equal here."""
+    try:
+        return make()
+    except MAPPING_FAILURES:
+        return MAPPING_FAILURES
+
+
+@dataclass
+class Published:
+    """A handler bound to lists: what it publishes by topic, what it sends, what it reports."""
+
+    program: Program
+    handler: Handler
+    topics: dict[str, list[bytes]] = field(default_factory=dict)
+    sent: dict[str, list[bytes]] = field(default_factory=dict)
+    reports: list[Report] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        topics = [target.target for target in self.handler.targets if target.is_topic]
+        endpoints = [target.target for target in self.handler.targets if not target.is_topic]
+        self.topics = {topic: [] for topic in topics}
+        self.sent = {endpoint: [] for endpoint in endpoints}
+        self._handle = bind(
+            self.handler,
+            self.program.books,
+            Outlets(
+                counts=self.program.books.fresh_counts(),
+                send={name: self._sender(name) for name in endpoints},
+                publish={topic: self._publisher(topic) for topic in topics},
+                wanted={topic: [True] for topic in topics},
+                report=self.reports.append,
+                publish_errors=(),
+            ),
+        )
+
+    def _sender(self, endpoint: str) -> Callable[[bytes], int]:
+        def send(datagram: bytes) -> int:
+            self.sent[endpoint].append(datagram)
+            return len(datagram)
+
+        return send
+
+    def _publisher(self, topic: str) -> Callable[[bytes], None]:
+        def publish(data: bytes) -> None:
+            self.topics[topic].append(bytes(data))
+
+        return publish
+
+    def __call__(self, message: Any) -> dict[str, bytes]:
+        """Serves one message. Topics whose mapping failed are left out; `reports` has why."""
+        self.reports.clear()
+        for published in self.topics.values():
+            published.clear()
+        self._handle(message, b"datagram", RECEIVED_AT, 1, SOURCE)
+        return {topic: published[0] for topic, published in self.topics.items() if published}

@@ -1,0 +1,127 @@
+"""Every route of the rover's table: the compiled handler publishes what the reference evaluator says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from router.compiler import Checked
+from router.compiler.program import Program
+from router.compiler.reference import fill
+from router.compiler.reference_cdr import cdr
+from router.compiler.routes import CheckedRoute
+from router.engine.binding import MAPPING_FAILURES
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+
+from tests.compiler.compiling import Published, context_of
+
+GOLDEN: list[dict[str, Any]] = json.loads(
+    (Path(__file__).parents[1] / "wire" / "golden_envelopes.json").read_text(encoding="utf-8")
+)
+INBOUND = [
+    "sensor_diag", "imu_info", "gps_info", "ph_info", "pressure_info", "load_cell_info", "flow_sensor_info",
+    "pump_info", "drive_diag", "drive_progress", "arm_diag", "arm_pos", "arm_feedback", "arm_obstructions",
+    "manual_drive", "manual_brake", "manual_arm", "control_mode", "object_selection", "rock_measure_request",
+]  # fmt: skip
+
+
+def expected(checked: Checked, route: CheckedRoute, message: Any) -> dict[str, bytes]:
+    """What the reference makes of each topic; topics that it refuses are left out."""
+    assert checked.schema is not None
+    made = {}
+    for target in route.targets:
+        if target.topic is None or target.type is None:
+            continue
+        context = context_of(message, route.case.type, tuple(checked.schema.enums.values()), nested(target.type))
+        try:
+            made[target.topic.topic.value] = cdr(target.type, fill(target.topic.fields, target.type, context))
+        except MAPPING_FAILURES:
+            continue
+    return made
+
+
+def nested(declared: Type) -> list[MessageType]:
+    """A ROS type and all types in it, whose constants its expressions see."""
+    if isinstance(declared, List):
+        return nested(declared.element)
+    if not isinstance(declared, MessageType):
+        return []
+    return [declared, *(inner for field in declared.fields for inner in nested(field.type))]
+
+
+def assert_agreement(checked: Checked, program: Program, route: CheckedRoute, message: Any) -> None:
+    serve = Published(program, program.handlers[route.case.number])
+    published = serve(message)
+    assert published == expected(checked, route, message)
+    assert {report.reason for report in serve.reports} <= {"mapping_error", "non_finite"}
+    assert {report.target for report in serve.reports} == serve.topics.keys() - published.keys()
+    assert all(sent == [b"datagram"] for sent in serve.sent.values())
+
+
+def test_inbound_routes_are_those_of_the_table(rover: Checked) -> None:
+    assert sorted(INBOUND) == sorted(checked.case.name for checked in rover.routes if not checked.route.is_outbound)
+
+
+@pytest.mark.parametrize("entry", GOLDEN, ids=lambda entry: f"{entry['payload_case']}-{entry['mode']}")
+def test_golden_envelope_fills_every_topic_as_the_reference_does(
+    rover: Checked, rover_program: Program, entry: dict[str, Any]
+) -> None:
+    route = next(checked for checked in rover.routes if checked.case.name == entry["payload_case"])
+    if route.route.is_outbound:
+        assert route.case.number not in rover_program.handlers
+        return
+    envelope = rover_program.envelope.message_class.FromString(bytes.fromhex(entry["hex"]))
+    message = getattr(envelope, route.case.name)
+    assert_agreement(rover, rover_program, route, message)
+    serve = Published(rover_program, rover_program.handlers[route.case.number])
+    assert serve(message).keys() == serve.topics.keys(), "every golden envelope is published on every topic"
+
+
+# values at the edges of their types
+
+_EDGES = [0.0, -0.0, float("nan"), float("inf"), float("-inf"), 1e-45, 3.4028234663852886e38, -1.0, 360.0]
+
+
+def values_for(declared: Type) -> st.SearchStrategy[Any]:
+    match declared:
+        case Bool():
+            return st.booleans()
+        case Int():
+            edges = [declared.low, declared.high, 0, 255, 256]
+            return st.sampled_from(edges) | st.integers(declared.low, declared.high)
+        case Float():
+            return st.sampled_from(_EDGES) | st.floats(width=declared.bits)  # type: ignore[arg-type]
+        case Enum():
+            named = [number for _, number in declared.values]
+            return st.sampled_from([*named, -1, 255, 256, -(1 << 31), (1 << 31) - 1])
+        case String():
+            return st.text(max_size=declared.bound)
+        case Bytes():
+            return st.binary(max_size=declared.bound)
+        case List():
+            return st.lists(values_for(declared.element), max_size=5)
+        case MessageType():
+            return st.fixed_dictionaries({}, optional={field.name: _member(field) for field in declared.fields})
+
+
+def _member(field: Field) -> st.SearchStrategy[Any]:
+    return values_for(field.type)
+
+
+@pytest.mark.parametrize("case", INBOUND)
+def test_any_message_is_published_or_refused_as_the_reference_does(
+    rover: Checked, rover_program: Program, case: str
+) -> None:
+    route = next(checked for checked in rover.routes if checked.case.name == case)
+
+    @settings(max_examples=60)
+    @given(values_for(route.case.type))
+    def agree(values: dict[str, Any]) -> None:
+        assert_agreement(rover, rover_program, route, route.case.message_class(**values))
+
+    agree()
