@@ -182,8 +182,9 @@ class RouteChecker:
         if twice[0] is not destination:
             self._report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
         endpoint = self.table.endpoints[name.value]
-        if finding := loop_finding(self.table, route, destination, endpoint):
-            self.findings.append(finding)
+        finding = loop_finding(self.table, route, destination, endpoint)
+        if finding and finding.message not in {earlier.message for earlier in self.findings}:
+            self.findings.append(finding)  # an endpoint that is the router itself is one mistake, not one per route
         if endpoint.kind is EndpointKind.BOARD:
             self.findings += board_findings(case, self.schema, self.board_limit, name.span)
         return endpoint.trim_trailing_zeros

@@ -28,7 +28,8 @@ _NUMBER_TAKEN = re.compile(
     r"|uses the same enum value as"
 )
 _RESERVED = re.compile(r'Field "(?P<field>\w+)" uses reserved number (?P<number>\d+)')
-_TYPE_TAKEN = re.compile(r'^"[\w.]+" is already defined')
+_TYPE_TAKEN = re.compile(r'^"(?P<name>[\w.]+)" is already defined')
+_MEMBER_TAKEN = re.compile(r'^"\w+" is already defined in "(?P<holder>[\w.]+)"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +89,12 @@ def _findings(root: Path, names: Sequence[str], complaints: Sequence[_Complaint]
     texts: dict[str, ProtoText] = {}
     findings: dict[tuple[str, int, int], Diagnostic] = {}
     lacking = {complaint.file for complaint in complaints if _IMPORT_FAILED.fullmatch(complaint.message)}
+    twice = {found["name"] for complaint in complaints if (found := _TYPE_TAKEN.match(complaint.message))}
     for complaint in complaints:
         if complaint.file == _EVERYTHING:
             continue
+        if (member := _MEMBER_TAKEN.match(complaint.message)) and member["holder"] in twice:
+            continue  # its message is a finding, and so would be all its fields
         if complaint.file in lacking and complaint.message.endswith(" is not defined."):
             continue  # it would be, by the import
         place = (complaint.file, complaint.line, complaint.column)
