@@ -72,7 +72,7 @@ def read_lock(root: Path) -> Lock | None:
     except json.JSONDecodeError as error:
         span = SourceSpan(shown_path(path), error.lineno, error.colno, error.colno + 1)
         problem = error.msg
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         span = SourceSpan(shown_path(path))
         problem = str(error)
     hint = "take the file from version control; without it nobody knows which numbers are taken"

@@ -5,8 +5,6 @@ Knows nothing of routes; the names it is asked for come from the table's `envelo
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,17 +20,13 @@ from router.table.model import EnvelopeSettings
 from router.types.board_options import NO_OPTIONS, BoardOptions, OptionsFile, read_options
 from router.types.descriptors import container, message_of
 from router.types.model import Enum, MessageType
+from router.types.proto_folder import OPTIONS, PROTO, read_folder, sha256_of
 from router.types.proto_model import build_types
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, compile_protos
 from router.types.sizes import framed_size, largest_beside, largest_encoding
 
 MessageClass = type[Message]
-
-_PROTO = ".proto"
-_OPTIONS = ".options"
-_HIDDEN = re.compile(r"(^|/)\.")
-_FILE_NAME = re.compile(r"[\w ./+,@-]+", re.ASCII)
 
 
 class ProtoSchema:
@@ -52,7 +46,7 @@ class ProtoSchema:
     ) -> None:
         self.root = root
         self.files = tuple(files)
-        self.sha256 = _sha256(files)
+        self.sha256 = sha256_of(files)
         self.sources = sources
         self._options = options
         self._pool = DescriptorPool()
@@ -125,55 +119,19 @@ def load_protos(root: Path, blame: SourceSpan | None = None) -> ProtoSchema:
     Raises TableError with every finding. What is wrong with the folder itself is blamed on `blame`, the
     place that names it, else on the folder.
     """
-    files = _read_folder(root, blame or SourceSpan(shown_path(root)))
-    compiled = compile_protos(root, [name for name in files if name.endswith(_PROTO)])
+    files = read_folder(root, blame or SourceSpan(shown_path(root)))
+    compiled = compile_protos(root, [name for name in files if name.endswith(PROTO)])
     paths = {file.name: (root if file.name in files else WELL_KNOWN) / file.name for file in compiled.file}
     sources = ProtoSources(compiled.file, paths)
     findings = _same_name_findings([file for file in compiled.file if file.name in files], sources)
     options = {}
     for name in files:
-        if name.endswith(_OPTIONS):
-            options[name[: -len(_OPTIONS)] + _PROTO], complaints = read_options(root / name)
+        if name.endswith(OPTIONS):
+            options[name[: -len(OPTIONS)] + PROTO], complaints = read_options(root / name)
             findings += complaints
     if findings:
         raise TableError(findings)
     return ProtoSchema(root, files, compiled, sources, options)
-
-
-def _read_folder(root: Path, blame: SourceSpan) -> dict[str, bytes]:
-    """The bytes of all `.proto` and `.options` files by name relative to `root`, sorted. Raises TableError."""
-    if not root.is_dir():
-        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {shown_path(root)}")])
-    found = {
-        name: path
-        for path in root.rglob("*")
-        if path.suffix in (_PROTO, _OPTIONS) and not _HIDDEN.search(name := path.relative_to(root).as_posix())
-    }
-    if not any(name.endswith(_PROTO) for name in found):
-        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")])
-    files = {}
-    findings = []
-    for name, path in sorted(found.items()):
-        if not _FILE_NAME.fullmatch(name):
-            hint = "take letters, digits, '_', '-' and '.'"
-            findings.append(Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint))
-            continue
-        try:
-            files[name] = path.read_bytes()
-        except OSError as error:
-            message = f"cannot be read: {error.strerror}"
-            findings.append(Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message))
-    if findings:
-        raise TableError(findings)
-    return files
-
-
-def _sha256(files: Mapping[str, bytes]) -> str:
-    digest = hashlib.sha256()
-    for name, content in files.items():
-        digest.update(f"{name}\0{len(content)}\0".encode())
-        digest.update(content)
-    return digest.hexdigest()
 
 
 def _same_name_findings(files: Sequence[FileDescriptorProto], sources: ProtoSources) -> list[Diagnostic]:

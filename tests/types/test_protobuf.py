@@ -28,38 +28,6 @@ message Envelope {
 """
 
 
-def test_missing_folder_is_blamed_on_whoever_names_it(tmp_path: Path) -> None:
-    blame = SourceSpan("table.yaml", 3, 11, 20)
-    with pytest.raises(TableError) as caught:
-        load_protos(tmp_path / "nowhere", blame)
-    (finding,) = caught.value.diagnostics
-    assert (finding.code, finding.span) == (Code.BAD_FILE, blame)
-
-
-def test_folder_without_protos_is_a_finding(refused: Refused) -> None:
-    (finding,) = refused({"readme.txt": "nothing here"})
-    assert (finding.code, "holds no .proto file" in finding.message) == (Code.BAD_FILE, True)
-
-
-def test_unreadable_proto_is_a_finding_at_that_file(write: Write) -> None:
-    root = write({"a.proto": 'syntax = "proto3";'})
-    (root / "b.proto").symlink_to("nowhere.proto")
-    with pytest.raises(TableError) as caught:
-        load_protos(root)
-    assert [(finding.code, finding.span.file) for finding in caught.value.diagnostics] == [(Code.BAD_FILE, "b.proto")]
-
-
-def test_hidden_files_of_editors_and_archives_are_left_alone(load: Load) -> None:
-    schema = load({"a.proto": 'syntax = "proto3";', "._a.proto": "no proto", ".git/b.proto": "neither"})
-    assert schema.files == ("a.proto",)
-
-
-@pytest.mark.parametrize("name", ['a"b.proto', "a\\b.proto", "gr\u00f6\u00dfe.proto", "a\nb.proto"])
-def test_file_that_protoc_cannot_import_is_a_finding(refused: Refused, name: str) -> None:
-    (finding,) = refused({name: 'syntax = "proto3";'})
-    assert (finding.code, "protoc cannot import" in finding.message) == (Code.BAD_FILE, True)
-
-
 def test_one_short_name_in_two_packages_is_blamed_on_the_second(refused: Refused) -> None:
     (finding,) = refused(
         {
