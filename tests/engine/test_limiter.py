@@ -1,0 +1,72 @@
+"""`max_rate` is right on average, never saves up for a burst, and forgives a sender its jitter."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.engine.limiter import NS, rate_limit
+
+rates = st.integers(1, 1000) | st.floats(0.5, 1000)
+
+
+def passed(hertz: float, times: Iterable[int]) -> list[int]:
+    limit = rate_limit(hertz)
+    return [time for time in times if limit(time)]
+
+
+@given(rates, st.lists(st.floats(0, 3), min_size=1, max_size=200), st.integers(0, 2**62))
+def test_in_any_second_at_most_one_more_than_the_rate_passes(hertz: float, gaps: list[float], start: int) -> None:
+    """The gaps are in periods: dense, with pauses of up to three."""
+    times = []
+    for gap in gaps:
+        start += round(gap * NS / hertz)
+        times.append(start)
+    kept = passed(hertz, times)
+    most = math.ceil(hertz) + 1
+    for first, beyond in zip(kept, kept[most:], strict=False):
+        assert beyond - first > NS
+
+
+@given(st.integers(1, 200), st.floats(1, 20), st.integers(0, NS))
+def test_a_steady_stream_above_the_rate_comes_down_to_it(hertz: int, factor: float, start: int) -> None:
+    interval = int(NS / hertz / factor)
+    kept = passed(hertz, range(start, start + 10 * NS, interval))
+    assert abs(len(kept) - 10 * hertz) <= 1
+
+
+@pytest.mark.parametrize("hertz", [1, 10, 30, 60, 100, 500])
+@pytest.mark.parametrize("jitter", [0.0, 0.05, 0.2])
+def test_a_stream_at_the_rate_loses_nothing_to_jitter(hertz: int, jitter: float) -> None:
+    noise = random.Random(hertz)
+    period = NS / hertz
+    times = [round((index + noise.uniform(-jitter, jitter)) * period) for index in range(1, 10 * hertz)]
+    assert passed(hertz, times) == times
+
+
+def test_heavy_jitter_at_the_rate_costs_little() -> None:
+    noise = random.Random(1)
+    times = [round((index + noise.uniform(-0.4, 0.4)) * NS / 50) for index in range(1, 5000)]
+    assert len(passed(50, times)) > 0.95 * len(times)
+
+
+@given(st.lists(st.floats(0.5, 100), min_size=1, max_size=20))
+def test_after_a_pause_nothing_was_saved_up(pauses: list[float]) -> None:
+    """A message, a pause, then a flood: of it one passes at once and the next half a period later."""
+    limit, now = rate_limit(10), 0
+    for pause in pauses:
+        limit(now)
+        now += NS // 10 + round(pause * NS)
+        flood = [now + index * 1_000_000 for index in range(100)]
+        assert [time - now for time in flood if limit(time)] == [0, 50_000_000]
+        now = flood[-1]
+
+
+def test_a_slower_stream_passes_whole() -> None:
+    times = list(range(0, 10 * NS, NS // 7))
+    assert passed(30, times) == times
