@@ -169,4 +169,4 @@ def _version() -> str:
 def tune_interpreter() -> None:
     """Settings of the whole process, for whoever owns it: call once, after start, before traffic."""
     gc.freeze()  # what start-up made lives as long as the process: the collector need not look at it again
-    sys.setswitchinterval(0.0005)
+    sys.setswitchinterval(0.0005)  # the receive thread waits no longer than this for a busy thread to let it in
