@@ -1,0 +1,103 @@
+"""Envelopes to send: the golden ones, and generated ones of every payload case with ordinary and extreme values."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import Message
+
+from router.assets import asset
+from router.tools.wire import wire_of_protos
+
+WIRE = wire_of_protos(asset("protos"))
+FRAME = 320
+"""Bytes of a fixed-size frame: the longest envelope has 305."""
+
+_FLOAT_MAX = 3.4028234663852886e38
+_DOUBLE_MAX = 1.7976931348623157e308
+_INT32 = (-(2**31), 2**31 - 1)
+_LIMITS: dict[int, tuple[Any, ...]] = {
+    FieldDescriptor.TYPE_FLOAT: (-_FLOAT_MAX, _FLOAT_MAX, -0.0, 1.401298464324817e-45),
+    FieldDescriptor.TYPE_DOUBLE: (-_DOUBLE_MAX, _DOUBLE_MAX, -0.0, 5e-324),
+    FieldDescriptor.TYPE_INT32: _INT32,
+    FieldDescriptor.TYPE_SINT32: _INT32,
+    FieldDescriptor.TYPE_INT64: (-(2**63), 2**63 - 1),
+    FieldDescriptor.TYPE_UINT32: (1, 2**32 - 1),
+    FieldDescriptor.TYPE_BOOL: (True, True),
+    FieldDescriptor.TYPE_ENUM: (*_INT32, 255, 256, -1),
+}
+
+
+class Sample(NamedTuple):
+    case: str
+    datagram: bytes
+    payload: Any
+
+    @property
+    def variants(self) -> dict[bytes, bool]:
+        """As sent, zero-trimmed, and padded to a fixed size: whether the router has to repair it, by datagram."""
+        trimmed, padded = self.datagram.rstrip(b"\0"), self.datagram.ljust(FRAME, b"\0")
+        return {self.datagram: False} | {form: form != self.datagram for form in (trimmed, padded)}
+
+
+def sample(case: str, payload: Message) -> Sample:
+    return Sample(case, WIRE.encode(WIRE.envelope.cases[case], payload), payload)
+
+
+def golden(datagram: bytes) -> Sample:
+    decoded = WIRE.decode(datagram)
+    return Sample(decoded.case.name, datagram, decoded.message)
+
+
+def generated(case: str) -> Iterator[Sample]:
+    """Of one payload case: ordinary values, sparse ones, and those at the ends of each field's range."""
+    values = [partial(_ordinary, random.Random(f"{case} {seed}")) for seed in range(3)]
+    values += [partial(_sparse, random.Random(f"{case} sparse {seed}")) for seed in range(2)]
+    values += [partial(_limit, turn) for turn in range(max(map(len, _LIMITS.values())))]
+    for value in values:
+        payload = WIRE.envelope.cases[case].message_class()
+        _fill(payload, value)
+        yield sample(case, payload)
+
+
+Value = Callable[[FieldDescriptor], Any]
+"""What a field gets: a scalar, True for a message that is to be filled, or None to leave it out."""
+
+
+def _fill(message: Any, value: Value) -> None:
+    for field in message.DESCRIPTOR.fields:
+        member = value(field)
+        if field.message_type is None:
+            setattr(message, field.name, field.default_value if member is None else member)
+        elif member:
+            getattr(message, field.name).SetInParent()
+            _fill(getattr(message, field.name), value)
+
+
+def _limit(turn: int, field: FieldDescriptor) -> Any:
+    if field.message_type is not None:
+        return True
+    limits = _LIMITS[field.type]
+    return limits[turn % len(limits)]
+
+
+def _sparse(rng: random.Random, field: FieldDescriptor) -> Any:
+    return _ordinary(rng, field) if rng.random() < 0.4 else None
+
+
+def _ordinary(rng: random.Random, field: FieldDescriptor) -> Any:
+    if field.message_type is not None:
+        return True
+    if field.enum_type is not None:
+        return rng.choice(field.enum_type.values).number
+    if field.type in (FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_DOUBLE):
+        return rng.choice((rng.uniform(-180, 180), float(rng.randint(-90, 90))))
+    if field.type == FieldDescriptor.TYPE_BOOL:
+        return rng.random() < 0.5
+    if field.type == FieldDescriptor.TYPE_UINT32:
+        return rng.randrange(2 ** rng.randint(1, 32))
+    return rng.randrange(-(2 ** rng.randint(1, 31)), 2**31)

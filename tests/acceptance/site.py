@@ -1,0 +1,221 @@
+"""A router in a process of its own, with everything around it: boards and basestation as sockets, scraper, log."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+from tests.acceptance.ros_peer import PATIENCE
+from tests.acceptance.rover_map import HOSTS, ROUTER
+
+ROOT = Path(__file__).parent.parent.parent
+
+ROVER = """\
+version: 1
+extends: {root}/routes/rover.yaml
+metrics:
+  address: 127.0.0.1:{metrics}
+listen:
+  rover:
+    address: 127.0.0.5:{listen}
+endpoints:
+{endpoints}"""
+"""The rover's table with loopback addresses, to be filled in by `Site.table`."""
+
+
+SERVED = "route_seconds_count"
+"""Counts the messages whose targets have all been served."""
+
+
+def key(metric: str, **labels: str) -> str:
+    """A counter as Prometheus writes it, without the prefix."""
+    return f"{metric}{{{','.join(f'{name}={json.dumps(labels[name])}' for name in sorted(labels))}}}"
+
+
+def wait_until(condition: Callable[[], bool], what: str = "it") -> None:
+    deadline = monotonic() + PATIENCE
+    while not condition():
+        assert monotonic() < deadline, f"{what} never happened"
+        sleep(0.01)
+
+
+class RouterProcess:
+    """`router run ARGUMENT...` as a child process, whose log goes to a file."""
+
+    def __init__(self, folder: Path, *arguments: object, **environment: str) -> None:
+        self._log = folder / "router.log"
+        folders = (environment.pop("PYTHONPATH", None), str(ROOT), os.environ.get("PYTHONPATH"))
+        with self._log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "router", "run", *map(str, arguments)],
+                stdin=subprocess.DEVNULL,
+                stderr=log,
+                env={**os.environ, **environment, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
+            )
+
+    def __enter__(self) -> RouterProcess:
+        wait_until(lambda: self.process.poll() is not None or bool(self.events("router started")), "the start")
+        assert self.process.poll() is None, self.text()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.process.poll() is None:
+            assert self.stop(signal.SIGTERM) == 0, self.text()
+
+    def stop(self, number: signal.Signals) -> int:
+        """Sends the signal, waits, and gives the exit code."""
+        self.process.send_signal(number)
+        return self.wait()
+
+    def wait(self) -> int:
+        return self.process.wait(PATIENCE)
+
+    def text(self) -> str:
+        """What it has written to stderr so far."""
+        return self._log.read_text()
+
+    def log(self) -> list[dict[str, Any]]:
+        """Its lines of JSON; the last one may still be in the making."""
+        return [json.loads(line) for line in self.text().splitlines() if line.startswith("{") and line.endswith("}")]
+
+    def events(self, event: str) -> list[dict[str, Any]]:
+        return [line for line in self.log() if line["event"] == event]
+
+
+@dataclass
+class Site:
+    """Sockets of all endpoints, each on an address of its own, and free ports for a router that is to be started."""
+
+    folder: Path
+    endpoints: Mapping[str, socket.socket]
+    listen: int
+    metrics: int
+
+    def table(self, text: str = ROVER) -> Path:
+        """Writes a table whose placeholders are filled in."""
+        lines = (
+            f"  {name}: {{address: {host}:{port}, kind: {_kind(name)}}}\n"
+            for name, (host, port) in ((name, opened.getsockname()) for name, opened in self.endpoints.items())
+        )
+        path = self.folder / "table.yaml"
+        path.write_text(text.format(listen=self.listen, metrics=self.metrics, endpoints="".join(lines), root=ROOT))
+        return path
+
+    def send(self, source: str, *datagrams: bytes) -> None:
+        for datagram in datagrams:
+            self.endpoints[source].sendto(datagram, (ROUTER, self.listen))
+
+    def receive(self, endpoint: str) -> bytes:
+        return self.endpoints[endpoint].recv(65536)
+
+    def waiting(self) -> dict[str, list[bytes]]:
+        """Everything that has arrived anywhere and was not received, by endpoint."""
+        found = {name: list(_drained(opened)) for name, opened in self.endpoints.items()}
+        return {name: datagrams for name, datagrams in found.items() if datagrams}
+
+    def scrape(self) -> Counter[str]:
+        """All counters of the router, without the prefix `router_` and the suffix `_total`."""
+        with urllib.request.urlopen(f"http://127.0.0.1:{self.metrics}/metrics", timeout=PATIENCE) as answer:
+            text = answer.read().decode()
+        lines = (line.rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
+        return Counter(
+            {
+                name[len("router_") :].replace("_total{", "{"): int(float(value))
+                for name, _, value in lines
+                if "_total{" in name or name.startswith(f"router_{SERVED}")
+            }
+        )
+
+    def changes(self, before: Counter[str]) -> Counter[str]:
+        """What was counted since `before`, without what stayed as it was."""
+        return self.scrape() - before
+
+    def settle(self, before: Counter[str], datagrams: int) -> Counter[str]:
+        """Waits until the router is done with so many datagrams since `before`; what was counted meanwhile."""
+
+        def done() -> bool:
+            now = self.changes(before)
+            received, lost = total(now, "datagrams_received"), total(now, "kernel_drops")
+            finished = total(now, "datagrams_rejected") + total(now, SERVED)
+            return received + lost >= datagrams and finished == received
+
+        wait_until(done, "the last datagram")
+        return Counter({name: count for name, count in self.changes(before).items() if not name.startswith(SERVED)})
+
+
+def total(counts: Mapping[str, int], metric: str, **labels: str) -> int:
+    """The sum of a metric's series, or of those that have these labels."""
+    wanted = [f'{name}="{value}"' for name, value in labels.items()]
+    return sum(
+        count
+        for name, count in counts.items()
+        if name.startswith(f"{metric}{{") and all(label in name[len(metric) :] for label in wanted)
+    )
+
+
+def balance(counts: Mapping[str, int]) -> None:
+    """The identities of the books: nothing that was received is unaccounted for."""
+    accepted = total(counts, "messages_received")
+    assert total(counts, "datagrams_received") == total(counts, "datagrams_rejected") + accepted
+    for route in labels_of(counts, "messages_received", "route"):
+        taken = total(counts, "messages_received", route=route)
+        for target in labels_of(counts, "messages_filtered", "target", route=route):
+            delivered = total(counts, "datagrams_sent", route=route, destination=target)
+            delivered += total(counts, "messages_published", route=route, topic=target)
+            withheld = total(counts, "messages_filtered", route=route, target=target)
+            assert taken == delivered + withheld + total(counts, "messages_dropped", route=route, target=target)
+
+
+def labels_of(counts: Mapping[str, int], metric: str, label: str, **labels: str) -> set[str]:
+    """Which values a label has among a metric's series."""
+    wanted = [f'{name}="{value}"' for name, value in labels.items()]
+    names = (name for name in counts if name.startswith(f"{metric}{{") and all(text in name for text in wanted))
+    return {match[1] for name in names if (match := re.search(rf'[{{,]{label}="([^"]*)"', name))}
+
+
+def _kind(endpoint: str) -> str:
+    return "board" if endpoint.endswith("board") else "basestation" if endpoint == "basestation" else "tool"
+
+
+def _drained(opened: socket.socket) -> Iterator[bytes]:
+    opened.setblocking(False)
+    try:
+        while True:
+            yield opened.recv(65536)
+    except BlockingIOError:
+        opened.settimeout(PATIENCE)
+
+
+def udp(host: str, port: int = 0) -> socket.socket:
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+    opened.bind((host, port))
+    opened.settimeout(PATIENCE)
+    return opened
+
+
+def free_port(host: str = ROUTER, kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+    with socket.socket(socket.AF_INET, kind) as unused:
+        unused.bind((host, 0))
+        port: int = unused.getsockname()[1]
+        return port
+
+
+@contextmanager
+def site(folder: Path, hosts: Mapping[str, str] = HOSTS) -> Iterator[Site]:
+    with ExitStack() as opened:
+        endpoints = {name: opened.enter_context(udp(host)) for name, host in hosts.items()}
+        yield Site(folder, endpoints, free_port(), free_port("127.0.0.1", socket.SOCK_STREAM))
