@@ -8,11 +8,11 @@ from pathlib import Path
 
 from router.assets import asset
 from router.compiler import check_table
-from router.compiler.books import HISTOGRAM_SLOTS
 from router.compiler.definitions import Definitions
 from router.compiler.program import Program
 from router.engine import Engine, Report
 from router.engine.binding import Outlets
+from tests.engine.ledger import Ledger
 
 HEAD = """version: 1
 envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
@@ -66,6 +66,7 @@ class Rig:
     def __init__(self, made: Program, unwanted: frozenset[str] = frozenset()) -> None:
         self.program = made
         self.counts = made.books.fresh_counts()
+        self.ledger = Ledger(made, self.counts)
         self.now = 0
         self.work_ns = 0
         self.sent: list[tuple[str, bytes]] = []
@@ -101,12 +102,7 @@ class Rig:
         return self.counts[self.program.books.slot(metric, *labels) + part]
 
     def counted(self, *prefixes: str) -> Mapping[tuple[str, ...], int]:
-        """What is not zero of the metrics whose name starts like one of these; histograms left out."""
-        return {
-            (series.metric, *series.labels): self.counts[slot]
-            for series, slot in self.program.books.series()
-            if self.counts[slot] and series.metric.startswith(prefixes) and not series.metric.endswith("seconds")
-        }
+        return self.ledger.counted(*prefixes)
 
     def rejected(self, listener: str = "trimmed") -> str | None:
         """The one reason for which this listener rejected anything."""
@@ -119,21 +115,7 @@ class Rig:
         return {labels[3]: count for labels, count in found if labels[1:3] == (route, target)}
 
     def assert_books_balance(self) -> None:
-        everything = self._sum("datagrams_rejected") + self._sum("messages_received")
-        assert self._sum("datagrams_received") == everything
-        for handler in self.program.handlers.values():
-            route = handler.case.name
-            accepted = self._sum("messages_received", route)
-            for target in handler.targets:
-                delivered = "messages_published" if target.is_topic else "datagrams_sent"
-                fates = (delivered, "messages_dropped", "messages_filtered")
-                assert accepted == sum(self._sum(metric, route, target.target) for metric in fates), target
-            timed = [self.count("route_seconds", route, part=part) for part in range(HISTOGRAM_SLOTS - 1)]
-            assert sum(timed) == accepted
-
-    def _sum(self, metric: str, *labels: str) -> int:
-        found = self.counted(metric).items()
-        return sum(count for key, count in found if key[0] == metric and key[1 : 1 + len(labels)] == labels)
+        assert list(self.ledger.imbalances()) == []
 
     def _sender(self, endpoint: str) -> Callable[[bytes], int]:
         take = self._outlet(endpoint, self.sent)

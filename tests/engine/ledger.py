@@ -1,0 +1,48 @@
+"""Reads the books by name, and says where they do not balance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from router.compiler.books import HISTOGRAM_SLOTS
+from router.compiler.program import Handler, Program
+
+
+class Ledger:
+    """The books of a program with their counts at the time of each call; timestamps and histograms left out."""
+
+    def __init__(self, program: Program, counts: Sequence[int]) -> None:
+        self._program = program
+        self._counts = counts
+
+    def counted(self, *prefixes: str) -> Mapping[tuple[str, ...], int]:
+        """What is not zero, by metric and labels, of the metrics whose name starts like one of these."""
+        return {
+            (series.metric, *series.labels): self._counts[slot]
+            for series, slot in self._program.books.series()
+            if self._counts[slot] and series.metric.startswith(prefixes) and not series.metric.endswith("seconds")
+        }
+
+    def total(self, metric: str, *labels: str) -> int:
+        """The sum over all series of a metric whose labels begin like this."""
+        return sum(count for key, count in self.counted(metric).items() if key[: 1 + len(labels)] == (metric, *labels))
+
+    def imbalances(self) -> Iterator[str]:
+        received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")
+        if received != (accepted := self.total("messages_received")) + rejected:
+            yield f"received {received}, but accepted {accepted} and rejected {rejected}"
+        for handler in self._program.handlers.values():
+            yield from self._of_route(handler)
+
+    def _of_route(self, handler: Handler) -> Iterator[str]:
+        route = handler.case.name
+        accepted = self.total("messages_received", route)
+        first = self._program.books.slot("route_seconds", route)
+        if accepted != (timed := sum(self._counts[first : first + HISTOGRAM_SLOTS - 1])):
+            yield f"{route}: accepted {accepted}, but the histogram holds {timed}"
+        for target in handler.targets:
+            delivered = "messages_published" if target.is_topic else "datagrams_sent"
+            metrics = (delivered, "messages_dropped", "messages_filtered")
+            fates = [self.total(metric, route, target.target) for metric in metrics]
+            if accepted != sum(fates):
+                yield f"{route} to {target.target}: accepted {accepted}, but delivered, dropped, filtered {fates}"
