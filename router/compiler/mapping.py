@@ -111,7 +111,7 @@ def build(fields: FieldMap | None, target: MessageType, scope: Scope, span: Sour
     automatic = Typed(MessageKind(scope.message), ast.Name(scope.locals.message, ast.Load()), span, path=())
     plan = builder.record(target, tree, automatic if fields and fields.auto else None, "")
     outcome = FieldMapping(plan, builder.rows, builder.findings)
-    if not builder.rows and not builder.findings:
+    if target.fields and not builder.rows and not builder.findings:
         hint = "map its fields, or say `fields: auto`"
         if fields and fields.auto:
             hint = f"{scope.message} and {target} have no field name in common; map the fields by hand"
