@@ -17,7 +17,6 @@ from router.compiler.reference_cdr import cdr
 from router.compiler.routes import CheckedRoute
 from router.engine.binding import MAPPING_FAILURES
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-
 from tests.compiler.compiling import Published, context_of
 
 GOLDEN: list[dict[str, Any]] = json.loads(

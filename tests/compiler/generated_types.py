@@ -1,0 +1,157 @@
+"""Hypothesis strategies: pairs of a ROS type and a source type that fills it, and values of the source."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from types import SimpleNamespace
+from typing import Any
+
+from hypothesis import strategies as st
+
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+
+INTS = [Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (True, False)]
+STATE = Enum("State", (("IDLE", 0), ("BUSY", 1), ("BROKEN", 300)))
+
+Pair = tuple[Type, Type]
+"""A ROS type, and a type of which any value fills it, or is refused when it runs."""
+
+_numbers = itertools.count()
+
+
+def _name(is_ros: bool) -> str:
+    return f"made/msg/T{next(_numbers)}" if is_ros else f"Made{next(_numbers)}"
+
+
+def message(is_ros: bool, *fields: Field) -> MessageType:
+    return MessageType(_name(is_ros), is_ros, fields)
+
+
+def mirror(declared: MessageType) -> MessageType:
+    """A source message with the fields of a ROS message, where a time is a message like others."""
+    return MessageType(
+        declared.name.replace("/", "_"),
+        False,
+        tuple(Field(field.name, _mirrored(field.type)) for field in declared.fields),
+    )
+
+
+def _mirrored(declared: Type) -> Type:
+    match declared:
+        case List():
+            return List(_mirrored(declared.element), declared.length, declared.bound)
+        case MessageType():
+            return mirror(declared)
+        case _:
+            return declared
+
+
+def _wider(target: Int) -> list[Type]:
+    return [source for source in INTS if target.low <= source.low and source.high <= target.high]
+
+
+def _exact(target: Float) -> list[Type]:
+    small: list[Type] = [source for source in INTS if source.bits < target.bits]
+    return [*small, Float(32)] if target.bits == 32 else [*small, Float(32), Float(64)]
+
+
+@st.composite
+def scalar_pairs(draw: st.DrawFn) -> Pair:
+    target: Type = draw(
+        st.one_of(
+            st.just(Bool()),
+            st.sampled_from(INTS),
+            st.sampled_from([Float(32), Float(64)]),
+            st.builds(String, st.none() | st.integers(1, 6), st.booleans()),
+        )
+    )
+    match target:
+        case Int():
+            return target, draw(st.sampled_from([*_wider(target), STATE]))
+        case Float():
+            return target, draw(st.sampled_from(_exact(target)))
+        case String():
+            return target, String()
+        case _:
+            return target, target
+
+
+@st.composite
+def list_pairs(draw: st.DrawFn, elements: st.SearchStrategy[Pair]) -> Pair:
+    target, source = draw(elements)
+    length, bound = draw(st.sampled_from([(None, None), (None, 2), (None, 5), (1, None), (3, None)]))
+    if target == Int(8, signed=False) and draw(st.booleans()):
+        return List(target, length, bound), Bytes()
+    # A length that the source's type says is checked when it is compiled, otherwise when it runs.
+    return List(target, length, bound), List(source, draw(st.sampled_from([None, length])))
+
+
+def _wrapped(pair: Pair) -> st.SearchStrategy[Pair]:
+    """A message of one field on either side is as good as what is in it."""
+    target, source = pair
+    return st.sampled_from(
+        [
+            (message(True, Field("only", target)), source),
+            (target, message(False, Field("other", source))),
+        ]
+    )
+
+
+@st.composite
+def message_pairs(draw: st.DrawFn, members: st.SearchStrategy[Pair], *, top: bool = False) -> Pair:
+    """Same-named fields in any order, fields of the target that nothing fills, none at all."""
+    shared = draw(st.lists(members, min_size=1, max_size=6))
+    if not top and draw(st.integers(0, 9)) == 0:
+        return message(True), message(False, Field("unused", Bool()))
+    targets = [Field(f"field_{index}", target) for index, (target, _) in enumerate(shared)]
+    sources = [Field(f"field_{index}", source) for index, (_, source) in enumerate(shared)]
+    unset = [Field(f"unset_{index}", type_, default=draw(defaults(type_))) for index, (type_, _) in
+             enumerate(draw(st.lists(members, max_size=2)))]  # fmt: skip
+    return (
+        message(True, *draw(st.permutations([*targets, *unset]))),
+        message(False, *draw(st.permutations(sources))),
+    )
+
+
+def defaults(declared: Type) -> st.SearchStrategy[Any]:
+    """What a `.msg` file may give as the default value of a field; None for nothing."""
+    if isinstance(declared, MessageType) or (isinstance(declared, List) and isinstance(declared.element, MessageType)):
+        return st.none()
+    if isinstance(declared, String) and not declared.wide:
+        return st.none() | st.text(st.characters(codec="ascii", exclude_characters="\0"), max_size=declared.bound or 8)
+    return st.none() | values(declared)
+
+
+def pairs(depth: int = 2) -> st.SearchStrategy[Pair]:
+    """Messages of messages, `depth` deep."""
+    members: st.SearchStrategy[Pair] = scalar_pairs() | list_pairs(scalar_pairs()) | scalar_pairs().flatmap(_wrapped)
+    for _ in range(depth):
+        inner = message_pairs(members)
+        members = members | inner | list_pairs(inner)
+    return message_pairs(members, top=True)
+
+
+def values(declared: Type) -> st.SearchStrategy[Any]:
+    """Python values of a type; messages are namespaces, as the generated code reads attributes only."""
+    match declared:
+        case Bool():
+            return st.booleans()
+        case Int():
+            return st.integers(declared.low, declared.high) | st.sampled_from([declared.low, declared.high])
+        case Float():
+            # One NaN: JSON, which carries values to another process, does not tell them apart.
+            return st.floats(width=declared.bits, allow_nan=False) | st.just(math.nan)  # type: ignore[arg-type]
+        case String():
+            return st.text(st.characters(exclude_categories=["Cs"]), max_size=declared.bound or 8)
+        case Bytes():
+            return st.binary(max_size=5)
+        case Enum():
+            return st.sampled_from([*(number for _, number in declared.values), -5, (1 << 31) - 1])
+        case List():
+            sizes = {declared.length} if declared.length is not None else {0, 1, 3}
+            return st.sampled_from(sorted(sizes)).flatmap(
+                lambda size: st.lists(values(declared.element), min_size=size, max_size=size)
+            )
+        case MessageType():
+            return st.builds(SimpleNamespace, **{field.name: values(field.type) for field in declared.fields})

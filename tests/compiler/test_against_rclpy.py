@@ -1,0 +1,76 @@
+"""The bytes that are published equal those of rclpy, for every type in use and for many that could be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from router.compiler import Checked
+from router.compiler.definitions import Definitions
+from router.compiler.reference import fill
+from router.engine.binding import MAPPING_FAILURES
+from router.types.model import MessageType
+from tests.compiler.comparing import assert_same_message, same
+from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer
+from tests.compiler.generated_types import mirror, values
+
+pytest.importorskip("rclpy")
+
+from tests.compiler.ros_objects import deserialized, serialized
+
+IN_USE = [
+    "comms/msg/ArmBoardActualPositions", "comms/msg/ArmBoardControlSignals", "comms/msg/ArmBoardDiagnostics",
+    "comms/msg/ArmBoardMovementFeedback", "comms/msg/ArmBoardObstructions", "comms/msg/ArmBoardTargetMovement",
+    "comms/msg/BasestationControlMode", "comms/msg/BasestationDetectedObject",
+    "comms/msg/BasestationManualArmMovement", "comms/msg/BasestationManualBrake", "comms/msg/BasestationManualDrive",
+    "comms/msg/BasestationObjectSelection", "comms/msg/BasestationRockMeasureRequest",
+    "comms/msg/BasestationRockMeasureResult", "comms/msg/BasestationRoverLocalization",
+    "comms/msg/DrivingBoardDiagnostics", "comms/msg/DrivingBoardMotorMessage",
+    "comms/msg/DrivingBoardMotorPeriodicProgress", "comms/msg/ImuSensorInformation",
+    "comms/msg/SensorBoardDiagnostics", "comms/msg/SensorBoardFlowSensorInfo", "comms/msg/SensorBoardGPSInfo",
+    "comms/msg/SensorBoardLoadCellInfo", "comms/msg/SensorBoardPHInfo", "comms/msg/SensorBoardPressureInfo",
+    "comms/msg/SensorBoardPumpInfo", "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/FluidPressure",
+    "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField", "sensor_msgs/msg/NavSatFix",
+    "sensor_msgs/msg/Temperature",
+]  # fmt: skip
+OTHERS = [
+    "geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/Wrench", "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image", "sensor_msgs/msg/JointState", "sensor_msgs/msg/Joy",
+    "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan", "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/Range", "sensor_msgs/msg/TimeReference", "std_msgs/msg/Bool", "std_msgs/msg/Byte",
+    "std_msgs/msg/ByteMultiArray", "std_msgs/msg/Char", "std_msgs/msg/ColorRGBA", "std_msgs/msg/Empty",
+    "std_msgs/msg/Float32MultiArray", "std_msgs/msg/Int64MultiArray", "std_msgs/msg/Int8", "std_msgs/msg/String",
+    "std_msgs/msg/UInt8MultiArray", "builtin_interfaces/msg/Duration", "rcl_interfaces/msg/ParameterValue",
+]  # fmt: skip
+
+
+def assert_equal_bytes(declared: MessageType, source: MessageType, message: Any) -> None:
+    """`source` is the declared type's mirror, so that `auto` maps all of it."""
+    value = outcome(lambda: fill(AUTO, declared, context_of(message, source)))
+    ours = outcome(lambda: serializer(AUTO, declared, scope_of(source))(message))
+    if value is MAPPING_FAILURES or ours is MAPPING_FAILURES:
+        assert value is ours
+        return
+    assert_same_message(ours, serialized(declared.name, value), declared, value)
+    assert same(deserialized(declared.name, ours), value)
+
+
+@pytest.mark.parametrize("name", [*IN_USE, *OTHERS])
+def test_type_is_written_as_rclpy_does(definitions: Definitions, name: str) -> None:
+    declared = definitions.interfaces.get(name)
+    assert declared is not None
+    source = mirror(declared)
+
+    @settings(max_examples=25, suppress_health_check=list(HealthCheck))
+    @given(values(source))
+    def equal(message: Any) -> None:
+        assert_equal_bytes(declared, source, message)
+
+    equal()
+
+
+def test_every_type_of_the_rover_is_among_them(rover: Checked) -> None:
+    assert {target.type.name for route in rover.routes for target in route.targets if target.type} == set(IN_USE)

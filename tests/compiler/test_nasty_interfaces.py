@@ -1,0 +1,85 @@
+"""Messages that hold everything that CDR makes hard, written by us and by rclpy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from router.compiler.reference import fill
+from router.compiler.reference_cdr import cdr
+from router.engine.binding import MAPPING_FAILURES
+from router.types.model import Field, Int, MessageType, String
+from router.types.ros import RosInterfaces
+from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+from tests.compiler.comparing import assert_same_message, same
+from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope_of, serializer
+from tests.compiler.generated_types import mirror, values
+from tests.compiler.interface_package import MESSAGES, NAME, InterfacePackage, built, is_buildable
+
+pytest.importorskip("rclpy")
+pytestmark = pytest.mark.skipif(not is_buildable(), reason="cmake and the ROS interface generators are needed")
+
+
+@pytest.fixture(scope="module")
+def package() -> Iterator[InterfacePackage]:
+    made = InterfacePackage(built())
+    yield made
+    made.close()
+
+
+def declared_type(package: InterfacePackage, name: str) -> MessageType:
+    found = RosInterfaces(MsgFiles([package.share]), RosbagsDefinitions()).get(f"{NAME}/msg/{name}")
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_message_is_written_as_rclpy_does(package: InterfacePackage, name: str) -> None:
+    declared = declared_type(package, name)
+    source = mirror(declared)
+
+    @settings(max_examples=60, suppress_health_check=list(HealthCheck))
+    @given(values(source))
+    def equal(message: Any) -> None:
+        value = outcome(lambda: fill(AUTO, declared, context_of(message, source)))
+        ours = outcome(lambda: serializer(AUTO, declared, scope_of(source))(message))
+        if value is MAPPING_FAILURES or ours is MAPPING_FAILURES:
+            assert ours is value
+            return
+        assert ours == cdr(declared, value)
+        theirs, read = package.ask(name, value, ours)
+        assert_same_message(ours, theirs, declared, value)
+        assert same(read, value)
+
+    equal()
+
+
+def test_unmapped_fields_have_the_defaults_of_rclpy(package: InterfacePackage) -> None:
+    declared = declared_type(package, "Defaults")
+    source = MessageType("Source", is_ros=False, fields=(Field("number", Int(8, signed=False)),))
+    ours = serializer(field_map(mapped="number"), declared, scope_of(source))(SimpleNamespace(number=9))
+    theirs, read = package.ask("Defaults", {"mapped": 9}, ours)
+    value = fill(field_map(mapped="number"), declared, context_of(SimpleNamespace(number=9), source))
+    assert_same_message(ours, theirs, declared, value)
+    assert read["text"] == "it is"
+    assert read["inside"]["number"] == 7
+
+
+@pytest.mark.parametrize("text", ["", "a", "é€", "a\0b", "\N{GRINNING FACE}", "x\N{GRINNING FACE}y"])
+def test_wide_text_arrives(package: InterfacePackage, text: str) -> None:
+    declared = declared_type(package, "WideText")
+    source = MessageType("Source", is_ros=False, fields=(Field("given", String()),))
+    ours = serializer(field_map(text="given"), declared, scope_of(source))(SimpleNamespace(given=text))
+    _, read = package.ask("WideText", {}, ours)
+    assert read["text"] == text
+
+
+def test_text_with_a_nul_is_refused_because_rclpy_would_cut_it() -> None:
+    target = MessageType("made/msg/Text", is_ros=True, fields=(Field("text", String()),))
+    source = MessageType("Source", is_ros=False, fields=(Field("text", String()),))
+    message = SimpleNamespace(text="a\0b")
+    assert outcome(lambda: serializer(AUTO, target, scope_of(source))(message)) is MAPPING_FAILURES
