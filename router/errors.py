@@ -183,7 +183,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     if not close:
         return None
     ratios = [difflib.SequenceMatcher(a=candidate, b=name.lower()).ratio() for candidate in close]
-    return folded[min(candidate for candidate, ratio in zip(close, ratios) if ratio == max(ratios))]
+    return folded[min(candidate for candidate, ratio in zip(close, ratios, strict=True) if ratio == max(ratios))]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -23,6 +23,8 @@ from router.errors import did_you_mean
 from router.table.model import ANY, ROS, RouteTable
 from router.types.sizes import framed_size
 
+_WIDEST_CELL = 48
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser("explain", help=VERBS["explain"])
@@ -95,7 +97,11 @@ def _target(served: CheckedTarget, table: RouteTable, *, outbound: bool) -> Iter
         yield f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"
         if target.plan is not None:
             size, exact = message_size(target.plan)
-            yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
+            yield (
+                f"    CDR: {size} bytes"
+                if exact
+                else f"    CDR: {size} bytes and the contents of strings and sequences"
+            )
     if target.max_rate is not None:
         yield f"    at most {target.max_rate:g} Hz"
     yield from _mapping(served.rows)
@@ -104,10 +110,13 @@ def _target(served: CheckedTarget, table: RouteTable, *, outbound: bool) -> Iter
 
 
 def _mapping(rows: Sequence[Row]) -> Iterator[str]:
-    cells = [(row.target, row.target_type, "<-", row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells)]
-    for cell in cells:
-        yield ("    " + "  ".join(text.ljust(width) for text, width in zip(cell, widths))).rstrip()
+    """One line a field; an expression that is long pushes only what stands behind it."""
+    cells = [(row.target, row.target_type, row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
+    widths = [min(max(map(len, column)), _WIDEST_CELL) for column in zip(*cells, strict=True)]
+    for target, type_, expression, kind, automatic in (
+        [text.ljust(width) for text, width in zip(cell, widths, strict=True)] for cell in cells
+    ):
+        yield f"    {target}  {type_}  <-  {expression}  {kind}  {automatic}".rstrip()
 
 
 def _unset(plan: Plan, prefix: str) -> Iterator[str]:

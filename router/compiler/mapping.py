@@ -21,7 +21,7 @@ from router.compiler.kinds import (
     kind_of,
 )
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
-from router.table.model import FieldEntry, FieldMap
+from router.table.model import Expression, FieldEntry, FieldMap
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
 NS = 1_000_000_000
@@ -201,7 +201,7 @@ class _Builder:
         except Finding as finding:
             self.findings.append(finding.diagnostic)
             return Unset(member.type, member.default, entry.value.span)
-        text = entry.value.text if entry.value.items is None else ast.unparse(typed.node)
+        text = _text(entry.value)
         self.rows.append(Row(path, str(member.type), text, str(typed.kind), automatic=False))
         return plan
 
@@ -287,3 +287,10 @@ def zero(declared: Type) -> object:
             return ""
         case _:
             return 0
+
+
+def _text(expression: Expression) -> str:
+    """As the table has it, on one line."""
+    if expression.items is not None:
+        return f"[{', '.join(map(_text, expression.items))}]"
+    return " ".join(expression.text.split())
