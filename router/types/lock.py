@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from router.errors import Code, Diagnostic, Severity, TableError
-from router.types.lock_file import Declaration, Entry, Lock, by_number, current_lock, read_lock
+from router.types.descriptors import declared_type
+from router.types.lock_file import Declaration, Entry, Lock, by_number, read_lock
 from router.types.proto_source import Part
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -30,7 +31,7 @@ def check_lock(schema: ProtoSchema, envelope: Envelope) -> list[Diagnostic]:
     if lock is None:
         message = "no lock file records the field numbers"
         return [Diagnostic(span, Code.NOT_LOCKED, message, "write it with `router schema lock`")]
-    current = current_lock(schema, envelope)
+    current = _current_lock(schema, envelope)
     findings = [*_compared(schema, lock.messages, current.messages), *_compared(schema, lock.enums, current.enums)]
     if (lock.message, lock.oneof) != (current.message, current.oneof):
         message = f"the lock is for the envelope {lock.message}.{lock.oneof}, not {current.message}.{current.oneof}"
@@ -46,7 +47,7 @@ def extended_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
 
     Raises TableError when the lock file is broken. For a schema without conflicts, see `check_lock`.
     """
-    current = current_lock(schema, envelope)
+    current = _current_lock(schema, envelope)
     lock = read_lock(schema.root)
     if lock is None:
         return current
@@ -55,6 +56,21 @@ def extended_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
         messages=_extended(lock.messages, current.messages),
         enums=_extended(lock.enums, current.enums),
     )
+
+
+def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
+    """What the lock would be for the `.proto` files as they are."""
+    messages = {}
+    for name in schema.messages:
+        if (file := schema.sources.file(name)) in schema.files:
+            fields = schema.descriptor(name).fields
+            entries = frozenset(Entry(field.number, field.name, declared_type(field)) for field in fields)
+            messages[name] = Declaration(file, entries)
+    enums = {}
+    for name, declared in schema.enums.items():
+        if (file := schema.sources.file(name)) in schema.files:
+            enums[name] = Declaration(file, frozenset(Entry(number, value) for value, number in declared.values))
+    return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
 
 
 def locked_size(schema: ProtoSchema) -> int | None:

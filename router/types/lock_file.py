@@ -1,6 +1,6 @@
 """The lock file: every field number that was ever given out, and what it was given to.
 
-Reads, writes and builds it; what may follow from a difference is `lock`'s business.
+Reads and writes it; knows no `.proto` file. What follows from a difference is `lock`'s business.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
-from router.types.descriptors import declared_type
-from router.types.protobuf import Envelope, ProtoSchema
 
 LOCK_NAME = "envelope.lock.json"
 
@@ -44,21 +42,6 @@ class Lock:
     max_size: int
     messages: Mapping[str, Declaration]
     enums: Mapping[str, Declaration]
-
-
-def current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
-    """What the lock would be for the `.proto` files as they are."""
-    messages = {}
-    for name in schema.messages:
-        if (file := schema.sources.file(name)) in schema.files:
-            fields = schema.descriptor(name).fields
-            entries = frozenset(Entry(field.number, field.name, declared_type(field)) for field in fields)
-            messages[name] = Declaration(file, entries)
-    enums = {}
-    for name, declared in schema.enums.items():
-        if (file := schema.sources.file(name)) in schema.files:
-            enums[name] = Declaration(file, frozenset(Entry(number, value) for value, number in declared.values))
-    return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
 
 
 def read_lock(root: Path) -> Lock | None:

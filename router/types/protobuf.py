@@ -19,6 +19,7 @@ from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
 from router.table.model import EnvelopeSettings
 from router.types.board_options import NO_OPTIONS, BoardOptions, OptionsFile, read_options
 from router.types.descriptors import container, message_of
+from router.types.lock_file import read_lock
 from router.types.model import Enum, MessageType
 from router.types.proto_folder import OPTIONS, PROTO, read_folder, sha256_of
 from router.types.proto_model import build_types
@@ -119,11 +120,13 @@ def load_protos(root: Path, blame: SourceSpan | None = None) -> ProtoSchema:
     Raises TableError with every finding. What is wrong with the folder itself is blamed on `blame`, the
     place that names it, else on the folder.
     """
+    root = root.resolve()
     files = read_folder(root, blame or SourceSpan(shown_path(root)))
-    compiled = compile_protos(root, [name for name in files if name.endswith(PROTO)])
+    homes = _homes(root)
+    compiled = compile_protos(root, [name for name in files if name.endswith(PROTO)], homes)
     paths = {file.name: (root if file.name in files else WELL_KNOWN) / file.name for file in compiled.file}
     sources = ProtoSources(compiled.file, paths)
-    findings = _same_name_findings([file for file in compiled.file if file.name in files], sources)
+    findings = _same_name_findings([file for file in compiled.file if file.name in files], sources, homes)
     options = {}
     for name in files:
         if name.endswith(OPTIONS):
@@ -134,20 +137,31 @@ def load_protos(root: Path, blame: SourceSpan | None = None) -> ProtoSchema:
     return ProtoSchema(root, files, compiled, sources, options)
 
 
-def _same_name_findings(files: Sequence[FileDescriptorProto], sources: ProtoSources) -> list[Diagnostic]:
+def _homes(root: Path) -> Mapping[str, str]:
+    """The files that the lock knows messages to belong to; what is wrong with the lock is `lock`'s finding."""
+    try:
+        lock = read_lock(root)
+    except TableError:
+        return {}
+    return {name: message.file for name, message in lock.messages.items()} if lock is not None else {}
+
+
+def _same_name_findings(
+    files: Sequence[FileDescriptorProto], sources: ProtoSources, homes: Mapping[str, str]
+) -> list[Diagnostic]:
     """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
-    findings = []
-    first: dict[str, str] = {}
+    names: dict[str, list[str]] = {}
     for file in files:
         for message in file.message_type:
-            name = f"{file.package}.{message.name}" if file.package else message.name
-            if message.name not in first:
-                first[message.name] = name
-                continue
-            other = sources.span(first[message.name])
-            hint = f"the other is at {other.file}:{other.line}; names must differ even in different packages"
-            text = f"there are two messages '{message.name}'"
-            findings.append(Diagnostic(sources.span(name), Code.DUPLICATE_MESSAGE, text, hint))
+            full = f"{file.package}.{message.name}" if file.package else message.name
+            names.setdefault(message.name, []).append(full)
+    findings = []
+    for short, same in names.items():
+        first, *others = sorted(same, key=lambda name: name not in homes)
+        place = sources.span(first)
+        hint = f"the other is at {place.file}:{place.line}; names must differ even in different packages"
+        text = f"there are two messages '{short}'"
+        findings += [Diagnostic(sources.span(name), Code.DUPLICATE_MESSAGE, text, hint) for name in others]
     return findings
 
 

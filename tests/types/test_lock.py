@@ -222,6 +222,18 @@ def test_lock_of_another_envelope_says_so(write: Write, envelope: Find) -> None:
     assert (finding.code, "OldEnvelope.payload" in finding.message) == (Code.NOT_LOCKED, True)
 
 
+@pytest.mark.parametrize("package", ["", "package first;\n"])
+def test_second_message_of_a_locked_name_is_blamed_although_it_comes_first(
+    write: Write, envelope: Find, package: str
+) -> None:
+    lock(write({"motor.proto": PROTO}), envelope)
+    with pytest.raises(TableError) as caught:
+        load_protos(write({"a.proto": f'syntax = "proto3";\n{package}\nmessage Motor {{\n  bool on = 1;\n}}\n'}))
+    (finding,) = caught.value.diagnostics
+    assert (finding.code, finding.span) == (Code.DUPLICATE_MESSAGE, SourceSpan("a.proto", 3 + bool(package), 9, 14))
+    assert "motor.proto" in f"{finding.message} {finding.hint}"
+
+
 def test_missing_lock_is_one_warning(write: Write, envelope: Find) -> None:
     schema = load_protos(write({"motor.proto": PROTO}))
     (finding,) = check_lock(schema, envelope(schema))

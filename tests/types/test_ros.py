@@ -78,6 +78,8 @@ def test_constants_are_those_of_the_installed_class(installed: RosInterfaces, na
 
 def test_rosbags_says_the_same_as_the_installed_packages(installed: RosInterfaces, carried: RosInterfaces) -> None:
     both = [name for name in INSTALLED if carried.get(name) is not None]
+    if not both:
+        pytest.skip("no ROS on this machine")
     for name in both:
         ours, theirs = installed.get(name), carried.get(name)
         assert ours is not None

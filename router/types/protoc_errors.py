@@ -1,0 +1,108 @@
+"""What protoc complains about, as findings.
+
+Knows protoc's sentences; how protoc is run is `protoc`'s business.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, shown_path
+from router.types.proto_text import ProtoText
+
+EVERYTHING = "router_every_proto_of_the_folder.proto"
+"""The file that imports all others; its own errors only repeat theirs."""
+
+_IMPORT_FAILED = re.compile(r'Import "(?P<name>.*)" was not found or had errors\.')
+_NUMBER_TAKEN = re.compile(
+    r"Field number \d+ has already been used|uses reserved number|Field name \S+ is reserved"
+    r"|uses the same enum value as"
+)
+_RESERVED = re.compile(r'Field "(?P<field>\w+)" uses reserved number (?P<number>\d+)')
+_TYPE_TAKEN = re.compile(r'^"(?P<name>[\w.]+)" is already defined(?: in file "(?P<other>[^"]+)")?')
+_NOT_IMPORTED = re.compile(r'^"(?P<name>[\w.]+)" seems to be defined in')
+_MEMBER_TAKEN = re.compile(r'^"\w+" is already defined in "(?P<holder>[\w.]+)"')
+
+
+@dataclass(frozen=True, slots=True)
+class Complaint:
+    """One error of protoc: file name relative to the root; line and column from 0, -1 for neither."""
+
+    file: str
+    line: int
+    column: int
+    message: str
+
+
+def findings_of(
+    complaints: Sequence[Complaint], root: Path, names: Sequence[str], homes: Mapping[str, str]
+) -> list[Diagnostic]:
+    """One finding for each fault; what only follows from another one is left out.
+
+    `names` are the files below `root` that were compiled, `homes` the files that messages are known to belong to.
+    """
+    places: dict[tuple[str, int, int], list[Complaint]] = {}
+    for complaint in _without_consequences(complaints, names):
+        places.setdefault((complaint.file, complaint.line, complaint.column), []).append(complaint)
+    texts = {file: ProtoText(root / file) for file in {complaint.file for complaint in complaints}}
+    findings = []
+    for first, *more in places.values():
+        finding = _newcomer(first, root, homes) or _finding(first, names, texts[first.file])
+        # What else protoc says about the same place is advice, or the same again.
+        advice = [other.message.rstrip(".") for other in more if other.message != first.message]
+        findings.append(replace(finding, hint=finding.hint or next(iter(advice), "")))
+    return findings
+
+
+def _without_consequences(complaints: Sequence[Complaint], names: Sequence[str]) -> Iterator[Complaint]:
+    lacking = {complaint.file for complaint in complaints if _IMPORT_FAILED.fullmatch(complaint.message)}
+    twice = {found["name"] for complaint in complaints if (found := _TYPE_TAKEN.match(complaint.message))}
+    for complaint in complaints:
+        if complaint.file == EVERYTHING:
+            continue
+        if (member := _MEMBER_TAKEN.match(complaint.message)) and member["holder"] in twice:
+            continue  # its message is a finding, and so would be all its fields
+        if (used := _NOT_IMPORTED.match(complaint.message)) and used["name"] in twice:
+            continue  # it means the other message of that name
+        if complaint.file in lacking and complaint.message.endswith(" is not defined."):
+            continue  # it would be, by the import
+        if (imported := _IMPORT_FAILED.fullmatch(complaint.message)) and imported["name"] in names:
+            continue  # that file's own errors are findings already
+        if complaint.line < 0 and complaint.file not in names:
+            continue  # an imported file that does not exist; the import is a finding
+        yield complaint
+
+
+def _finding(complaint: Complaint, names: Sequence[str], text: ProtoText) -> Diagnostic:
+    if complaint.line < 0:
+        return Diagnostic(SourceSpan(shown_path(text.path)), Code.BAD_PROTO, complaint.message.rstrip("."))
+    span = text.word(complaint.line, complaint.column)
+    if reserved := _RESERVED.match(complaint.message):  # protoc blames the `reserved`, not who breaks it
+        span = text.nearest(rf"\b{reserved['field']}\s*=\s*{reserved['number']}\b", complaint.line) or span
+    if missing := _IMPORT_FAILED.fullmatch(complaint.message):
+        hint = did_you_mean(missing["name"], names)
+        return Diagnostic(span, Code.BAD_PROTO, f"there is no file '{missing['name']}' to import", hint)
+    what, _, advice = complaint.message.partition(". ")
+    return Diagnostic(span, _code(complaint, text), what.rstrip("."), advice.rstrip("."))
+
+
+def _newcomer(complaint: Complaint, root: Path, homes: Mapping[str, str]) -> Diagnostic | None:
+    """protoc blames the file that comes last in the alphabet; where that one had the message first, blame the other."""
+    taken = _TYPE_TAKEN.match(complaint.message)
+    if taken is None or taken["other"] is None or homes.get(taken["name"]) != complaint.file:
+        return None
+    short = taken["name"].rpartition(".")[2]
+    span = ProtoText(root / taken["other"]).nearest(rf"(?<=\bmessage ){short}\b", 0)
+    message = f'"{taken["name"]}" is already defined in file "{complaint.file}"'
+    return Diagnostic(span, Code.DUPLICATE_MESSAGE, message) if span is not None else None
+
+
+def _code(complaint: Complaint, text: ProtoText) -> Code:
+    if _NUMBER_TAKEN.search(complaint.message):
+        return Code.WIRE_NUMBER_CONFLICT
+    if _TYPE_TAKEN.search(complaint.message) and text.before(complaint.line, complaint.column).endswith("message"):
+        return Code.DUPLICATE_MESSAGE
+    return Code.BAD_PROTO
