@@ -10,9 +10,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import RosPeer
-from tests.acceptance.rover_map import TOPICS
-from tests.acceptance.site import RouterProcess, Site, site
+from tests.acceptance.rover_map import FLOWS, TOPICS
+from tests.acceptance.site import RouterProcess, Site, site, total, wait_until
 
 
 @dataclass(frozen=True)
@@ -39,3 +40,22 @@ def peer(rover: Rover) -> Iterator[RosPeer]:
     """Subscribes to all topics of the rover. What has not been sent yet will reach it."""
     with RosPeer(TOPICS) as subscribed:
         yield subscribed
+
+
+@pytest.fixture(scope="module")
+def watched(rover: Rover, peer: RosPeer) -> Rover:
+    """The router has learned of the peer's subscriptions, and what it took to find out has been received."""
+    at_start = rover.site.scrape()
+
+    def all_published() -> bool:
+        for case, flow in FLOWS.items():
+            rover.site.send(flow.source, next(generated(case)).datagram)
+        now = rover.site.changes(at_start)
+        return all(total(now, "messages_published", topic=topic) for topic in TOPICS)
+
+    wait_until(all_published, "the last match")
+    sent = total(rover.site.scrape(), "datagrams_received")
+    for _ in range(total(rover.site.settle(at_start, sent), "messages_published")):
+        peer.receive()
+    rover.site.waiting()
+    return rover

@@ -146,14 +146,17 @@ class Site:
     def settle(self, before: Counter[str], datagrams: int) -> Counter[str]:
         """Waits until the router is done with so many datagrams since `before`; what was counted meanwhile."""
 
+        now = Counter[str]()
+
         def done() -> bool:
+            nonlocal now
             now = self.changes(before)
             received, lost = total(now, "datagrams_received"), total(now, "kernel_drops")
             finished = total(now, "datagrams_rejected") + total(now, SERVED)
             return received + lost >= datagrams and finished == received
 
         wait_until(done, "the last datagram")
-        return Counter({name: count for name, count in self.changes(before).items() if not name.startswith(SERVED)})
+        return Counter({name: count for name, count in now.items() if not name.startswith(SERVED)})
 
 
 def total(counts: Mapping[str, int], metric: str, **labels: str) -> int:

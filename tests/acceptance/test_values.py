@@ -13,31 +13,12 @@ from tests.acceptance.conftest import Rover
 from tests.acceptance.expected import expected_messages
 from tests.acceptance.payloads import Sample, generated, golden
 from tests.acceptance.ros_peer import RosPeer
-from tests.acceptance.rover_map import FLOWS, TOPICS, topics_of
-from tests.acceptance.site import Site, balance, key, total, wait_until
+from tests.acceptance.rover_map import FLOWS, topics_of
+from tests.acceptance.site import Site, balance, key, total
 from tests.wire.test_golden_envelopes import GOLDEN, native, values_of
 
 CLOCK_STEP = 1e-6
 """Seconds by which a stamp in whole nanoseconds and a Python time may differ in rounding."""
-
-
-@pytest.fixture(scope="module")
-def watched(rover: Rover, peer: RosPeer) -> Rover:
-    """The router has learned of every subscription, and what it took to find out has been received."""
-    at_start = rover.site.scrape()
-
-    def all_published() -> bool:
-        for case, flow in FLOWS.items():
-            rover.site.send(flow.source, next(generated(case)).datagram)
-        now = rover.site.changes(at_start)
-        return all(total(now, "messages_published", topic=topic) for topic in TOPICS)
-
-    wait_until(all_published, "the last match")
-    sent = total(rover.site.scrape(), "datagrams_received")
-    for _ in range(total(rover.site.settle(at_start, sent), "messages_published")):
-        peer.receive()
-    rover.site.waiting()
-    return rover
 
 
 def test_every_series_exists_at_zero_before_the_first_datagram(rover: Rover) -> None:
