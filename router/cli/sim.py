@@ -25,7 +25,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "sim",
         help="play all boards and the basestation",
-        description="Send plausible, moving values from every endpoint of a table and show what comes back to it.",
+        description="Send plausible, moving values from every endpoint of a table and show what comes back to it. "
+        "The endpoints' addresses must be this machine's, as they are in routes/sim.yaml.",
     )
     default = Path("routes/sim.yaml")
     parser.add_argument("table", nargs="?", type=Path, default=default, metavar="TABLE", help=f"default: {default}")
