@@ -20,7 +20,8 @@ from google.protobuf.message import Message
 from router.errors import DecodeError, did_you_mean
 from router.table.model import ANY, Address, Endpoint, RouteTable
 from router.tools import UsageError
-from router.tools.models import PayloadModel, moment, usual_rate
+from router.tools.models import moment, usual_rate
+from router.tools.payload_model import PayloadModel
 from router.tools.places import LOOPBACK, open_udp, reachable
 from router.tools.wire import Wire
 from router.types.protobuf import PayloadCase
