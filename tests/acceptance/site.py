@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import urllib.request
@@ -35,6 +36,9 @@ endpoints:
 {endpoints}"""
 """The rover's table with loopback addresses, to be filled in by `Site.table`."""
 
+
+SO_MEMINFO = 55
+"""Of Linux; word 8 of what it tells are the datagrams dropped."""
 
 SERVED = "route_seconds_count"
 """Counts the messages whose targets have all been served."""
@@ -200,6 +204,19 @@ def _drained(opened: socket.socket) -> Iterator[bytes]:
             yield opened.recv(65536)
     except BlockingIOError:
         opened.settimeout(PATIENCE)
+
+
+def arrived(opened: socket.socket, before: int = 0) -> int:
+    """How many datagrams came to a socket and were not received yet, those included that its buffer had no room for.
+
+    `before` is how many had found no room earlier (`no_room`).
+    """
+    return len(list(_drained(opened))) + no_room(opened) - before
+
+
+def no_room(opened: socket.socket) -> int:
+    words = struct.unpack("9I", opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36))
+    return int(words[8])
 
 
 def udp(host: str, port: int = 0) -> socket.socket:

@@ -1,4 +1,4 @@
-"""What must not pass: one counter each, nothing forwarded, and the router goes on; and what must, though it looks odd."""
+"""What must not pass, and what must though it looks odd: one counter each, and the router goes on."""
 
 from __future__ import annotations
 

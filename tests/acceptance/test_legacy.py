@@ -1,0 +1,102 @@
+"""`routes/legacy.yaml` does what the C++ node did: everything to both addresses, four topics, its parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.acceptance.expected import in_board_units
+from tests.acceptance.payloads import WIRE, generated, sample
+from tests.acceptance.ros_peer import RosPeer
+from tests.acceptance.site import ROOT, RouterProcess, Site, site, wait_until
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+LEGACY = ROOT / "routes" / "legacy.yaml"
+DESTINATIONS = ("dst_a", "dst_b")
+TOPICS = {
+    "imu_data": "comms/msg/ImuSensorInformation",
+    "gps_data": "comms/msg/SensorBoardGPSInfo",
+    "ph_data": "comms/msg/SensorBoardPHInfo",
+    "sensor_board_diagnostics": "comms/msg/SensorBoardDiagnostics",
+}
+CASES = {
+    "imu_info": "imu_data",
+    "gps_info": "gps_data",
+    "ph_info": "ph_data",
+    "sensor_diag": "sensor_board_diagnostics",
+}
+
+HOSTS = {"anybody": "127.0.0.77", "dst_a": "127.0.0.88", "dst_b": "127.0.0.88"}
+"""The old node had one parameter for the address of both destinations."""
+
+
+def parameters(place: Site) -> dict[str, str]:
+    host, port_a = place.endpoints["dst_a"].getsockname()
+    port_b = place.endpoints["dst_b"].getsockname()[1]
+    return {"listen_port": str(place.listen), "dst_ip": host, "dst_a_port": str(port_a), "dst_b_port": str(port_b)}
+
+
+def assert_both_get(place: Site, datagram: bytes) -> None:
+    place.send("anybody", datagram)
+    assert [place.receive(name) for name in DESTINATIONS] == [datagram, datagram]
+
+
+def test_every_case_goes_to_both_addresses_and_four_to_topics(tmp_path: Path) -> None:
+    with site(tmp_path, HOSTS) as place:
+        assignments = [f"{name}:={value}" for name, value in parameters(place).items()]
+        arguments = [word for assignment in assignments for word in ("-p", assignment)]
+        with RouterProcess(tmp_path, LEGACY, "--ros-args", *arguments) as router, RosPeer(TOPICS) as peer:
+            subscribed(place, peer)
+            for case in WIRE.envelope.cases:
+                for sent in generated(case):
+                    assert_both_get(place, sent.datagram)
+                    if case in CASES:
+                        assert peer.receive() == (CASES[case], in_board_units(sent.payload))
+            assert router.events("message dropped") == router.events("datagram rejected") == []
+            assert peer.nothing_left()
+            assert place.waiting() == {}
+
+
+def subscribed(place: Site, peer: RosPeer) -> None:
+    """This table has no metrics to ask: sends until the peer gets messages of all topics."""
+    seen: set[str] = set()
+
+    def all_seen() -> bool:
+        for case in CASES:
+            assert_both_get(place, next(generated(case)).datagram)
+        while not peer.nothing_left():
+            seen.add(peer.receive()[0])
+        return seen == set(TOPICS)
+
+    wait_until(all_seen, "a message on each topic")
+    # More may be on their way. On each topic they come before what is sent from here on: an empty payload.
+    empty = {case: WIRE.envelope.cases[case].message_class() for case in CASES}
+    for case, payload in empty.items():
+        assert_both_get(place, sample(case, payload).datagram)
+    last = {CASES[case]: in_board_units(payload) for case, payload in empty.items()}
+    while last:
+        topic, message = peer.receive()
+        if last[topic] == message:
+            del last[topic]
+
+
+def test_parameters_come_from_the_environment_too(tmp_path: Path) -> None:
+    with site(tmp_path, HOSTS) as place:
+        variables = {name.upper(): value for name, value in parameters(place).items()}
+        with RouterProcess(tmp_path, LEGACY, **variables):
+            for case in WIRE.envelope.cases:
+                assert_both_get(place, next(generated(case)).datagram)
+            assert place.waiting() == {}
+
+
+def test_what_the_old_node_could_not_read_goes_nowhere(tmp_path: Path) -> None:
+    """The one intended difference: garbage is not passed on."""
+    with site(tmp_path, HOSTS) as place:
+        variables = {name.upper(): value for name, value in parameters(place).items()}
+        with RouterProcess(tmp_path, LEGACY, **variables) as router:
+            place.send("anybody", b"\xff" * 20)
+            wait_until(lambda: bool(router.events("datagram rejected")), "the rejection")
+            assert_both_get(place, next(generated("ph_info")).datagram)
+            assert place.waiting() == {}

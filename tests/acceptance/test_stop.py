@@ -1,0 +1,85 @@
+"""Stopping under load: at once, in good order, and without losing anything that was received."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+from tests.acceptance.payloads import generated
+from tests.acceptance.site import RouterProcess, Site, arrived, site, wait_until
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+RATE = 2000
+"""Datagrams per second."""
+
+BATCH = 20
+GENEROUS = 3.0
+"""Seconds; a second is what is promised, on a machine that does nothing else."""
+
+PH = next(generated("ph_info")).datagram
+
+
+@contextmanager
+def stream(place: Site) -> Iterator[Callable[[], int]]:
+    """The sensor board sends all the time; the function says how many datagrams it has sent."""
+    sent, ended = 0, threading.Event()
+
+    def send() -> None:
+        nonlocal sent
+        begin = monotonic()
+        while not ended.is_set():
+            place.send("sensor_board", *[PH] * BATCH)
+            sent += BATCH
+            sleep(max(0.0, begin + sent / RATE - monotonic()))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        yield lambda: sent
+    finally:
+        ended.set()
+        sender.join()
+
+
+def assert_in_order(router: RouterProcess, code: int) -> dict[str, int]:
+    """Exit code 0, nothing alarming, and the last line of the log, which sums up."""
+    assert code == 0
+    assert "Traceback" not in router.text()
+    assert [line["event"] for line in router.log()[-2:]] == ["router stopping", "router stopped"]
+    assert not [line for line in router.log() if line["level"] in ("error", "critical")]
+    totals: dict[str, int] = router.log()[-1]
+    return totals
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_it_at_once_under_load(tmp_path: Path, number: signal.Signals) -> None:
+    with site(tmp_path) as place, RouterProcess(tmp_path, place.table()) as router:
+        with stream(place) as sent:
+            wait_until(lambda: sent() >= RATE / 2, "half a second of traffic")
+            before, begin = sent(), monotonic()
+            code = router.stop(number)
+            took = monotonic() - begin
+        print(f"stopped after {took:.3f} s")  # pytest -rP shows it
+        assert took < GENEROUS
+        totals = assert_in_order(router, code)
+        assert before <= totals["datagrams_received"] + totals["kernel_drops"] <= sent() + BATCH
+        assert totals["datagrams_rejected"] == totals["messages_dropped"] == 0
+        assert totals["datagrams_received"] == totals["datagrams_sent"] == arrived(place.endpoints["basestation"])
+
+
+def test_what_has_arrived_when_the_signal_comes_is_still_routed(tmp_path: Path) -> None:
+    with site(tmp_path) as place, RouterProcess(tmp_path, place.table()) as router:
+        router.process.send_signal(signal.SIGSTOP)
+        place.send("sensor_board", *[PH] * 200)
+        router.process.send_signal(signal.SIGTERM)
+        router.process.send_signal(signal.SIGCONT)
+        totals = assert_in_order(router, router.wait())
+        assert totals["datagrams_received"] + totals["kernel_drops"] == 200
+        assert totals["datagrams_received"] == totals["datagrams_sent"] == arrived(place.endpoints["basestation"])
