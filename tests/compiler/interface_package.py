@@ -148,9 +148,7 @@ def _environment(*installs: Path) -> dict[str, str]:
         "LD_LIBRARY_PATH": libraries,
         "PYTHONPATH": [install / site_packages for install in installs],
     }
-    present = {name: os.environ[name] for name in ("LD_LIBRARY_PATH", "PYTHONPATH") if name in os.environ}
-    joined = {name: os.pathsep.join(map(str, paths)) for name, paths in added.items()}
-    return {
-        **os.environ,
-        **{name: os.pathsep.join(filter(None, [text, present.get(name, "")])) for name, text in joined.items()},
+    return os.environ | {
+        name: os.pathsep.join([*map(str, paths), os.environ.get(name, "")]).rstrip(os.pathsep)
+        for name, paths in added.items()
     }

@@ -1,0 +1,253 @@
+"""Well-typed expressions: the compiled path and the reference agree, and inferred ranges hold."""
+
+from __future__ import annotations
+
+import math
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, assume, event, given, settings
+from hypothesis import strategies as st
+
+from router.compiler.expressions import Finding
+from router.compiler.kinds import BoolKind, FloatKind, IntKind, Kind, StringKind
+from router.compiler.mapping import build
+from router.compiler.reference_expressions import evaluate
+from router.engine.binding import MAPPING_FAILURES
+from router.errors import Code
+from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
+from tests.compiler.comparing import same
+from tests.compiler.compiling import (
+    SPAN,
+    compiled,
+    context_of,
+    field_map,
+    outcome,
+    reference_bytes,
+    scope_of,
+    serializer,
+    written,
+)
+from tests.compiler.generated_types import values
+
+MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300), ("LESS", -7)))
+INNER = MessageType("Inner", False, (Field("value", Int(16, True)), Field("ratio", Float(64))))
+OUTER = MessageType("Outer", False, (Field("inner", INNER, has_presence=True), Field("b_c", Int(8, True))))
+SOURCE = MessageType(
+    "Source",
+    is_ros=False,
+    fields=(
+        Field("i8", Int(8, True)), Field("u8", Int(8, False)), Field("i32", Int(32, True)),
+        Field("u64", Int(64, False)),
+        Field("f32", Float(32)), Field("f64", Float(64)), Field("flag", Bool()), Field("name", String()),
+        Field("mode", MODE), Field("numbers", List(Int(32, True))), Field("outer", OUTER, has_presence=True),
+        Field("a", MessageType("A", False, (Field("b_c", INNER),))),
+        Field("a_b", MessageType("AB", False, (Field("c", INNER),))),
+    ),
+)  # fmt: skip
+TARGETS: list[Type] = [
+    Bool(), Int(8, False), Int(8, True), Int(32, True), Int(64, True), Float(32), Float(64), String(), String(5),
+]  # fmt: skip
+
+
+class Present(SimpleNamespace):
+    """A protobuf message as far as expressions look."""
+
+    def HasField(self, name: str) -> bool:  # noqa: N802 - protobuf's name
+        return getattr(self, name) is not None
+
+
+def present(declared: Type) -> st.SearchStrategy[Any]:
+    if not isinstance(declared, MessageType):
+        return values(declared)
+    return st.builds(Present, **{field.name: present(field.type) for field in declared.fields})
+
+
+# texts by kind
+
+_SMALL = st.integers(-10, 300).map(lambda number: f"({number})" if number < 0 else str(number))
+
+
+def _calls(*templates: str) -> Any:
+    """Templates with {i}, {f}, {b} and {s} for an inner integer, float, bool and string expression."""
+    return templates
+
+
+_INTS = _calls(
+    "({i} + {i})", "({i} - {i})", "({i} * {i})", "({i} // {i})", "({i} % {i})", "(-{i})", "(+{i})", "({i} ** 2)",
+    "({i} ** 3)", "abs({i})", "min({i}, {i})", "max({i}, {i}, {i})", "clamp({i}, {i}, {i})", "clamp({i}, -100, 100)",
+    "wrap({i}, -180, 179)", "wrap({i}, 0, 255)", "round({f})", "trunc({f})", "floor({f})", "ceil({f})", "int({b})",
+    "({i} if {b} else {i})", "int(mode)", "len({s})", "len(numbers)", "numbers[1]", "round({i})", "[{i}, {i}][1]",
+    "wrap({i}, {i}, {i})",
+)  # fmt: skip
+_FLOATS = _calls(
+    "({f} + {i})", "({f} - {f})", "({f} * {f})", "({i} / {i})", "({f} / {f})", "({f} // {i})", "({f} % {f})", "(-{f})",
+    "abs({f})", "min({f}, {i})", "max({f}, {f})", "clamp({f}, -1.5, 1.5)", "clamp({f}, {f}, {f})", "radians({f})",
+    "degrees({i})", "sqrt({f})", "sin({f})", "cos({f})", "tan({f})", "atan2({f}, {f})", "hypot({f}, {i})",
+    "float32({f})", "float64({i})", "({f} if {b} else {i})", "({f} ** 2)", "seconds(received_at)",
+)  # fmt: skip
+_BOOLS = _calls(
+    "({i} < {i})", "({f} <= {i} < {f})", "({i} == {f})", "({s} == {s})", "({s} < {s})", "(not {b})", "({b} and {b})",
+    "({b} or {b} or {b})", "({i} in [{i}, {i}, {i}])", "({i} not in numbers)", "(mode == Mode.ON)",
+    "(mode in [Mode.OFF, Mode.LOUD])", "({b} if {b} else {b})", "({b} == {b})", "has(outer)", "has(outer.inner)",
+    "({i} != {i} > {i})", "(source == {s})", "(received_at == received_at)",
+)  # fmt: skip
+_STRINGS = _calls("({s} + {s})", "str({i})", "str({f})", "str({b})", "str(mode)", "({s} if {b} else {s})", "str({s})")
+_LEAVES: dict[str, st.SearchStrategy[str]] = {
+    "i": _SMALL | st.sampled_from(["i8", "u8", "i32", "u64", "mode", "Mode.LESS", "outer.b_c", "message.u8",
+                                   "outer.inner.value", "a.b_c.value", "a_b.c.value"]),
+    "f": st.sampled_from(["f32", "f64", "0.5", "1e6", "outer.inner.ratio", "2.0", "(-0.0)", "a.b_c.ratio"]),
+    "b": st.sampled_from(["flag", "True", "false"]),
+    "s": st.sampled_from(["name", "source", "'ab'", "'é'", "''"]),
+}  # fmt: skip
+_TEMPLATES = {"i": _INTS, "f": _FLOATS, "b": _BOOLS, "s": _STRINGS}
+
+
+@st.composite
+def texts(draw: st.DrawFn, letter: str, depth: int) -> str:
+    if depth == 0 or draw(st.integers(0, 3)) == 0:
+        return draw(_LEAVES[letter])
+    made: str = draw(st.sampled_from(_TEMPLATES[letter]))
+    while "{" in made:
+        start = made.index("{")
+        made = made[:start] + draw(texts(made[start + 1], depth - 1)) + made[start + 3 :]
+    return made
+
+
+expressions = st.sampled_from("ifbs").flatmap(lambda letter: texts(letter, 3))
+REFUSED = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS}
+"""Findings that depend on what literals come to: a division by zero, bounds the wrong way round."""
+
+MANY = settings(max_examples=300, suppress_health_check=list(HealthCheck))
+
+
+@MANY
+@given(expressions, present(SOURCE))
+def test_compiled_and_reference_agree(text: str, message: Any) -> None:
+    try:
+        typed, run = compiled(text, scope_of(SOURCE, [MODE]))
+    except Finding as finding:
+        if finding.diagnostic.code not in REFUSED:
+            raise
+        event("refused")
+        return
+    value = outcome(lambda: run(message))
+    by_reference = outcome(lambda: evaluate(written(text), context_of(message, SOURCE, [MODE])))
+    assert same(value, by_reference), (text, value, by_reference)
+    event("failed" if value is MAPPING_FAILURES else "has a value")
+    if value is not MAPPING_FAILURES:
+        assert_of_kind(value, typed.kind)
+
+
+def assert_of_kind(value: object, kind: Kind) -> None:
+    match kind:
+        case IntKind(low, high):
+            assert isinstance(value, int)
+            assert low is None or low <= value
+            assert high is None or value <= high
+        case FloatKind():
+            assert isinstance(value, (int, float))
+        case BoolKind():
+            assert isinstance(value, bool)
+        case StringKind():
+            assert isinstance(value, str)
+
+
+@st.composite
+def filled_fields(draw: st.DrawFn) -> tuple[Type, str]:
+    """A field's type and an expression of a kind that may fill it."""
+    target = draw(st.sampled_from(TARGETS))
+    match target:
+        case Int():
+            around = draw(
+                st.sampled_from(["clamp({i})", "wrap({i})", "{i}", "round({f})", "mode", "clamp(round({f}))"])
+            )
+        case Float():
+            around = draw(
+                st.sampled_from([f"float{target.bits}({{f}})", f"float{target.bits}({{i}})", "{f}", "clamp({i}, 0, 9)"])
+            )
+        case Bool():
+            around = "{b}"
+        case _:
+            around = "{s}"
+    inner = draw(texts(around[around.index("{") + 1], 2)) if "{" in around else ""
+    return target, re.sub("{.}", lambda _: inner, around)
+
+
+@MANY
+@given(filled_fields(), present(SOURCE))
+def test_field_is_filled_alike(filled: tuple[Type, str], message: Any) -> None:
+    target, text = filled
+    declared = MessageType("made/msg/One", True, (Field("before", Bool(), default=True), Field("it", target)))
+    fields = field_map(it=text)
+    scope = scope_of(SOURCE, [MODE])
+    assume(not build(fields, declared, scope, SPAN).findings)
+    ours = outcome(lambda: serializer(fields, declared, scope)(message))
+    event("refused" if ours is MAPPING_FAILURES else "published")
+    assert ours == outcome(lambda: reference_bytes(fields, declared, context_of(message, SOURCE, [MODE]))), text
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("u8 + 1", IntKind(1, 256)),
+        ("-i8", IntKind(-127, 128)),
+        ("u8 % u8", IntKind(0, 254)),
+        ("i8 % -3", IntKind(-2, 0)),
+        ("i8 // u8", IntKind(-128, 127)),
+        ("i8 // 2", IntKind(-64, 63)),
+        ("i8 ** 2", IntKind(0, 128 * 128)),
+        ("u8 ** Mode.ON", IntKind(0, 255)),
+        ("abs(i8)", IntKind(0, 128)),
+        ("min(u8, 10)", IntKind(0, 10)),
+        ("max(u8, 10)", IntKind(10, 255)),
+        ("clamp(i32, 0, 255)", IntKind(0, 255)),
+        ("clamp(i32, i8, u8)", IntKind(-128, 255)),
+        ("clamp(round(f64), 0, 9)", IntKind(0, 9)),
+        ("wrap(i32, 0, 359)", IntKind(0, 359)),
+        ("wrap(i32, i8, u8)", IntKind(None, None)),
+        ("round(f32)", IntKind(None, None)),
+        ("int(flag) * 3", IntKind(0, 3)),
+        ("u8 if flag else 1000", IntKind(0, 1000)),
+        ("2 + 3 * 4", IntKind(14, 14)),
+        ("f32 * 2", FloatKind(32)),
+        ("f32 * f64", FloatKind(64)),
+        ("i32 / 2", FloatKind(32)),
+        ("[i8, u8][0]", IntKind(-128, 255)),
+    ],
+)
+def test_inferred_kind(text: str, kind: Kind) -> None:
+    typed, _ = compiled(text, scope_of(SOURCE, [MODE]))
+    assert typed.kind == kind
+
+
+def test_bounds_of_clamp_and_wrap_come_from_the_field() -> None:
+    for text in ("clamp(i32)", "wrap(i32) if flag else clamp(u64)"):
+        typed, _ = compiled(text, scope_of(SOURCE, [MODE]), Int(8, signed=False))
+        assert typed.kind == IntKind(0, 255)
+
+
+def test_nan_goes_through_clamp() -> None:
+    _, run = compiled("clamp(f64, 0.0, 1.0)", scope_of(SOURCE))
+    assert math.isnan(run(SimpleNamespace(f64=math.nan)))
+
+
+def test_submessages_whose_paths_read_alike_stay_apart() -> None:
+    scope = scope_of(SOURCE)
+    _, run = compiled("a.b_c.value - a_b.c.value", scope)
+    inner = [SimpleNamespace(value=number) for number in (30, 4)]
+    message = SimpleNamespace(a=SimpleNamespace(b_c=inner[0]), a_b=SimpleNamespace(c=inner[1]))
+    assert run(message) == 26
+
+
+def test_a_source_field_named_as_a_keyword_or_as_a_variable_is_read() -> None:
+    names = ("class", "message", "source", "received_at", "m", "data", "values", "v", "abs")
+    source = MessageType("Source", False, tuple(Field(name, Int(32, True)) for name in names))
+    message = SimpleNamespace(**{name: index for index, name in enumerate(names)})
+    for index, name in enumerate(names[1:], start=1):
+        _, run = compiled(f"abs({name}) + 1", scope_of(source))
+        assert run(message) == index + 1
+    target = MessageType("made/msg/Kept", True, (Field("class", Int(32, True)),))
+    assert serializer(field_map(auto=True), target, scope_of(source))(message)[-4:] == bytes(4)
