@@ -6,6 +6,7 @@ Counting happens elsewhere, in plain lists; nothing here is called per datagram.
 from __future__ import annotations
 
 import errno
+import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate
 from time import sleep
@@ -111,6 +112,8 @@ class MetricsServer:
         self.address = Address(address.host, self._server.server_port)
 
     def close(self) -> None:
+        # The server looks every half second whether it is to stop, and whenever its socket stirs.
+        self._server.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
