@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router.engine.framing import restored
-from tests.engine.wire import LEN, envelopes, framed, rover_envelope, tag, unknown_fields, varint
+from tests.engine.wire import LEN, damaged, envelopes, framed, rover_envelope, tag, unknown_fields, varint
 
 LIMIT = 16 * 1024
 
@@ -36,6 +36,12 @@ def test_an_envelope_comes_back_whatever_happened_to_its_zeros(envelope: bytes, 
     assert restored(envelope + bytes(count), LIMIT) == envelope
     for kept in range(len(trimmed), len(envelope)):
         assert restored(envelope[:kept], LIMIT) == envelope
+
+
+@given(damaged())
+def test_what_the_library_accepts_is_left_alone(data: bytes) -> None:
+    if accepts(data):
+        assert restored(data, LIMIT) == data
 
 
 @pytest.mark.parametrize("case", rover_envelope().cases)

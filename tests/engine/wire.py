@@ -97,3 +97,26 @@ def envelopes(draw: st.DrawFn) -> bytes:
     parts = [draw(_value(descriptor.fields_by_name[draw(cases)])) for _ in range(chosen)]
     parts += draw(st.lists(unknown_fields, max_size=draw(st.sampled_from([0, 0, 1, 3]))))
     return b"".join(draw(st.permutations(parts)))
+
+
+@st.composite
+def damaged(draw: st.DrawFn) -> bytes:
+    """An envelope, and what happens to one on its way: cuts, padding, flipped bits, a stretched varint, garbage."""
+    data = bytearray(draw(envelopes()))
+    for _ in range(draw(st.sampled_from([0, 0, 1, 1, 2]))):
+        at = draw(st.integers(0, len(data)))
+        kind = draw(st.sampled_from(["cut", "pad", "trim", "flip", "insert", "stretch"]))
+        if kind == "cut":
+            del data[at:]
+        elif kind == "pad":
+            data += bytes(at + 1)
+        elif kind == "trim":
+            data = data.rstrip(b"\0")
+        elif kind == "insert":
+            data[at:at] = draw(st.binary(max_size=8))
+        elif at < len(data):
+            if kind == "flip":
+                data[at] ^= 1 << draw(st.integers(0, 7))
+            elif data[at] < 0x80:
+                data[at : at + 1] = bytes((data[at] | 0x80, 0))
+    return bytes(data)
