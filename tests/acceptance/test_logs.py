@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from tests.acceptance.conftest import Rover
-from tests.acceptance.payloads import WIRE, sample
+from tests.acceptance.payloads import WIRE, generated, sample
 from tests.acceptance.rover_map import topics_of
 from tests.acceptance.site import ROOT, RouterProcess, balance, key, site, total
 
@@ -70,3 +70,18 @@ def test_a_person_at_a_terminal_reads_lines(tmp_path: Path) -> None:
         os.close(ours)
     assert process.returncode == 0
     assert not any(line.startswith("{") for line in shown.decode().splitlines())
+
+
+def test_a_log_that_nobody_reads_any_more_does_not_stop_it(tmp_path: Path) -> None:
+    good = next(generated("ph_info")).datagram
+    with site(tmp_path) as place:
+        command = [sys.executable, "-m", "router", "run", str(place.table())]
+        with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stderr
+            while "router started" not in process.stderr.readline():
+                assert process.poll() is None
+            process.stderr.close()
+            place.send("sensor_board", b"\xff", b"", good)
+            assert place.receive("basestation") == good
+            process.terminate()
+    assert process.returncode == 0
