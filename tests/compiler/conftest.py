@@ -1,7 +1,10 @@
-"""The rover's own tables, checked once."""
+"""The rover's own tables, checked once, and small ones for a test."""
 
 from __future__ import annotations
 
+import linecache
+import textwrap
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,15 @@ from router.compiler.definitions import Definitions
 from router.compiler.program import Program
 
 ROUTES = Path(__file__).parents[2] / "routes"
+HEAD = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+node: {node}
+listen: {{here: {{address: 127.0.0.1:25000}}}}
+endpoints:
+  board: {{address: 127.0.0.2:8, kind: board}}
+  base: {{address: 127.0.0.3:9000, kind: basestation}}
+"""
 
 
 @pytest.fixture(scope="session")
@@ -28,3 +40,17 @@ def rover_program(rover: Checked) -> Program:
     assert rover.diagnostics == []
     assert rover.program is not None
     return rover.program
+
+
+@pytest.fixture
+def check_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, definitions: Definitions) -> Callable[[str], Checked]:
+    """Checks `routes` as the routes of a small table, which becomes table.yaml in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    linecache.clearcache()
+
+    def check(routes: str, node: str = "{name: router}") -> Checked:
+        text = HEAD.format(protos=ROUTES.parent / "protos", node=node) + textwrap.dedent(routes)
+        (tmp_path / "table.yaml").write_text(text, encoding="utf-8")
+        return check_table(Path("table.yaml"), {}, definitions)
+
+    return check

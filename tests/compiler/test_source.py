@@ -1,0 +1,162 @@
+"""Generated code: the text that people read is the code that runs, and it blames the route table."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import traceback
+from collections.abc import Callable
+
+import pytest
+
+from router.compiler import Checked, check_table
+from router.compiler.books import Books
+from router.compiler.definitions import Definitions
+from router.compiler.handlers import HandlerSource
+from router.compiler.routes import CheckedRoute
+from router.compiler.source import Source
+from router.errors import SourceSpan
+from tests.compiler.compiling import Published
+from tests.compiler.conftest import ROUTES
+
+SPAN = SourceSpan("table.yaml", 3, 5, 9)
+
+
+def generated(route: CheckedRoute) -> Source:
+    generator = HandlerSource(route.case.name, Books(), route.route.case.span)
+    generator.generate([served.target for served in route.targets])
+    return generator.out
+
+
+@pytest.mark.parametrize("table", ["rover", "sim", "legacy"])
+def test_text_is_the_code_that_runs(definitions: Definitions, table: str) -> None:
+    checked = check_table(ROUTES / f"{table}.yaml", {}, definitions)
+    inbound = [route for route in checked.routes if not route.route.is_outbound]
+    assert inbound
+    for route in inbound:
+        out = generated(route)
+        # unparsed, because a literal -1 is one node in the tree and two in parsed text
+        assert ast.unparse(ast.parse(out.text())) == ast.unparse(out.tree())
+
+
+@pytest.mark.parametrize("table", ["rover", "sim", "legacy"])
+def test_every_node_stands_somewhere_in_the_table(definitions: Definitions, table: str) -> None:
+    checked = check_table(ROUTES / f"{table}.yaml", {}, definitions)
+    assert checked.table is not None
+    lines = max(len(path.read_text(encoding="utf-8").splitlines()) for path in checked.table.files)
+    for route in checked.routes:
+        if route.route.is_outbound:
+            continue
+        for node in ast.walk(generated(route).tree()):
+            if isinstance(node, (ast.expr, ast.stmt)):
+                assert 1 <= node.lineno <= lines
+                assert node.end_col_offset is not None
+                assert 0 <= node.col_offset < node.end_col_offset
+
+
+def test_values_enter_by_name_and_names_are_never_used_twice() -> None:
+    out = Source()
+    assert [out.constant("known", value) for value in (b"a", b"b", b"a")] == ["known", "known_2", "known_3"]
+    assert out.constants == {"known": b"a", "known_2": b"b", "known_3": b"a"}
+
+
+def test_expression_inside_a_line_is_put_in_brackets_where_it_needs_them() -> None:
+    out = Source()
+    both = ast.parse("a or b", mode="eval").body
+    out.line(f"if not {out.expression(both)}:", SPAN)
+    with out.indented():
+        out.line(f"{out.expression(both)},", SPAN)
+    assert out.text() == "if not (a or b):\n    a or b,\n"
+
+
+# run-time failures
+
+
+FAILING = {
+    "division by zero in a field": (
+        """
+        routes:
+          imu_info:
+            source: board
+            topics:
+              - topic: out
+                type: geometry_msgs/msg/Vector3
+                fields:
+                  x: accel_x
+                  y: 1 + accel_x / gyro_x
+        """,
+        "y: 1 + accel_x / gyro_x",
+        "accel_x / gyro_x",
+        ZeroDivisionError,
+    ),
+    "division by zero in a when": (
+        """
+        routes:
+          imu_info:
+            source: board
+            topics:
+              - topic: out
+                when: 1 / gyro_x > 2
+                type: geometry_msgs/msg/Vector3
+                fields: {x: accel_x}
+        """,
+        "when: 1 / gyro_x > 2",
+        "1 / gyro_x",
+        ZeroDivisionError,
+    ),
+    "a number that the field cannot hold": (
+        """
+        routes:
+          imu_info:
+            source: board
+            topics:
+              - topic: out
+                type: std_msgs/msg/UInt8
+                fields: {data: round(mag_x * 1000)}
+        """,
+        "fields: {data: round(mag_x * 1000)}",
+        "round(mag_x * 1000)",
+        Exception,
+    ),
+    "text behind non-ASCII text": (
+        """
+        routes:
+          imu_info:
+            source: board
+            topics:
+              - topic: out
+                type: std_msgs/msg/String
+                fields: {data: "'é€' + str(accel_x / gyro_x)"}
+        """,
+        """fields: {data: "'é€' + str(accel_x / gyro_x)"}""",
+        "accel_x / gyro_x",
+        ZeroDivisionError,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAILING)
+def test_traceback_points_into_the_table(name: str, check_text: Callable[[str], Checked]) -> None:
+    routes, line, blamed, kind = FAILING[name]
+    program = check_text(routes).program
+    assert program is not None
+    (handler,) = program.handlers.values()
+    serve = Published(program, handler)
+    assert serve(handler.case.message_class(accel_x=1.0, mag_x=1e6)) == {}
+    (report,) = serve.reports
+    assert isinstance(report.error, kind)
+
+    text = (program.table.path).read_text(encoding="utf-8").splitlines()
+    number = 1 + next(index for index, candidate in enumerate(text) if line in candidate)
+    frame = next(entry for entry in traceback.extract_tb(report.error.__traceback__) if entry.filename == "table.yaml")
+    assert frame.lineno == number
+    assert frame.line == line
+    assert frame.name == "route_imu_info"
+    if sys.version_info >= (3, 11):
+        raw = text[number - 1]
+        assert frame.colno is not None
+        assert frame.end_colno is not None
+        assert raw[frame.colno : frame.end_colno] == blamed
+    shown = "".join(traceback.format_exception(report.error))
+    assert f'File "table.yaml", line {number}, in route_imu_info' in shown
+    assert f"    {line}\n" in shown
