@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 
 from router.compiler.program import Program
+from router.edges.background import background_threads
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.log import SUMMARY_INTERVAL_NS, FloodLog, logger
 from router.edges.metrics import BooksCollector, MetricsServer
@@ -39,7 +40,9 @@ class Router:
 
     def __enter__(self) -> Router:
         with ExitStack() as opening:
-            self._open(opening)
+            with background_threads():
+                engine = self._open(opening)
+            self._start_receiving(engine, opening)
             self._open_edges = opening.pop_all()
         table = self.program.table
         logger.info(
@@ -72,8 +75,8 @@ class Router:
                 totals[series.metric] += self.counts[slot]
         return totals | {"kernel_drops": sum(listener.kernel_drops() for listener in self.listeners.values())}
 
-    def _open(self, opening: ExitStack) -> None:
-        """Everything that can fail first, receiving last. `opening` closes in the opposite order."""
+    def _open(self, opening: ExitStack) -> Engine:
+        """Everything but receiving. `opening` closes in the opposite order."""
         program, table = self.program, self.program.table
         opening.callback(self._floods.flush, final=True)
         for plan in program.listeners:
@@ -96,11 +99,14 @@ class Router:
         else:
             engine = bind({}, {})
         self._open_metrics(opening)
-        receive = {name: engine.receiver(name) for name in self.listeners}
         teller = threading.Thread(target=self._tell_of_floods, name="log")
         teller.start()
         opening.callback(teller.join)
         opening.callback(self._stopped.set)
+        return engine
+
+    def _start_receiving(self, engine: Engine, opening: ExitStack) -> None:
+        receive = {name: engine.receiver(name) for name in self.listeners}
         receiving = ReceiveThread(list(self.listeners.values()), receive, MAX_DATAGRAM, self._receive_failed)
         receiving.start()
         opening.callback(receiving.stop)
