@@ -6,15 +6,18 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
+
+import yaml
 
 from router.cli import BAD_TABLE, OK, VERBS
 from router.cli.findings import print_findings
 from router.compiler import check_table
 from router.edges.log import LEVELS as LOG_LEVELS
 from router.edges.log import configure_log
+from router.errors import StartError
 from router.runtime import Router, tune_interpreter
 
 DEFAULT_TABLE = Path("routes/rover.yaml")
@@ -64,6 +67,31 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table_variables(ros_args: Sequence[str]) -> dict[str, str]:
-    """`["-p", "listen_port:=5001"]` -> `{"LISTEN_PORT": "5001"}`; a node's name before the parameter's is left out."""
-    assignments = (word.partition(":=") for option, word in pairwise(ros_args) if option in ("-p", "--param"))
-    return {name.rpartition(":")[2].upper(): value.strip("'\"") for name, _, value in assignments if value}
+    """`["-p", "listen_port:=5001"]` -> `{"LISTEN_PORT": "5001"}`; so too `--params-file`, which `ros2 launch` passes.
+
+    The last one wins, as in ROS. Which node a parameter is meant for is left out. Raises StartError.
+    """
+    variables: dict[str, str] = {}
+    for option, word in pairwise(ros_args):
+        name, assigned, value = word.partition(":=")
+        if option in ("-p", "--param") and assigned:
+            variables[name.rpartition(":")[2].upper()] = value.strip("'\"")
+        elif option == "--params-file":
+            variables.update((name.upper(), str(value)) for name, value in _parameters(_read_yaml(Path(word))))
+    return variables
+
+
+def _read_yaml(path: Path) -> object:
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise StartError(f"the parameter file {path} cannot be read: {error}") from error
+
+
+def _parameters(tree: object) -> Iterator[tuple[str, object]]:
+    """Those of all nodes, however deep in namespaces they stand."""
+    for key, value in tree.items() if isinstance(tree, dict) else ():
+        if key == "ros__parameters" and isinstance(value, dict):
+            yield from ((str(name), member) for name, member in value.items())
+        else:
+            yield from _parameters(value)

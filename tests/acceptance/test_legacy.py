@@ -91,6 +91,22 @@ def test_parameters_come_from_the_environment_too(tmp_path: Path) -> None:
             assert place.waiting() == {}
 
 
+def test_parameters_come_from_a_file_as_ros2_launch_writes_it(tmp_path: Path) -> None:
+    with site(tmp_path, HOSTS) as place:
+        lines = "".join(f"    {name}: {value}\n" for name, value in parameters(place).items())
+        file = tmp_path / "launch_params.yaml"
+        file.write_text(f"/**:\n  ros__parameters:\n{lines}")
+        with RouterProcess(tmp_path, LEGACY, "--ros-args", "--params-file", file):
+            assert_both_get(place, next(generated("imu_info")).datagram)
+
+
+def test_a_parameter_file_that_is_missing_is_told(tmp_path: Path) -> None:
+    router = RouterProcess(tmp_path, LEGACY, "--ros-args", "--params-file", tmp_path / "none.yaml")
+    assert router.wait() == 78
+    assert router.text().startswith(f"router run: the parameter file {tmp_path / 'none.yaml'} cannot be read: ")
+    assert "Traceback" not in router.text()
+
+
 def test_what_the_old_node_could_not_read_goes_nowhere(tmp_path: Path) -> None:
     """The one intended difference: garbage is not passed on."""
     with site(tmp_path, HOSTS) as place:
