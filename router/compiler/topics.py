@@ -77,10 +77,6 @@ def qos_findings(topic: Topic) -> Iterator[Diagnostic]:
         span = given.durability or given.reliability or given.profile
         yield conflict(span.span if span else given.span, "late joiners get nothing from a best_effort publisher",
                        "transient_local goes with reliability: reliable")  # fmt: skip
-    if plan.liveliness_lease_duration and plan.deadline and plan.liveliness_lease_duration < plan.deadline:
-        lease = given.liveliness_lease_duration or given.deadline
-        yield conflict(lease.span if lease else given.span, "the liveliness lease ends before the deadline",
-                       "make the lease at least as long as the deadline")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +129,15 @@ def _unheard(offered: QosPlan, requested: QosPlan) -> str:
         return "it wants reliable and gets best_effort"
     if offered.durability == "volatile" and requested.durability == "transient_local":
         return "it wants transient_local and gets volatile"
-    if requested.deadline is not None and (offered.deadline is None or offered.deadline > requested.deadline):
+    if _is_longer(offered.deadline, requested.deadline):
         return "it wants a shorter deadline than is offered"
+    if _is_longer(offered.liveliness_lease_duration, requested.liveliness_lease_duration):
+        return "it wants a shorter liveliness lease than is offered"
     if offered.liveliness == "automatic" and requested.liveliness == "manual_by_topic":
         return "it wants liveliness manual_by_topic and gets automatic"
     return ""
+
+
+def _is_longer(offered: int | None, requested: int | None) -> bool:
+    """None is for ever."""
+    return requested is not None and (offered is None or offered > requested)
