@@ -32,7 +32,7 @@ def written(text: str) -> Expression:
     return Expression(text, SourceSpan("table.yaml", 7, 3, 3 + len(text)), verbatim=True, text_column=3)
 
 
-def field_map(auto: bool = False, **entries: str) -> FieldMap:
+def field_map(auto: bool = False, /, **entries: str) -> FieldMap:
     """`header__stamp="received_at"` is the entry `header.stamp: received_at`."""
     paths = {tuple(name.split("__")): text for name, text in entries.items()}
     return FieldMap(
@@ -40,7 +40,7 @@ def field_map(auto: bool = False, **entries: str) -> FieldMap:
     )
 
 
-AUTO = field_map(auto=True)
+AUTO = field_map(True)
 
 
 def scope_of(message: MessageType, enums: Collection[Enum] = (), ros_types: Collection[MessageType] = ()) -> Scope:

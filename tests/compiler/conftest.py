@@ -18,11 +18,14 @@ HEAD = """\
 version: 1
 envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
 node: {node}
-listen: {{here: {{address: 127.0.0.1:25000}}}}
-endpoints:
-  board: {{address: 127.0.0.2:8, kind: board}}
-  base: {{address: 127.0.0.3:9000, kind: basestation}}
+listen: {listen}
+endpoints: {endpoints}
 """
+LISTEN = "{here: {address: 127.0.0.1:25000}}"
+ENDPOINTS = "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation}}"
+
+CheckText = Callable[..., Checked]
+"""Takes the text of a table from `routes:` on; `node`, `listen` and `endpoints` as YAML flow mappings."""
 
 
 @pytest.fixture(scope="session")
@@ -43,13 +46,14 @@ def rover_program(rover: Checked) -> Program:
 
 
 @pytest.fixture
-def check_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, definitions: Definitions) -> Callable[[str], Checked]:
-    """Checks `routes` as the routes of a small table, which becomes table.yaml in the working directory."""
+def check_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, definitions: Definitions) -> CheckText:
+    """Checks a small table, which becomes table.yaml in the working directory."""
     monkeypatch.chdir(tmp_path)
     linecache.clearcache()
 
-    def check(routes: str, node: str = "{name: router}") -> Checked:
-        text = HEAD.format(protos=ROUTES.parent / "protos", node=node) + textwrap.dedent(routes)
+    def check(routes: str, node: str = "{name: router}", listen: str = LISTEN, endpoints: str = ENDPOINTS) -> Checked:
+        head = HEAD.format(protos=ROUTES.parent / "protos", node=node, listen=listen, endpoints=endpoints)
+        text = head + textwrap.dedent(routes)
         (tmp_path / "table.yaml").write_text(text, encoding="utf-8")
         return check_table(Path("table.yaml"), {}, definitions)
 

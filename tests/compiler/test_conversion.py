@@ -182,13 +182,13 @@ def test_field_filled_twice_is_reported_whichever_way_round() -> None:
 
 
 def test_auto_without_a_common_name_is_reported() -> None:
-    (finding,) = findings_of(field_map(auto=True), UNRELATED, scope_of(SOURCE))
+    (finding,) = findings_of(field_map(True), UNRELATED, scope_of(SOURCE))
     assert finding.code is Code.NOTHING_MAPPED
 
 
 def test_auto_says_which_field_it_cannot_fill() -> None:
     target = MessageType("m/msg/It", True, (Field("f64", Float(32)), Field("flag", Bool())))
-    (finding,) = findings_of(field_map(auto=True), target, scope_of(SOURCE))
+    (finding,) = findings_of(field_map(True), target, scope_of(SOURCE))
     assert finding.code is Code.LOSSY_CONVERSION
     assert "f64" in finding.message
 

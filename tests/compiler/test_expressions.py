@@ -250,4 +250,4 @@ def test_a_source_field_named_as_a_keyword_or_as_a_variable_is_read() -> None:
         _, run = compiled(f"abs({name}) + 1", scope_of(source))
         assert run(message) == index + 1
     target = MessageType("made/msg/Kept", True, (Field("class", Int(32, True)),))
-    assert serializer(field_map(auto=True), target, scope_of(source))(message)[-4:] == bytes(4)
+    assert serializer(field_map(True), target, scope_of(source))(message)[-4:] == bytes(4)

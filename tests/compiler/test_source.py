@@ -5,11 +5,10 @@ from __future__ import annotations
 import ast
 import sys
 import traceback
-from collections.abc import Callable
 
 import pytest
 
-from router.compiler import Checked, check_table
+from router.compiler import check_table
 from router.compiler.books import Books
 from router.compiler.definitions import Definitions
 from router.compiler.handlers import HandlerSource
@@ -17,7 +16,7 @@ from router.compiler.routes import CheckedRoute
 from router.compiler.source import Source
 from router.errors import SourceSpan
 from tests.compiler.compiling import Published
-from tests.compiler.conftest import ROUTES
+from tests.compiler.conftest import ROUTES, CheckText
 
 SPAN = SourceSpan("table.yaml", 3, 5, 9)
 
@@ -136,7 +135,7 @@ FAILING = {
 
 
 @pytest.mark.parametrize("name", FAILING)
-def test_traceback_points_into_the_table(name: str, check_text: Callable[[str], Checked]) -> None:
+def test_traceback_points_into_the_table(name: str, check_text: CheckText) -> None:
     routes, line, blamed, kind = FAILING[name]
     program = check_text(routes).program
     assert program is not None

@@ -1,0 +1,78 @@
+"""Every series has a slot of its own from the start, and the histogram counts each duration once."""
+
+from __future__ import annotations
+
+import pytest
+
+from router.compiler.books import (
+    DROP_REASONS,
+    HISTOGRAM_BOUNDS_NS,
+    HISTOGRAM_SLOTS,
+    METRICS,
+    REJECT_REASONS,
+    UNKNOWN_CASE,
+    Books,
+    Series,
+    histogram_part,
+    metric,
+)
+from router.compiler.program import Program
+
+
+def test_asking_twice_gives_the_same_slot() -> None:
+    books = Books()
+    assert books.slot("datagrams_received", "a") == books.slot("datagrams_received", "a") == 0
+    assert books.slot("datagrams_received", "b") == 1
+    assert books.fresh_counts() == [0, 0]
+
+
+def test_histogram_takes_a_run_of_slots() -> None:
+    books = Books()
+    first = books.slot("route_seconds", "a")
+    assert books.slot("route_seconds", "b") == first + HISTOGRAM_SLOTS
+    parts = [series.part for series, _ in books.series() if series.labels == ("a",)]
+    assert parts == list(range(HISTOGRAM_SLOTS))
+
+
+def test_wrong_number_of_labels_is_a_mistake_of_ours() -> None:
+    with pytest.raises(ValueError, match="labels"):
+        Books().slot("datagrams_rejected", "a")
+
+
+def test_metric_names_are_unique() -> None:
+    assert [metric(one.name) for one in METRICS] == list(METRICS)
+
+
+@pytest.mark.parametrize(
+    ("elapsed", "part"),
+    [
+        (0, 0),
+        (HISTOGRAM_BOUNDS_NS[0], 0),
+        (HISTOGRAM_BOUNDS_NS[0] + 1, 1),
+        (HISTOGRAM_BOUNDS_NS[-1], len(HISTOGRAM_BOUNDS_NS) - 1),
+        (HISTOGRAM_BOUNDS_NS[-1] + 1, len(HISTOGRAM_BOUNDS_NS)),
+        (10**12, len(HISTOGRAM_BOUNDS_NS)),
+    ],
+)
+def test_duration_falls_into_the_first_bound_that_holds_it(elapsed: int, part: int) -> None:
+    assert histogram_part(elapsed) == part
+
+
+def test_rover_has_every_series_before_the_first_datagram(rover_program: Program) -> None:
+    series = dict(rover_program.books.series())
+    assert len(set(series.values())) == len(series)
+    assert sorted(series.values()) == list(range(len(series)))
+    for listener in rover_program.listeners:
+        for reason in REJECT_REASONS:
+            assert Series("datagrams_rejected", (listener.name, reason)) in series
+    for case in (*rover_program.envelope.cases, UNKNOWN_CASE):
+        assert Series("unhandled", (case,)) in series
+    for handler in rover_program.handlers.values():
+        route = handler.case.name
+        for target in handler.targets:
+            delivered = "messages_published" if target.is_topic else "datagrams_sent"
+            assert Series(delivered, (route, target.target)) in series
+            assert Series("messages_filtered", (route, target.target)) in series
+            assert all(Series("messages_dropped", (route, target.target, reason)) in series for reason in DROP_REASONS)
+        for name in ("route_seconds", "route_last_message_timestamp_seconds"):
+            assert Series(name, (route,)) in series
