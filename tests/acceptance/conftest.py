@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("rclpy", reason="needs ROS 2")
-
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.rover_map import FLOWS, TOPICS

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from tests.acceptance.expected import in_board_units
 from tests.acceptance.payloads import WIRE, generated, sample
 from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.site import ROOT, RouterProcess, Site, site, wait_until
-
-pytest.importorskip("rclpy", reason="needs ROS 2")
 
 LEGACY = ROOT / "routes" / "legacy.yaml"
 DESTINATIONS = ("dst_a", "dst_b")

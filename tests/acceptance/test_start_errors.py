@@ -12,8 +12,6 @@ import pytest
 from tests.acceptance.rover_map import ROUTER
 from tests.acceptance.site import ROVER, RouterProcess, Site, site, udp
 
-pytest.importorskip("rclpy", reason="needs ROS 2")
-
 BAD_TABLE = 78
 
 

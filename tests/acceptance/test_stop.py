@@ -14,8 +14,6 @@ import pytest
 from tests.acceptance.payloads import generated
 from tests.acceptance.site import ROVER, RouterProcess, Site, arrived, site, wait_until
 
-pytest.importorskip("rclpy", reason="needs ROS 2")
-
 RATE = 2000
 """Datagrams per second."""
 
