@@ -17,12 +17,13 @@ from router.compiler.functions import FUNCTIONS, fit, fit_text, fit_wide_text
 from router.compiler.handlers import HandlerSource
 from router.compiler.network import network_findings
 from router.compiler.program import Handler, ListenerPlan, Program, PublisherPlan, SenderPlan
-from router.compiler.routes import CheckedRoute, RouteChecker, sorted_findings
+from router.compiler.routes import CheckedRoute, RouteChecker, nested_types, sorted_findings
 from router.compiler.topics import meeting_findings, qos_of
 from router.errors import Diagnostic, Severity, TableError
 from router.table import load_table
 from router.table.model import ANY, RouteTable
 from router.types.lock import check_lock, locked_size
+from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope
 from router.types.ros import definition
 
@@ -95,7 +96,7 @@ def _program(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes:
         for served in checked.targets:
             if served.topic and served.type:
                 topic = served.topic
-                plan = PublisherPlan(topic.topic.value, served.type.name, qos_of(topic), definition(served.type))
+                plan = PublisherPlan(topic.topic.value, served.type.name, qos_of(topic), _definitions(served.type))
                 publishers.setdefault(plan.topic, plan)
     return Program(
         table=table,
@@ -114,6 +115,10 @@ def _program(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes:
         declared_outbound=tuple(checked.case.name for checked in routes if checked.route.is_outbound),
         protos_sha256=schema.sha256,
     )
+
+
+def _definitions(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
+    return {nested.name: definition(nested) for nested in nested_types(message)}
 
 
 def _open_books(books: Books, table: RouteTable, envelope: Envelope) -> None:

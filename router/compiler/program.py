@@ -52,12 +52,16 @@ class QosPlan:
 
 @dataclass(frozen=True, slots=True)
 class PublisherPlan:
-    """One ROS publisher; `definition` is what the CDR bytes were laid out after (see edges.ros)."""
+    """One ROS publisher.
+
+    `definitions` are what the CDR bytes were laid out after: of the type itself and of each type nested
+    in it, by name, the fields as rclpy spells them.
+    """
 
     topic: str
     type_name: str
     qos: QosPlan
-    definition: tuple[tuple[str, str], ...]
+    definitions: Mapping[str, tuple[tuple[str, str], ...]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,7 +202,7 @@ class RouteChecker:
         return found
 
     def _scope(self, message: MessageType, ros_type: MessageType | None = None) -> Scope:
-        nested = tuple(_nested(ros_type)) if ros_type else ()
+        nested = tuple(nested_types(ros_type)) if ros_type else ()
         return Scope(message, tuple(self.schema.enums.values()), nested, Locals())
 
     def _when(self, expression: Expression | None, scope: Scope) -> Typed | None:
@@ -220,7 +220,7 @@ class RouteChecker:
         return typed
 
 
-def _nested(declared: Type) -> Iterable[MessageType]:
+def nested_types(declared: Type) -> Iterable[MessageType]:
     """A ROS message type and all types in it, each once."""
     found: dict[str, MessageType] = {}
     waiting: list[Type] = [declared]

@@ -134,20 +134,27 @@ def _events(plan: PublisherPlan, wanted: list[bool]) -> PublisherEventCallbacks:
 
 
 def _message_class(plan: PublisherPlan, span: SourceSpan) -> type:
-    """The installed Python class, which must be laid out as the table was compiled for: the bytes depend on it."""
-    package, _, name = plan.type_name.split("/")
-    remedy = f"run 'make setup', or install the ROS package '{package}'"
+    """The installed Python class; it and all in it must be laid out as the table was compiled for."""
+    for name, compiled in plan.definitions.items():
+        installed = tuple(_installed(name, span).get_fields_and_field_types().items())
+        if installed != compiled:
+            raise StartError(
+                f"{span}: {name} as installed is not what the table was compiled for; {_remedy(name)}\n"
+                f"  installed: {_fields(installed)}\n  compiled:  {_fields(compiled)}"
+            )
+    return _installed(plan.type_name, span)  # type: ignore[no-any-return]
+
+
+def _installed(name: str, span: SourceSpan) -> Any:
+    package, _, short = name.split("/")
     try:
-        message_class: Any = getattr(importlib.import_module(f"{package}.msg"), name)
+        return getattr(importlib.import_module(f"{package}.msg"), short)
     except (ImportError, AttributeError) as error:
-        raise StartError(f"{span}: {plan.type_name} is not installed ({error}); {remedy}") from error
-    installed = tuple(message_class.get_fields_and_field_types().items())
-    if installed != plan.definition:
-        raise StartError(
-            f"{span}: {plan.type_name} as installed is not what the table was compiled for; {remedy}\n"
-            f"  installed: {_fields(installed)}\n  compiled:  {_fields(plan.definition)}"
-        )
-    return message_class  # type: ignore[no-any-return]
+        raise StartError(f"{span}: {name} is not installed ({error}); {_remedy(name)}") from error
+
+
+def _remedy(name: str) -> str:
+    return f"run 'make setup', or install the ROS package '{name.partition('/')[0]}'"
 
 
 def _fields(definition: tuple[tuple[str, str], ...]) -> str:

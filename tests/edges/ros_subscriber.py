@@ -11,12 +11,17 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from time import monotonic, sleep
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
+
+from tests.own_stdout import own_stdout
 
 
 class Subscriber:
@@ -49,6 +54,7 @@ def main() -> None:
     parser.add_argument("type")
     parser.add_argument("--transient-local", action="store_true")
     arguments = parser.parse_args()
+    lines = own_stdout()
     package, _, name = arguments.type.split("/")
     qos = QoSProfile(
         depth=100,
@@ -60,10 +66,10 @@ def main() -> None:
     node.create_subscription(
         getattr(importlib.import_module(f"{package}.msg"), name),
         arguments.topic,
-        lambda data: print(data.hex(), flush=True),
+        lambda data: print(data.hex(), file=lines),
         qos,
         raw=True,
-        event_callbacks=SubscriptionEventCallbacks(matched=lambda _: print("matched", flush=True)),
+        event_callbacks=SubscriptionEventCallbacks(matched=lambda _: print("matched", file=lines)),
     )
     threading.Thread(target=lambda: (sys.stdin.read(), rclpy.shutdown()), daemon=True).start()
     try:

@@ -17,6 +17,7 @@ from router.compiler.program import PublisherPlan, QosPlan
 from router.edges.ros import RosEdge
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
+from router.types.ros import definition, ros_interfaces
 from tests.edges.ros_subscriber import Subscriber, wait_until
 
 RELIABLE = QosPlan("reliable", "volatile", "keep_last", 10)
@@ -25,7 +26,7 @@ HELLO = bytes(serialize_message(String(data="hello, rover...")))  # 24 bytes: DD
 
 
 def string_topic(qos: QosPlan = RELIABLE, topic: str = "greeting") -> PublisherPlan:
-    return PublisherPlan(topic, "std_msgs/msg/String", qos, (("data", "string"),))
+    return PublisherPlan(topic, "std_msgs/msg/String", qos, {"std_msgs/msg/String": (("data", "string"),)})
 
 
 def open_ros(*plans: PublisherPlan, args: tuple[str, ...] = ()) -> RosEdge:
@@ -85,9 +86,9 @@ def test_every_qos_that_a_table_can_name_opens() -> None:
 
 
 def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
-    stale = PublisherPlan("greeting", "std_msgs/msg/String", RELIABLE, (("data", "string"), ("more", "uint8")))
+    stale = (("data", "string"), ("more", "uint8"))
     with pytest.raises(StartError) as refused:
-        open_ros(stale)
+        open_ros(PublisherPlan("greeting", "std_msgs/msg/String", RELIABLE, {"std_msgs/msg/String": stale}))
     assert str(refused.value) == (
         "routes/rover.yaml:40:16: std_msgs/msg/String as installed is not what the table was compiled for; "
         "run 'make setup', or install the ROS package 'std_msgs'\n"
@@ -96,9 +97,18 @@ def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
     )
 
 
+def test_a_type_with_one_in_it_that_was_compiled_otherwise_is_refused() -> None:
+    interfaces = ros_interfaces()
+    types = {name: interfaces.get(name) for name in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")}
+    definitions = {name: definition(found) for name, found in types.items() if found}
+    definitions["builtin_interfaces/msg/Time"] = (("sec", "int64"), ("nanosec", "uint32"))
+    with pytest.raises(StartError, match="builtin_interfaces/msg/Time as installed is not what"):
+        open_ros(PublisherPlan("stamps", "std_msgs/msg/Header", RELIABLE, definitions))
+
+
 @pytest.mark.parametrize("type_name", ["no_such_msgs/msg/String", "std_msgs/msg/NoSuch"])
 def test_a_type_that_is_not_installed_is_refused(type_name: str) -> None:
-    missing = PublisherPlan("greeting", type_name, RELIABLE, ())
+    missing = PublisherPlan("greeting", type_name, RELIABLE, {type_name: ()})
     with pytest.raises(StartError, match=rf"rover.yaml:40:16: {type_name} is not installed .* run 'make setup'"):
         open_ros(missing)
 
