@@ -77,6 +77,7 @@ class Engine:
         self._report = report
         self._clock_ns = clock_ns
         self._wall_ns = wall_ns
+        self._case_numbers = frozenset(case.number for case in program.envelope.cases.values())
         self._by_host, self._by_address = recognisers(program.table.endpoints)
         outlets = Outlets(counts, send, publish, wanted, report, publish_errors)
         self._routes = {
@@ -187,11 +188,14 @@ class Engine:
         envelope = self._program.envelope
         case = message.WhichOneof(envelope.oneof)
         if case is None:
-            unknown = UnknownFieldSet(message)
-            if not len(unknown):
+            fields = UnknownFieldSet(message)
+            numbers = [fields[index].field_number for index in range(len(fields))]
+            if not numbers:
                 raise _Rejected("no_payload")
+            if known := [number for number in numbers if number in self._case_numbers]:
+                raise _Rejected("malformed", f"field {known[0]} is no message here")
             self._count_unhandled(UNKNOWN_CASE)
-            raise _Rejected("unknown_case", f"field {unknown[0].field_number}")
+            raise _Rejected("unknown_case", f"field {numbers[0]}")
         number = envelope.cases[case].number
         route = self._routes.get(number)
         if route is not None:

@@ -54,8 +54,12 @@ class Naive:
     def _route(self, message: Message, data: bytes, peer: tuple[str, int]) -> str | None:
         name = message.WhichOneof("payload")
         if name is None:
-            if not len(UnknownFieldSet(message)):
+            fields = UnknownFieldSet(message)
+            if not len(fields):
                 return "no_payload"
+            cases = {case.number for case in self.program.envelope.cases.values()}
+            if any(fields[index].field_number in cases for index in range(len(fields))):
+                return "malformed"
             self._add(1, "unhandled", "unknown")
             return "unknown_case"
         number = self.program.envelope.cases[name].number
