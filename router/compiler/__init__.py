@@ -13,8 +13,9 @@ from pathlib import Path
 from router.compiler.books import REJECT_REASONS, UNKNOWN_CASE, Books
 from router.compiler.cdr import RUNTIME
 from router.compiler.definitions import Definitions
-from router.compiler.functions import FUNCTIONS, fit, fit_text, fit_wide_text
+from router.compiler.functions import FUNCTIONS
 from router.compiler.handlers import HandlerSource
+from router.compiler.implementations import fit, fit_text, fit_wide_text
 from router.compiler.network import network_findings
 from router.compiler.program import Handler, ListenerPlan, Program, PublisherPlan, SenderPlan
 from router.compiler.routes import CheckedRoute, RouteChecker, nested_types, sorted_findings

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 
 from router.compiler.expressions import Finding, Typed, placed
-from router.compiler.functions import FLOAT32_END, clamp
+from router.compiler.implementations import FLOAT32_END, clamp
 from router.compiler.kinds import (
     INT32,
     BoolKind,

@@ -6,27 +6,34 @@ The examples are tests (tests/compiler/test_functions.py) and the reference page
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from router.compiler import function_kinds as result
+from router.compiler.function_kinds import Rule
+from router.compiler.implementations import (
+    ceil,
+    clamp,
+    floor,
+    round_half_even,
+    seconds,
+    time_from_milliseconds,
+    time_from_seconds,
+    to_float32,
+    truncate,
+    wrap,
+)
 from router.compiler.kinds import (
     BoolKind,
     BytesKind,
     EnumKind,
     FloatKind,
     IntKind,
-    Kind,
     ListKind,
     Number,
     StringKind,
     TimeKind,
-    as_int,
-    float_bits,
-    join,
 )
-from router.errors import MappingError, NonFiniteError
-
-NS_PER_SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +47,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Function:
-    """One function. `result` gives the kind of a call from the kinds of its arguments, or raises ValueError
-    with a sentence when no call with such arguments works.
+    """One function. `result` tells the kind of a call from the kinds of its arguments, see `function_kinds`.
 
     The last parameter may be repeated when `variadic`; `optional` of the last ones may be left out.
     A function with optional bounds takes them from the integer field that it fills (see expressions).
@@ -49,7 +55,7 @@ class Function:
 
     name: str
     parameters: tuple[Parameter, ...]
-    result: Callable[[Sequence[Kind]], Kind]
+    result: Rule
     implementation: Callable[..., object]
     summary: str
     examples: tuple[tuple[str, object], ...]
@@ -64,141 +70,6 @@ class Function:
         return f"{self.name}({', '.join(shown)})"
 
 
-def round_half_even(x: float) -> int:
-    return _to_int(round, x)
-
-
-def truncate(x: float) -> int:
-    return _to_int(math.trunc, x)
-
-
-def floor(x: float) -> int:
-    return _to_int(math.floor, x)
-
-
-def ceil(x: float) -> int:
-    return _to_int(math.ceil, x)
-
-
-def _to_int(convert: Callable[[float], int], x: float) -> int:
-    try:
-        return convert(x)
-    except (ValueError, OverflowError):
-        raise NonFiniteError(f"{x} is no integer") from None
-
-
-def clamp(x: float, low: float, high: float) -> float:
-    return low if x < low else high if x > high else x  # noqa: FURB136 - min() takes three times as long
-
-
-def wrap(x: int, low: int, high: int) -> int:
-    return (x - low) % (high - low + 1) + low
-
-
-def fit(x: int, low: int, high: int) -> int:
-    """Passes an integer that the target can hold (not callable from a table)."""
-    if low <= x <= high:
-        return x
-    raise MappingError(f"{x} is outside {low}..{high}")
-
-
-def fit_wide_text(x: str, bound: int) -> str:
-    """Passes text of at most `bound` UTF-16 code units (not callable from a table)."""
-    length = len(x.encode("utf-16-le")) // 2
-    if length <= bound:
-        return x
-    raise MappingError(f"{length} characters are more than {bound}")
-
-
-def fit_text(x: str | bytes, bound: int) -> str | bytes:
-    """Passes text or bytes of at most `bound` bytes (not callable from a table)."""
-    length = len(x.encode() if isinstance(x, str) else x)
-    if length <= bound:
-        return x
-    raise MappingError(f"{length} bytes are more than {bound}")
-
-
-def to_float32(x: float) -> float:
-    if math.isinf(x) or abs(x) < FLOAT32_END or math.isnan(x):
-        return x
-    raise MappingError(f"{x} is too large for a float32")
-
-
-FLOAT32_END = 3.4028235677973366e38
-"""The smallest magnitude that does not round to a finite float32."""
-
-
-def seconds(time: int) -> float:
-    return time / NS_PER_SECOND
-
-
-def time_from_seconds(x: float) -> int:
-    return _to_int(round, x * NS_PER_SECOND)
-
-
-def time_from_milliseconds(x: float) -> int:
-    return _to_int(round, x * 1_000_000)
-
-
-def _same(kinds: Sequence[Kind]) -> Kind:
-    joined = kinds[0]
-    for kind in kinds[1:]:
-        joined = join(joined, kind) or joined
-    return joined
-
-
-def _integer(kinds: Sequence[Kind]) -> Kind:
-    """Integers stay what they are; of a float only the value at run time tells."""
-    return as_int(kinds[0]) or IntKind(None, None)
-
-
-def _absolute(kinds: Sequence[Kind]) -> Kind:
-    known = as_int(kinds[0])
-    if known is None or known.low is None or known.high is None:
-        return kinds[0]
-    largest = max(abs(known.low), abs(known.high))
-    return IntKind(0 if known.low <= 0 <= known.high else min(abs(known.low), abs(known.high)), largest)
-
-
-def _extreme(pick: Callable[[list[int]], int]) -> Callable[[Sequence[Kind]], Kind]:
-    def result(kinds: Sequence[Kind]) -> Kind:
-        integers = [as_int(kind) for kind in kinds]
-        known = [kind for kind in integers if kind and kind.low is not None and kind.high is not None]
-        if len(known) != len(kinds):
-            return _same(kinds)
-        return IntKind(pick([kind.low for kind in known]), pick([kind.high for kind in known]))  # type: ignore[misc]
-
-    return result
-
-
-def _clamped(kinds: Sequence[Kind]) -> Kind:
-    _, low, high = (as_int(kind) for kind in kinds)
-    if as_int(kinds[0]) is None or low is None or high is None:
-        return _same(kinds)
-    if low.low is None or low.high is None or high.low is None or high.high is None:
-        return IntKind(None, None)
-    _want_ordered(low.low, high.high)
-    return IntKind(min(low.low, high.low), max(low.high, high.high))
-
-
-def _wrapped(kinds: Sequence[Kind]) -> Kind:
-    low, high = as_int(kinds[1]), as_int(kinds[2])
-    if low is None or high is None or low.low is None or low.high is None or high.low is None or high.high is None:
-        return IntKind(None, None)
-    _want_ordered(low.low, high.high)
-    # Only the value tells where the bounds may be the wrong way round.
-    return IntKind(low.low, high.high) if low.high <= high.low else IntKind(None, None)
-
-
-def _want_ordered(low: int, high: int) -> None:
-    if low > high:
-        raise ValueError(f"the low bound {low} is above the high bound {high}")
-
-
-def _double(kinds: Sequence[Kind]) -> Kind:
-    return FloatKind(max(map(float_bits, kinds)))
-
-
 def _number(name: str = "x") -> Parameter:
     return Parameter(name, Number, "a number")
 
@@ -207,31 +78,27 @@ def _whole(name: str = "x") -> Parameter:
     return Parameter(name, (IntKind, EnumKind), "an integer")
 
 
-def _constant(kind: Kind) -> Callable[[Sequence[Kind]], Kind]:
-    return lambda _: kind
-
-
 def _math(name: str, summary: str, *examples: tuple[str, object], parameters: tuple[str, ...] = ("x",)) -> Function:
-    return Function(name, tuple(map(_number, parameters)), _double, getattr(math, name), summary, examples)
+    return Function(name, tuple(map(_number, parameters)), result.double, getattr(math, name), summary, examples)
 
 
 _SIZED = (StringKind, BytesKind, ListKind)
 _DECLARED = (
-    Function("abs", (_number(),), _absolute, abs, "The magnitude of a number.", (("abs(-3)", 3),)),
-    Function("min", (_number("a"), _number("b")), _extreme(min), min, "The smallest argument.",
+    Function("abs", (_number(),), result.absolute, abs, "The magnitude of a number.", (("abs(-3)", 3),)),
+    Function("min", (_number("a"), _number("b")), result.extreme(min), min, "The smallest argument.",
              (("min(2, 1.5)", 1.5),), variadic=True),
-    Function("max", (_number("a"), _number("b")), _extreme(max), max, "The largest argument.",
+    Function("max", (_number("a"), _number("b")), result.extreme(max), max, "The largest argument.",
              (("max(2, 3, 1)", 3),), variadic=True),
-    Function("round", (_number(),), _integer, round_half_even,
+    Function("round", (_number(),), result.integer, round_half_even,
              "The nearest integer, the even one of two. NaN and infinities drop the target.",
              (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
-    Function("trunc", (_number(),), _integer, truncate, "The integer towards zero.", (("trunc(-2.7)", -2),)),
-    Function("floor", (_number(),), _integer, floor, "The integer at or below.", (("floor(-2.5)", -3),)),
-    Function("ceil", (_number(),), _integer, ceil, "The integer at or above.", (("ceil(2.1)", 3),)),
-    Function("clamp", (_number(), _number("low"), _number("high")), _clamped, clamp,
+    Function("trunc", (_number(),), result.integer, truncate, "The integer towards zero.", (("trunc(-2.7)", -2),)),
+    Function("floor", (_number(),), result.integer, floor, "The integer at or below.", (("floor(-2.5)", -3),)),
+    Function("ceil", (_number(),), result.integer, ceil, "The integer at or above.", (("ceil(2.1)", 3),)),
+    Function("clamp", (_number(), _number("low"), _number("high")), result.clamped, clamp,
              "The number, held between two bounds; without bounds, those of the integer field that it fills.",
              (("clamp(300, 0, 255)", 255), ("clamp(-1.5, -1.0, 1.0)", -1.0)), optional=2),
-    Function("wrap", (_whole(), _whole("low"), _whole("high")), _wrapped, wrap,
+    Function("wrap", (_whole(), _whole("low"), _whole("high")), result.wrapped, wrap,
              "The integer, counted on from the low bound when it passes the high one; without bounds, those of "
              "the integer field that it fills.",
              (("wrap(256, 0, 255)", 0), ("wrap(-1, 0, 255)", 255), ("wrap(190, -180, 179)", -170)), optional=2),
@@ -245,22 +112,21 @@ _DECLARED = (
     _math("atan2", "The angle of the point (x, y) in radians, -pi to pi.", ("atan2(0, 1)", 0.0),
           parameters=("y", "x")),
     _math("hypot", "The length of the vector (x, y).", ("hypot(3, 4)", 5.0), parameters=("x", "y")),
-    Function("float32", (_number(),), _constant(FloatKind(32)), to_float32,
+    Function("float32", (_number(),), result.constant(FloatKind(32)), to_float32,
              "Says that a double, or a large integer, may lose digits in a float32.", (("float32(0.5)", 0.5),)),
-    Function("float64", (_number(),), _constant(FloatKind(64)), float,
+    Function("float64", (_number(),), result.constant(FloatKind(64)), float,
              "Says that a large integer may lose digits in a double.", (("float64(3)", 3.0),)),
     Function("int", (Parameter("x", (BoolKind, IntKind, EnumKind), "a bool, an integer or an enum"),),
-             lambda kinds: IntKind(0, 1) if isinstance(kinds[0], BoolKind) else _integer(kinds), int,
-             "A bool as 0 or 1, an enum as its number.", (("int(True)", 1),)),
+             result.integer_or_bool, int, "A bool as 0 or 1, an enum as its number.", (("int(True)", 1),)),
     Function("str", (Parameter("x", (BoolKind, IntKind, FloatKind, EnumKind, StringKind), "a scalar"),),
-             _constant(StringKind()), str, "A scalar as text.", (("'wheel_' + str(3)", "wheel_3"),)),
-    Function("len", (Parameter("x", _SIZED, "a list, a string or bytes"),), _constant(IntKind(0, (1 << 32) - 1)),
+             result.constant(StringKind()), str, "A scalar as text.", (("'wheel_' + str(3)", "wheel_3"),)),
+    Function("len", (Parameter("x", _SIZED, "a list, a string or bytes"),), result.constant(IntKind(0, (1 << 32) - 1)),
              len, "How many elements a list has, or characters a string.", (("len([1, 2])", 2),)),
-    Function("seconds", (Parameter("time", (TimeKind,), "a time"),), _constant(FloatKind(64)), seconds,
+    Function("seconds", (Parameter("time", (TimeKind,), "a time"),), result.constant(FloatKind(64)), seconds,
              "A time as seconds since 1970.", (("seconds(time_from_seconds(1.5))", 1.5),)),
-    Function("time_from_seconds", (_number(),), _constant(TimeKind()), time_from_seconds,
+    Function("time_from_seconds", (_number(),), result.constant(TimeKind()), time_from_seconds,
              "Seconds since 1970 as a time.", (("time_from_seconds(2)", 2_000_000_000),)),
-    Function("time_from_milliseconds", (_number(),), _constant(TimeKind()), time_from_milliseconds,
+    Function("time_from_milliseconds", (_number(),), result.constant(TimeKind()), time_from_milliseconds,
              "Milliseconds since 1970 as a time.", (("time_from_milliseconds(1500)", 1_500_000_000),)),
 )  # fmt: skip
 

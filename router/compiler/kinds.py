@@ -15,6 +15,7 @@ TIME_TYPES = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/D
 """ROS messages that expressions see as one value: a time or a duration, in nanoseconds."""
 
 INT32 = Int(32, signed=True)
+"""What an enum can be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +31,17 @@ class IntKind:
     low: int | None
     high: int | None
 
+    @property
+    def bounds(self) -> tuple[int, int] | None:
+        """Both, or None where only the value at run time tells."""
+        return None if self.low is None or self.high is None else (self.low, self.high)
+
     def __str__(self) -> str:
-        if self.low is None or self.high is None:
+        if self.bounds is None:
             return "int"
         for bits in (8, 16, 32, 64):
             for signed in (False, True):
-                if (Int(bits, signed).low, Int(bits, signed).high) == (self.low, self.high):
+                if (Int(bits, signed).low, Int(bits, signed).high) == self.bounds:
                     return str(Int(bits, signed))
         return f"int {self.low}" if self.low == self.high else f"int {self.low}..{self.high}"
 
@@ -97,8 +103,10 @@ class ListKind:
         return f"list of {self.element}" if self.element else "empty list"
 
 
+ANY_INT = IntKind(None, None)
 Kind = Union[BoolKind, IntKind, FloatKind, StringKind, BytesKind, EnumKind, TimeKind, MessageKind, ListKind]
 Number = (IntKind, FloatKind, EnumKind)
+"""The kinds that arithmetic takes, for isinstance()."""
 
 
 def kind_of(declared: Type) -> Kind:
@@ -139,15 +147,23 @@ def join(left: Kind, right: Kind) -> Kind | None:
     if left == right:
         return left
     if isinstance(left, Number) and isinstance(right, Number):
-        a, b = as_int(left), as_int(right)
-        if a is None or b is None:
-            return FloatKind(max(float_bits(left), float_bits(right)))
-        if None in (a.low, a.high, b.low, b.high):
-            return IntKind(None, None)
-        return IntKind(min(a.low, b.low), max(a.high, b.high))  # type: ignore[type-var]
+        return _join_numbers(left, right)
     if isinstance(left, ListKind) and isinstance(right, ListKind):
-        if left.element is None or right.element is None:
-            return ListKind(left.element or right.element)
-        element = join(left.element, right.element)
-        return ListKind(element, left.length if left.length == right.length else None) if element else None
+        return _join_lists(left, right)
     return None
+
+
+def _join_numbers(left: Kind, right: Kind) -> Kind:
+    a, b = as_int(left), as_int(right)
+    if a is None or b is None:
+        return FloatKind(max(float_bits(left), float_bits(right)))
+    if a.bounds is None or b.bounds is None:
+        return ANY_INT
+    return IntKind(min(*a.bounds, *b.bounds), max(*a.bounds, *b.bounds))
+
+
+def _join_lists(left: ListKind, right: ListKind) -> Kind | None:
+    if left.element is None or right.element is None:
+        return ListKind(left.element or right.element)
+    element = join(left.element, right.element)
+    return ListKind(element, left.length if left.length == right.length else None) if element else None
