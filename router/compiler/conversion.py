@@ -1,175 +1,102 @@
-"""Whether one scalar value fits the field that it fills, and the syntax that converts it.
+"""From a checked value to the plan of the field that it fills: messages field by field, lists element by element.
 
-The rules: nothing is lost without being asked for. Ranges that are known now are checked now; a range
-that only the value tells (a rounded float) is checked at run time and drops the target. An enum
-saturates into a narrower integer, as the boards' firmware does.
+Whether a scalar fits is for `scalars` to say. Every function raises Finding where the value does not fit.
 """
 
 from __future__ import annotations
 
 import ast
 
-from router.compiler.expressions import Finding, Typed, placed
-from router.compiler.implementations import FLOAT32_END, clamp
-from router.compiler.kinds import (
-    INT32,
-    BoolKind,
-    BytesKind,
-    EnumKind,
-    FloatKind,
-    IntKind,
-    StringKind,
-    TimeKind,
-)
-from router.errors import Code
-from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
-
-EXACT_INTEGER_BITS = {32: 24, 64: 53}
-"""Up to this many bits every integer is exactly a float of that width."""
+from router.compiler import scalars
+from router.compiler.expressions import Finding, Scope, Typed
+from router.compiler.implementations import NS_PER_SECOND
+from router.compiler.kinds import BytesKind, Kind, ListKind, MessageKind, TimeKind, kind_of
+from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
+from router.compiler.syntax import name
+from router.errors import Code, SourceSpan
+from router.types.model import Field, Int, List, MessageType, Type
 
 
-def scalar(value: Typed, target: Type) -> ast.expr:
-    """The expression that fills a scalar field. Raises Finding when it does not fit."""
-    match target:
-        case Bool():
-            return _to_bool(value, target)
-        case Int():
-            return _to_int(value, target)
-        case Float():
-            return _to_float(value, target)
-        case String():
-            return _to_string(value, target)
-        case Enum():
-            return _to_enum(value, target)
-        case Bytes():
-            return _to_bytes(value, target)
-        case List() | MessageType():
-            raise AssertionError(f"{target} is no scalar")
+def convert(value: Typed, target: Type, scope: Scope) -> Plan:
+    if isinstance(target, MessageType):
+        return _to_message(value, target, scope)
+    if isinstance(target, List):
+        return _to_list(value, target, scope)
+    if isinstance(value.kind, MessageKind) and len(value.kind.type.fields) == 1:
+        (only,) = value.kind.type.fields
+        return convert(scope.field_of(value, only, value.span), target, scope)
+    return Leaf(target, scalars.converted(value, target), value.span)
 
 
-def mismatch(value: Typed, target: Type, hint: str = "") -> Finding:
-    return Finding(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
+def same_named(holder: Typed, member: Field, scope: Scope) -> Typed | None:
+    """The field of a message that is called as `member` is, None when `holder` has none."""
+    found = holder.kind.type.field(member.name) if isinstance(holder.kind, MessageKind) else None
+    return scope.field_of(holder, found, holder.span) if found else None
 
 
-def want_length(value: Typed, target: List, length: int) -> None:
-    """Raises Finding when a list of known length does not fill the target."""
+def unset(member: Field, span: SourceSpan) -> Unset:
+    return Unset(member.type, member.default, span)
+
+
+# messages
+
+
+def _to_message(value: Typed, target: MessageType, scope: Scope) -> Plan:
+    if isinstance(value.kind, TimeKind) and target.name == "builtin_interfaces/msg/Time":
+        return _to_time(value, target)
+    if isinstance(value.kind, MessageKind):
+        return _to_same_named(value, value.kind.type, target, scope)
+    if len(target.fields) == 1:
+        (only,) = target.fields
+        return Record(target, ((only, convert(value, only.type, scope)),), value.span)
+    raise scalars.mismatch(value, target, "map its fields one by one")
+
+
+def _to_time(value: Typed, target: MessageType) -> Record:
+    def part(member: Field, op: ast.operator) -> tuple[Field, Plan]:
+        made = ast.BinOp(value.node, op, ast.Constant(NS_PER_SECOND))
+        return member, Leaf(member.type, Typed.at(value.span, value.kind, made).node, value.span)
+
+    sec, nanosec = target.fields
+    return Record(target, (part(sec, ast.FloorDiv()), part(nanosec, ast.Mod())), value.span)
+
+
+def _to_same_named(value: Typed, source: MessageType, target: MessageType, scope: Scope) -> Record:
+    members: list[tuple[Field, Plan]] = []
+    for member in target.fields:
+        given = same_named(value, member, scope)
+        members.append((member, convert(given, member.type, scope) if given else unset(member, value.span)))
+    if target.fields and not any(source.field(member.name) for member in target.fields):
+        raise scalars.mismatch(value, target, "they have no field name in common")
+    return Record(target, tuple(members), value.span)
+
+
+# lists
+
+
+def _to_list(value: Typed, target: List, scope: Scope) -> Plan:
+    if value.items is not None:
+        _want_length(value, target, len(value.items))
+        return Items(target, tuple(convert(item, target.element, scope) for item in value.items), value.span)
+    element_kind, length = _elements(value.kind)
+    if element_kind is None:
+        raise scalars.mismatch(value, target, "write a list, [a, b]")
+    if length is not None:
+        _want_length(value, target, length)
+    variable = scope.locals.loop()
+    element = Typed.at(value.span, element_kind, name(variable))
+    return Each(target, value.node, variable, convert(element, target.element, scope), value.span)
+
+
+def _elements(kind: Kind) -> tuple[Kind | None, int | None]:
+    """The kind and number of a list's elements, each None where there is none or it is not known."""
+    if isinstance(kind, BytesKind):
+        return kind_of(Int(8, signed=False)), None
+    return (kind.element, kind.length) if isinstance(kind, ListKind) else (None, None)
+
+
+def _want_length(value: Typed, target: List, length: int) -> None:
     if target.length is not None and length != target.length:
         raise Finding(value.span, Code.TYPE_MISMATCH, f"{target} takes {target.length} elements, not {length}")
     if target.bound is not None and length > target.bound:
         raise Finding(value.span, Code.OUT_OF_RANGE, f"{target} takes at most {target.bound} elements, not {length}")
-
-
-def _to_bool(value: Typed, target: Bool) -> ast.expr:
-    if isinstance(value.kind, BoolKind):
-        return value.node
-    raise mismatch(value, target, "compare it, as in x != 0" if isinstance(value.kind, (IntKind, FloatKind)) else "")
-
-
-def _to_int(value: Typed, target: Int) -> ast.expr:
-    match value.kind:
-        case EnumKind():
-            return _saturate(value, target)
-        case IntKind(low, high):
-            return _fit(value, target, low, high)
-        case FloatKind():
-            hint = "say how: round() or trunc()"
-            raise Finding(value.span, Code.LOSSY_CONVERSION, f"a float does not fit {target}", hint)
-        case BoolKind():
-            raise mismatch(value, target, "int() makes a number of a bool")
-        case TimeKind():
-            raise mismatch(value, target, "round(seconds(...)) makes a number of a time")
-        case _:
-            raise mismatch(value, target)
-
-
-def _saturate(value: Typed, target: Int) -> ast.expr:
-    """The usual value passes with one comparison; only one that does not fit costs a call."""
-    if target.low <= INT32.low and INT32.high <= target.high:
-        return value.node
-    if isinstance(value.constant, int):
-        return placed(ast.Constant(clamp(value.constant, target.low, target.high)), value.span)
-    bind = ast.NamedExpr(ast.Name("v", ast.Store()), value.node)
-    inside = ast.Compare(ast.Constant(target.low), [ast.LtE(), ast.LtE()], [bind, ast.Constant(target.high)])
-    held = ast.Name("v", ast.Load())
-    outside = _call("clamp", ast.Name("v", ast.Load()), target.low, target.high)
-    return placed(ast.IfExp(inside, held, outside), value.span)
-
-
-def _fit(value: Typed, target: Int, low: int | None, high: int | None) -> ast.expr:
-    if low is None or high is None:
-        return placed(_call("fit", value.node, target.low, target.high), value.span)
-    if target.low <= low and high <= target.high:
-        return value.node
-    if high < target.low or low > target.high:
-        limits = f"{target.low}..{target.high}"
-        raise Finding(value.span, Code.OUT_OF_RANGE, f"{value.kind} does not fit {target}", f"it holds {limits}")
-    hint = "say how: clamp() or wrap()"
-    raise Finding(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
-
-
-def _to_float(value: Typed, target: Float) -> ast.expr:
-    limit = 1 << EXACT_INTEGER_BITS[target.bits]
-    match value.kind:
-        case FloatKind(bits):
-            if isinstance(value.constant, float) and target.bits == 32 and abs(value.constant) >= FLOAT32_END:
-                raise Finding(value.span, Code.OUT_OF_RANGE, f"{value.constant!r} does not fit float32")
-            if bits > target.bits:
-                hint = "float32() says that losing digits is meant"
-                raise Finding(value.span, Code.LOSSY_CONVERSION, f"a double does not fit {target}", hint)
-            return value.node
-        case IntKind(low, high):
-            if low is None or high is None or (-limit <= low and high <= limit):
-                return value.node
-            hint = f"float{target.bits}() says that losing digits is meant"
-            raise Finding(value.span, Code.LOSSY_CONVERSION, f"{value.kind} does not fit {target}", hint)
-        case EnumKind() | BoolKind():
-            raise mismatch(value, target, "int() makes a number of it")
-        case TimeKind():
-            raise mismatch(value, target, "seconds() makes a number of a time")
-        case _:
-            raise mismatch(value, target)
-
-
-def _to_string(value: Typed, target: String) -> ast.expr:
-    if not isinstance(value.kind, StringKind):
-        numeric = isinstance(value.kind, (IntKind, FloatKind, EnumKind, BoolKind))
-        raise mismatch(value, target, "str() makes text of it" if numeric else "")
-    if isinstance(value.constant, str):
-        _want_text(value, value.constant, target)
-        return value.node
-    if target.bound is None:
-        return value.node
-    return placed(_call("fit_wide_text" if target.wide else "fit_text", value.node, target.bound), value.span)
-
-
-def _want_text(value: Typed, text: str, target: String) -> None:
-    """Raises Finding when a literal cannot stand in the field."""
-    try:
-        length = len(text.encode("utf-16-le")) // 2 if target.wide else len(text.encode())
-    except UnicodeEncodeError as error:
-        raise Finding(value.span, Code.OUT_OF_RANGE, f"{error.object[error.start]!a} is no character") from None
-    if not target.wide and "\0" in text:
-        raise Finding(value.span, Code.OUT_OF_RANGE, "a string cannot hold a NUL")
-    if target.bound is not None and length > target.bound:
-        unit = "characters" if target.wide else "bytes"
-        raise Finding(value.span, Code.OUT_OF_RANGE, f"{length} {unit} do not fit {target}")
-
-
-def _to_enum(value: Typed, target: Enum) -> ast.expr:
-    match value.kind:
-        case EnumKind(enum) if enum == target:
-            return value.node
-        case IntKind(low, high):
-            return _fit(value, INT32, low, high)
-        case _:
-            raise mismatch(value, target, f"name one of its values: {target.name}.{target.values[0][0]}")
-
-
-def _to_bytes(value: Typed, target: Bytes) -> ast.expr:
-    if not isinstance(value.kind, BytesKind):
-        raise mismatch(value, target)
-    return value.node if target.bound is None else placed(_call("fit_text", value.node, target.bound), value.span)
-
-
-def _call(function: str, value: ast.expr, *limits: int) -> ast.expr:
-    return ast.Call(ast.Name(function, ast.Load()), [value, *map(ast.Constant, limits)], [])

@@ -131,4 +131,7 @@ _DECLARED = (
 )  # fmt: skip
 
 FUNCTIONS: Mapping[str, Function] = {function.name: function for function in _DECLARED}
-"""By name. `has(field)`, which looks at a field rather than at its value, is part of the syntax."""
+"""By name, without `has`."""
+
+HAS = "has"
+"""`has(field)` looks at a field rather than at its value, and so is part of the syntax."""

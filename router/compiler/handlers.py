@@ -7,17 +7,17 @@ It counts in a flat list. `router explain` prints it.
 
 from __future__ import annotations
 
-import ast
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from router.compiler.books import DROP_REASONS, Books
 from router.compiler.cdr import write_message
-from router.compiler.expressions import Locals, Typed, attribute, placed
-from router.compiler.mapping import Record
+from router.compiler.expressions import Locals, Typed
+from router.compiler.plan import Record
 from router.compiler.program import TargetPlan
 from router.compiler.source import Source, namespace_name
+from router.compiler.syntax import attribute, name, placed
 from router.errors import SourceSpan
 
 PARAMETERS = ("m", "datagram", "received_at", "now", "source")
@@ -59,12 +59,13 @@ class HandlerSource:
         self._open_books(target)
         name = self._unique(namespace_name(target.name))
         self.plans.append(TargetPlan(name, target.name, target.plan is not None, target.max_rate))
-        self.out.line(f"# {'topic' if target.plan else 'destination'} {target.name}", target.span)
-        if target.plan is None:
+        plan = target.plan
+        self.out.line(f"# {'topic' if plan else 'destination'} {target.name}", target.span)
+        if plan is None:
             self._guarded(target, name, lambda: self._send(target, name))
             return
         with self.out.block(f"if wanted_{name}[0]:", target.span):
-            self._guarded(target, name, lambda: self._publish(target, name))
+            self._guarded(target, name, lambda: self._publish(target, name, plan))
         with self.out.block("else:", target.span):
             self._count("messages_filtered", target)
 
@@ -87,27 +88,23 @@ class HandlerSource:
     def _guarded(self, target: Target, name: str, serve: Callable[[], None]) -> None:
         """What fails for one target is counted there and leaves the others alone."""
         with self.out.block("try:", target.span):
-            for path, local in target.locals.bound.items():
-                holder = target.locals.name(path[:-1])
-                made = self.out.expression(placed(attribute(ast.Name(holder, ast.Load()), path[-1]), target.span))
-                self.out.line(f"{local} = {made}", target.span)
+            bind_locals(self.out, target.locals, target.span)
             self._limited(target, name, serve)
         with self.out.block("except FAILURES as error:", target.span):
             self.out.line(f"lost_{name}(error)", target.span)
 
     def _limited(self, target: Target, name: str, serve: Callable[[], None]) -> None:
-        word = "if"
+        """Serves the target if its `when` is true and its `max_rate` is not used up."""
+        if target.when is None and target.max_rate is None:
+            serve()
+            return
         if target.when is not None:
             with self.out.block(f"if not {self.out.expression(target.when.node)}:", target.when.span):
                 self._count("messages_filtered", target)
-            word = "elif"
         if target.max_rate is not None:
+            word = "if" if target.when is None else "elif"
             with self.out.block(f"{word} not limit_{name}(now):", target.span):
                 self._count("messages_dropped", target, "rate_limited")
-            word = "elif"
-        if word == "if":
-            serve()
-            return
         with self.out.block("else:", target.span):
             serve()
 
@@ -117,7 +114,13 @@ class HandlerSource:
         self.out.line(f"counts[{slot}] += send_{name}({datagram})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
 
-    def _publish(self, target: Target, name: str) -> None:
-        assert target.plan is not None  # noqa: S101 - _target() asked
-        self.out.line(f"publish_{name}({write_message(self.out, target.plan, name)})", target.span)
+    def _publish(self, target: Target, name: str, plan: Record) -> None:
+        self.out.line(f"publish_{name}({write_message(self.out, plan, name)})", target.span)
         self._count("messages_published", target)
+
+
+def bind_locals(out: Source, variables: Locals, span: SourceSpan) -> None:
+    """Appends an assignment for each submessage that expressions look into."""
+    for path, local in variables.bound.items():
+        made = placed(attribute(name(variables.name(path[:-1])), path[-1]), span)
+        out.line(f"{local} = {out.expression(made)}", span)

@@ -14,6 +14,14 @@ from router.compiler.books import Books
 from router.table.model import Address, Framing, RouteTable
 from router.types.protobuf import Envelope, PayloadCase
 
+STRANGER = None
+"""Stands among a handler's sources for a sender that is no endpoint of the table."""
+
+
+def source_label(source: str | None) -> str:
+    """The `source` label of a sender: its name, or `unknown` for a stranger on a route that takes any."""
+    return source if source is not None else "unknown"
+
 
 @dataclass(frozen=True, slots=True)
 class ListenerPlan:
@@ -80,7 +88,7 @@ class Handler:
 
     `code` defines the function called `function`. Executed in a namespace that holds `constants` and what the
     engine binds for `targets` (see engine.binding), it serves one parsed message. `source` is the same
-    as text. `sources` are the endpoints that may send it; None among them stands for a stranger.
+    as text. `sources` are the endpoints that may send it, perhaps with STRANGER among them.
     """
 
     case: PayloadCase

@@ -85,7 +85,8 @@ class RouteChecker:
             self._report(route.case.span, Code.NO_TARGET, f"'{route.case.value}' goes nowhere",
                          "name destinations or topics, or say `ignore: reason`")  # fmt: skip
         for topic in route.topics:
-            self.findings += [finding for finding in (topic_name_finding(topic), *qos_findings(topic, publishes=not route.is_outbound)) if finding]
+            found = (topic_name_finding(topic), *qos_findings(topic, publishes=not route.is_outbound))
+            self.findings += [finding for finding in found if finding]
         targets = self._outbound(route, case) if route.is_outbound else self._inbound(route, case)
         return CheckedRoute(route, case, tuple(targets))
 

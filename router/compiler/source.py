@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import CodeType
 
-from router.compiler.expressions import place
+from router.compiler.syntax import PLACEABLE, place
 from router.errors import SourceSpan
 
 INDENT = "    "
@@ -62,7 +62,6 @@ class Source:
 
     def text(self) -> str:
         """What `router explain` prints."""
-
         return "\n".join(self._shown(line) for line, _ in self._lines) + "\n"
 
     def _shown(self, line: str) -> str:
@@ -79,10 +78,9 @@ class Source:
         """The same as a syntax tree with the table's positions."""
         module = ast.parse("\n".join(line for line, _ in self._lines))
         for node in ast.walk(module):
-            if hasattr(node, "lineno"):
+            if isinstance(node, PLACEABLE):
                 place(node, self._lines[node.lineno - 1][1])
-        grafted = _Graft(self._expressions).visit(module)
-        assert isinstance(grafted, ast.Module)  # noqa: S101 - a module stays one
+        grafted: ast.Module = _Graft(self._expressions).visit(module)
         return grafted
 
     def compile(self, file: str) -> CodeType:

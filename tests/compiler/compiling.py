@@ -6,10 +6,11 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from router.compiler import _NAMESPACE
 from router.compiler.cdr import write_message
-from router.compiler.expressions import Locals, Scope, Typed, attribute, check, placed
+from router.compiler.expressions import Locals, Scope, Typed, check
+from router.compiler.handlers import bind_locals
 from router.compiler.mapping import build
+from router.compiler.namespace import NAMESPACE
 from router.compiler.program import Handler, Program
 from router.compiler.reference import fill
 from router.compiler.reference_cdr import cdr
@@ -58,19 +59,11 @@ def compiled(text: str, scope: Scope, expected: Type | None = None) -> tuple[Typ
     typed = check(written(text), scope, expected)
     out = Source()
     with out.block("def evaluate(m, source, received_at):", SPAN):
-        bind_locals(out, scope)
+        bind_locals(out, scope.locals, SPAN)
         out.line(f"return {out.expression(typed.node)}", SPAN)
-    namespace: dict[str, Any] = dict(_NAMESPACE)
+    namespace: dict[str, Any] = dict(NAMESPACE)
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
     return typed, lambda message: namespace["evaluate"](message, SOURCE, RECEIVED_AT)
-
-
-def bind_locals(out: Source, scope: Scope) -> None:
-    import ast
-
-    for path, local in scope.locals.bound.items():
-        holder = ast.Name(scope.locals.name(path[:-1]), ast.Load())
-        out.line(f"{local} = {out.expression(placed(attribute(holder, path[-1]), SPAN))}", SPAN)
 
 
 def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[[Any], bytes]:
@@ -79,9 +72,9 @@ def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[
     assert mapping.findings == []
     out = Source()
     with out.block("def serialize(m, source, received_at):", SPAN):
-        bind_locals(out, scope)
+        bind_locals(out, scope.locals, SPAN)
         out.line(f"return {write_message(out, mapping.plan, 'it')}", SPAN)
-    namespace: dict[str, Any] = {**_NAMESPACE, **out.constants}
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
     return lambda message: bytes(namespace["serialize"](message, SOURCE, RECEIVED_AT))
 

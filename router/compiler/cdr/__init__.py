@@ -1,0 +1,13 @@
+"""From a mapping's plan to code that fills a ROS message straight into CDR bytes.
+
+Plain CDR, little-endian (XCDR1, as Fast DDS and Cyclone DDS speak it): four bytes of header, then each
+scalar aligned to its own size counted from behind the header. Up to the first string or sequence of
+unknown length all offsets are known when the code is made, so that whole stretch is one `struct` call.
+"""
+
+from __future__ import annotations
+
+from router.compiler.cdr.generation import write_message
+from router.compiler.cdr.steps import message_size
+
+__all__ = ["write_message", "message_size"]

@@ -1,0 +1,145 @@
+"""The code that writes a plan as CDR bytes: as few `struct` calls as alignment allows.
+
+What comes before the first string or list is one call with all offsets known. Behind it, offsets are known
+modulo 8 when the code runs, and one of eight packers is taken.
+"""
+
+from __future__ import annotations
+
+import ast
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Union
+
+from router.compiler.cdr.steps import HEADER, Blob, Put, Repeat, Step, Text, steps
+from router.compiler.plan import Record
+from router.compiler.source import Source
+from router.errors import SourceSpan
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Scalars and known bytes in a row."""
+
+    parts: tuple[Put | Blob, ...]
+
+    def static(self, prefix: bytes) -> tuple[str, list[Put | bytes]]:
+        """Struct format and arguments where the run begins at offset 0, behind `prefix`.
+
+        Known neighbours and the padding between them become one argument.
+        """
+        letters, arguments, known, offset = ["<"], list[Union[Put, bytes]](), bytearray(prefix), 0
+        for part in self.parts:
+            padding = -offset % part.alignment
+            known += bytes(padding)
+            offset += padding + part.size
+            if isinstance(part, Blob):
+                known += part.data
+                continue
+            _add_known(bytes(known), letters, arguments)
+            known.clear()
+            letters.append(part.format)
+            arguments.append(part)
+        _add_known(bytes(known), letters, arguments)
+        return "".join(letters), arguments
+
+    def floating(self, phase: int) -> tuple[str, list[Put | bytes]]:
+        """The same where the run begins at an offset of `phase` modulo 8: equal arguments for each phase."""
+        letters, arguments, offset = ["<"], list[Union[Put, bytes]](), phase
+        for part in self.parts:
+            padding = -offset % part.alignment
+            _add_known(bytes(padding), letters, arguments)
+            offset += padding + part.size
+            if isinstance(part, Blob):
+                _add_known(part.data, letters, arguments)
+            else:
+                letters.append(part.format)
+                arguments.append(part)
+        return "".join(letters), arguments
+
+
+def _add_known(data: bytes, letters: list[str], arguments: list[Put | bytes]) -> None:
+    if any(data):
+        letters.append(f"{len(data)}s")
+        arguments.append(data)
+    elif data:
+        letters.append(f"{len(data)}x")  # zeros, which struct writes by itself
+
+
+def write_message(out: Source, plan: Record, name: str) -> str:
+    """Appends the code that makes the CDR bytes of a message. Returns the expression that is the bytes.
+
+    `name` goes into the names of packers and known bytes; messages of one function have different ones.
+    """
+    runs = _runs(steps(plan))
+    first = runs[0] if isinstance(runs[0], _Run) else _Run(())
+    fixed = runs == [first]
+    letters, arguments = first.static(HEADER if fixed else b"")
+    pack = out.constant(f"pack_{name}", struct.Struct(letters).pack)
+    _call(out, "data = {}" if fixed else "data = bytearray({})", name, pack, arguments, plan.span)
+    if fixed:
+        return "data"
+    _write(out, runs[1:] if runs[0] is first else runs, name, plan.span)
+    return "HEADER + data"
+
+
+def _runs(sequence: Iterable[Step]) -> list[_Run | Text | Repeat]:
+    """Never empty; neighbouring scalars and known bytes are one run."""
+    found: list[_Run | Text | Repeat] = []
+    together: list[Put | Blob] = []
+    for step in sequence:
+        if isinstance(step, (Put, Blob)):
+            together.append(step)
+            continue
+        if together:
+            found.append(_Run(tuple(together)))
+            together = []
+        found.append(step)
+    return [*found, _Run(tuple(together))] if together or not found else found
+
+
+def _call(
+    out: Source, statement: str, name: str, function: str, arguments: Sequence[Put | bytes], span: SourceSpan
+) -> None:
+    """A statement around a call with one argument a line."""
+    before, _, after = statement.partition("{}")
+    out.line(f"{before}{function}(", span)
+    with out.indented():
+        for argument in arguments:
+            if isinstance(argument, bytes):
+                out.line(f"{out.constant(f'known_{name}', argument)},", span)
+            else:
+                out.line(f"{out.expression(argument.node)},", argument.span)
+    out.line(f"){after}", span)
+
+
+def _write(out: Source, runs: Iterable[_Run | Text | Repeat], name: str, span: SourceSpan) -> None:
+    """What comes after the first string or sequence: offsets are known when it runs, modulo 8."""
+    for run in runs:
+        match run:
+            case _Run():
+                packers = tuple(struct.Struct(run.floating(phase)[0]).pack for phase in range(8))
+                at = out.constant(f"pack_{name}_at", packers)
+                _call(out, "data += {}", name, f"{at}[len(data) & 7]", run.floating(0)[1], span)
+            case Text():
+                put = "put_wide_text" if run.wide else "put_text"
+                out.line(f"{put}(data, {out.expression(run.node)})", run.span)
+            case Repeat():
+                _repeat(out, run, name)
+
+
+def _repeat(out: Source, repeat: Repeat, name: str) -> None:
+    values = out.expression(repeat.values)
+    out.line(f"values = {values}", repeat.span)
+    if repeat.type.length is not None:
+        out.line(f"want_length(len(values), {repeat.type.length})", repeat.span)
+    else:
+        out.line(f"put_length(data, len(values), {repeat.type.bound})", repeat.span)
+    if len(repeat.body) == 1 and isinstance(body := repeat.body[0], Put):
+        plain = isinstance(body.node, ast.Name) and body.node.id == repeat.variable
+        each = "values" if plain else f"[{out.expression(body.node)} for {repeat.variable} in values]"
+        out.line(f"put_numbers(data, {body.format!r}, {body.size}, {each})", repeat.span)
+        return
+    with out.block(f"for {repeat.variable} in values:", repeat.span):
+        _write(out, _runs(repeat.body), name, repeat.span)

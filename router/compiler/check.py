@@ -1,0 +1,75 @@
+"""Checks a table and everything that it refers to, and collects what there is to say about it.
+
+The same check serves `validate`, `explain` and `run`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from router.compiler.definitions import Definitions
+from router.compiler.link import link
+from router.compiler.network import network_findings
+from router.compiler.program import Program
+from router.compiler.routes import CheckedRoute, RouteChecker, sorted_findings
+from router.compiler.topics import meeting_findings
+from router.errors import Diagnostic, Severity, TableError
+from router.table import load_table
+from router.table.model import RouteTable
+from router.types.lock import check_lock, locked_size
+from router.types.protobuf import Envelope, ProtoSchema, find_envelope
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A table after all checks. `program` is None while there is an error among the findings."""
+
+    path: Path
+    diagnostics: Sequence[Diagnostic]
+    table: RouteTable | None = None
+    schema: ProtoSchema | None = None
+    envelope: Envelope | None = None
+    routes: Sequence[CheckedRoute] = ()
+
+    @property
+    def has_errors(self) -> bool:
+        return any(finding.severity is Severity.ERROR for finding in self.diagnostics)
+
+    @cached_property
+    def program(self) -> Program | None:
+        """Made when first asked for: `validate` needs none."""
+        if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
+            return None
+        return link(self.table, self.schema, self.envelope, self.routes)
+
+
+def check_table(
+    path: Path, environ: Mapping[str, str] | None = None, definitions: Definitions | None = None
+) -> Checked:
+    """Checks a table and everything that it refers to. Never raises for what a person may have written.
+
+    `environ` fills the table's variables, None means the process environment. Pass one `definitions` to
+    several calls to read `.proto` files and ROS interfaces once.
+    """
+    table, findings = load_table(path, environ)
+    if table is None:
+        return Checked(path, sorted_findings(findings))
+    definitions = definitions or Definitions()
+    try:
+        schema = definitions.protos(table.envelope.protos.value, table.envelope.protos.span)
+        envelope = find_envelope(schema, table.envelope)
+    except TableError as error:
+        return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
+    checker = RouteChecker(table, schema, envelope, definitions, locked_size(schema) or envelope.max_size)
+    routes = checker.check_all()
+    findings = [
+        *findings,
+        *check_lock(schema, envelope),
+        *network_findings(table),
+        *checker.findings,
+        *meeting_findings(table, [checked.route for checked in routes]),
+    ]
+    return Checked(path, sorted_findings(findings), table, schema, envelope, routes)

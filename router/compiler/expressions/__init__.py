@@ -1,0 +1,13 @@
+"""The expressions of a table: a closed subset of Python, checked, typed and turned into Python syntax.
+
+`checker` walks an expression and asks the modules beside it for the rules. None of them knows of the field that an
+expression fills, but for the bounds that clamp() and wrap() take from it: whether a value fits is `conversion`'s.
+"""
+
+from __future__ import annotations
+
+from router.compiler.expressions.checker import DEEPEST, check
+from router.compiler.expressions.scope import Locals, Scope
+from router.compiler.expressions.typed import Finding, Typed
+
+__all__ = ["check", "Finding", "Typed", "Scope", "Locals", "DEEPEST"]

@@ -1,0 +1,178 @@
+"""Operators: what they take, of which kind the result is, and between which bounds an integer result lies.
+
+Operands come here checked. Knows no names and no text.
+"""
+
+from __future__ import annotations
+
+import ast
+import operator
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+from router.compiler.expressions.forbidden import forbidden
+from router.compiler.expressions.literals import folded, within_bounds
+from router.compiler.expressions.typed import Finding, Typed
+from router.compiler.kinds import (
+    ANY_INT,
+    BoolKind,
+    FloatKind,
+    IntKind,
+    Kind,
+    ListKind,
+    MessageKind,
+    Number,
+    StringKind,
+    TimeKind,
+    as_int,
+    float_bits,
+    join,
+)
+from router.errors import Code, SourceSpan
+
+LARGEST_EXPONENT = 8
+
+_MONOTONE: dict[type[ast.operator], Callable[[int, int], int]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+}
+"""Operators whose extremes are at the extremes of their operands."""
+
+_DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
+
+
+# arithmetic
+
+
+def unary(op: ast.unaryop, operand: Typed, span: SourceSpan) -> Typed:
+    if isinstance(op, ast.Not):
+        want_bool(operand, "not")
+        return Typed.at(span, BoolKind(), ast.UnaryOp(op, operand.node))
+    if not isinstance(op, (ast.USub, ast.UAdd)):
+        raise forbidden(op, span)
+    _want_number(operand)
+    negative = isinstance(op, ast.USub)
+    kind: Kind = as_int(operand.kind) or operand.kind
+    if isinstance(kind, IntKind) and kind.bounds and negative:
+        low, high = kind.bounds
+        kind = IntKind(-high, -low)
+    if isinstance(operand.constant, (int, float)):
+        return Typed.at(span, kind, ast.Constant(-operand.constant if negative else operand.constant))
+    return Typed.at(span, kind, ast.UnaryOp(op, operand.node))
+
+
+def want_binary(op: ast.operator, span: SourceSpan) -> None:
+    """Raises Finding for an operator that the language does not have."""
+    if not isinstance(op, (*_MONOTONE, *_DIVISIONS, ast.Pow)):
+        raise forbidden(op, span)
+
+
+def binary(op: ast.operator, left: Typed, right: Typed, span: SourceSpan) -> Typed:
+    made = ast.BinOp(left.node, op, right.node)
+    if isinstance(op, ast.Add) and isinstance(left.kind, StringKind) and isinstance(right.kind, StringKind):
+        return Typed.at(span, StringKind(), made)
+    if isinstance(left.kind, TimeKind) or isinstance(right.kind, TimeKind):
+        raise Finding(span, Code.TYPE_MISMATCH, "times are not computed with", "use seconds(time) and back")
+    _want_number(left)
+    _want_number(right)
+    if isinstance(op, _DIVISIONS) and right.constant == 0:
+        raise _division_by_zero(span)
+    kind = _power(left.kind, right) if isinstance(op, ast.Pow) else _arithmetic(op, left.kind, right.kind, span)
+    result = Typed.at(span, within_bounds(kind, span), made)
+    return result if left.constant is None or right.constant is None else folded(result)
+
+
+def _arithmetic(op: ast.operator, left: Kind, right: Kind, span: SourceSpan) -> Kind:
+    a, b = as_int(left), as_int(right)
+    if a is None or b is None or isinstance(op, ast.Div):
+        return FloatKind(max(float_bits(left), float_bits(right)))
+    if a.bounds is None or b.bounds is None:
+        return ANY_INT
+    if b.bounds == (0, 0) and isinstance(op, _DIVISIONS):
+        raise _division_by_zero(span)
+    extremes = _extremes(op, a.bounds, b.bounds)
+    return IntKind(min(extremes), max(extremes))
+
+
+def _extremes(op: ast.operator, left: tuple[int, int], right: tuple[int, int]) -> list[int]:
+    """Integers among which are the smallest and the largest that `left op right` can be."""
+    low, high = right
+    if compute := _MONOTONE.get(type(op)):
+        return [compute(x, y) for x in left for y in right]
+    if isinstance(op, ast.Mod):  # has the divisor's sign
+        return [min(low + 1, 0), max(high - 1, 0)]
+    divisors = [y for y in (low, high, -1, 1) if low <= y <= high and y != 0]
+    return [x // y for x in left for y in divisors]
+
+
+def _power(base: Kind, exponent: Typed) -> Kind:
+    value = exponent.constant
+    if not isinstance(value, int) or not 0 <= value <= LARGEST_EXPONENT:
+        message = f"an exponent is a literal integer from 0 to {LARGEST_EXPONENT}"
+        raise Finding(exponent.span, Code.FORBIDDEN_EXPRESSION, message, "use sqrt() for roots")
+    number = as_int(base)
+    if number is None:
+        return FloatKind(float_bits(base))
+    if number.bounds is None:
+        return ANY_INT
+    low, high = number.bounds
+    extremes = [low**value, high**value, *[0] * (low < 0 < high)]
+    return IntKind(min(extremes), max(extremes))
+
+
+def _division_by_zero(span: SourceSpan) -> Finding:
+    return Finding(span, Code.OUT_OF_RANGE, "division by zero")
+
+
+def _want_number(operand: Typed) -> None:
+    if not isinstance(operand.kind, Number):
+        hint = {BoolKind: "int() makes a number of a bool", StringKind: "str() makes text of a number"}
+        raise Finding(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
+                      hint.get(type(operand.kind), ""))  # fmt: skip
+
+
+# truth
+
+
+def boolean(op: ast.boolop, operands: Sequence[Typed], span: SourceSpan) -> Typed:
+    for operand in operands:
+        want_bool(operand, "and" if isinstance(op, ast.And) else "or")
+    return Typed.at(span, BoolKind(), ast.BoolOp(op, [operand.node for operand in operands]))
+
+
+def comparison(ops: list[ast.cmpop], operands: Sequence[Typed], span: SourceSpan) -> Typed:
+    """`a < b < c` has two operators and three operands."""
+    for op, (left, right) in zip(ops, pairwise(operands), strict=True):
+        _want_comparable(op, left, right, span)
+    first, *others = [operand.node for operand in operands]
+    return Typed.at(span, BoolKind(), ast.Compare(first, ops, others))
+
+
+def _want_comparable(op: ast.cmpop, left: Typed, right: Typed, span: SourceSpan) -> None:
+    if isinstance(op, (ast.Is, ast.IsNot)):
+        raise forbidden(op, span)
+    other: Kind | None = right.kind
+    if isinstance(op, (ast.In, ast.NotIn)):
+        if not isinstance(right.kind, ListKind):
+            raise Finding(right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}")
+        other = right.kind.element
+    if other is None or isinstance(left.kind, (MessageKind, ListKind)) or join(left.kind, other) is None:
+        raise Finding(span, Code.TYPE_MISMATCH, f"{left.kind} cannot be compared with {right.kind}")
+    if isinstance(op, (ast.Lt, ast.LtE, ast.Gt, ast.GtE)) and isinstance(left.kind, BoolKind):
+        raise Finding(span, Code.TYPE_MISMATCH, "bools have no order", "use == or !=")
+
+
+def choice(test: Typed, body: Typed, orelse: Typed, span: SourceSpan) -> Typed:
+    """`body if test else orelse`; that the test is a bool was seen to before."""
+    kind = join(body.kind, orelse.kind)
+    if kind is None:
+        message = f"this is {body.kind} or {orelse.kind}, which no field holds"
+        raise Finding(span, Code.TYPE_MISMATCH, message)
+    return Typed.at(span, kind, ast.IfExp(test.node, body.node, orelse.node))
+
+
+def want_bool(operand: Typed, word: str) -> None:
+    if not isinstance(operand.kind, BoolKind):
+        hint = "compare it, as in x != 0" if isinstance(operand.kind, Number) else ""
+        raise Finding(operand.span, Code.TYPE_MISMATCH, f"'{word}' takes a bool, not {operand.kind}", hint)

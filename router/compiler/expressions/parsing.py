@@ -1,0 +1,65 @@
+"""From the text of an expression to Python's syntax tree, whose nodes know where in the table they stand.
+
+Whatever Python can parse is fine here; what the language has of it is the checker's business.
+"""
+
+from __future__ import annotations
+
+import ast
+import warnings
+
+from router.compiler.expressions.typed import Finding
+from router.errors import Code, SourceSpan
+from router.table.model import Expression
+
+
+class Parsed:
+    """`tree` is the syntax as the user wrote it. Raises Finding for what is no expression of Python's."""
+
+    def __init__(self, expression: Expression) -> None:
+        text = expression.text.replace("\n", " ")
+        self._expression = expression
+        self._indent = len(text) - len(text.lstrip())
+        self._encoded = text.lstrip().encode(errors="replace")
+        self.tree = self._parse(text.strip())
+
+    def _parse(self, text: str) -> ast.expr:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", SyntaxWarning)
+                warnings.simplefilter("ignore", DeprecationWarning)
+                return ast.parse(text, mode="eval").body
+        except SyntaxError as error:
+            span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
+            raise Finding(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}") from None
+        except (ValueError, RecursionError, MemoryError) as error:
+            raise Finding(self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}") from None
+
+    def _blamed(self, error: SyntaxError) -> SourceSpan:
+        """Syntax errors count characters, from 1; some have no place, and some end on another line."""
+        start = max(error.offset or 1, 1) - 1
+        end = error.end_offset - 1 if error.end_offset and error.end_lineno == error.lineno else start + 1
+        return self._expression.part(self._indent + start, self._indent + end)
+
+    def span(self, node: ast.expr) -> SourceSpan:
+        """The stretch of the table that a node stands for."""
+        end = node.end_col_offset if node.end_col_offset is not None else node.col_offset + 1
+        return self._expression.part(self._characters(node.col_offset), self._characters(end))
+
+    def last_span(self, node: ast.Attribute) -> SourceSpan:
+        """The last name of `a.b.c` alone."""
+        end = self._characters(node.end_col_offset or 0)
+        return self._expression.part(end - len(node.attr), end)
+
+    def _characters(self, offset: int) -> int:
+        """ast counts UTF-8 bytes, people count characters."""
+        return self._indent + len(self._encoded[:offset].decode(errors="replace"))
+
+
+def dotted(node: ast.expr) -> tuple[str, ...] | None:
+    """`a.b.c` as its parts, None for anything else."""
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    return (node.id, *reversed(parts)) if isinstance(node, ast.Name) else None

@@ -1,0 +1,24 @@
+"""What generated code can call by name, beside what the engine binds for its targets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from router.compiler.cdr.steps import HEADER
+from router.compiler.cdr.writers import put_length, put_numbers, put_text, put_wide_text, want_length
+from router.compiler.functions import FUNCTIONS
+from router.compiler.implementations import fit, fit_text, fit_wide_text
+
+NAMESPACE: Mapping[str, object] = {
+    **{name: function.implementation for name, function in FUNCTIONS.items()},
+    "fit": fit,
+    "fit_text": fit_text,
+    "fit_wide_text": fit_wide_text,
+    "HEADER": HEADER,
+    "ZERO": b"\0",
+    "put_text": put_text,
+    "put_wide_text": put_wide_text,
+    "put_numbers": put_numbers,
+    "put_length": put_length,
+    "want_length": want_length,
+}
