@@ -37,7 +37,7 @@ def test_a_bad_table_is_named_after_the_code_that_it_shows(table: Path) -> None:
 
 def test_what_the_bad_tables_extend_has_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["validate", "--strict", str(HERE / "base" / "base.yaml")]) == OK
-    assert "ok (26 payload cases" in capsys.readouterr().out
+    assert "base.yaml: ok (" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("code", Code, ids=lambda code: code.value)

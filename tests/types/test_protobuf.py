@@ -122,5 +122,5 @@ def test_payload_case_that_is_no_message_is_a_finding_in_the_proto(load: Load) -
     assert (finding.code, finding.span) == (Code.BAD_PROTO, SourceSpan("a.proto", 7, 12, 19))
 
 
-def test_the_rovers_envelope_has_26_cases(rover_envelope: Envelope) -> None:
-    assert sorted(case.number for case in rover_envelope.cases.values()) == list(range(1, 27))
+def test_the_rovers_envelope_has_the_26_cases_of_the_existing_system(rover_envelope: Envelope) -> None:
+    assert {case.number for case in rover_envelope.cases.values()} >= set(range(1, 27))

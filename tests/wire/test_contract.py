@@ -64,8 +64,11 @@ def proto_declarations(schema: ProtoSchema) -> set[Declaration]:
     return {message_declaration(message) for message in messages} | {enum_declaration(enum) for enum in enums}
 
 
-def test_protos_agree_with_the_contract(schema: ProtoSchema) -> None:
-    assert proto_declarations(schema) == contract_declarations(CONTRACT)
+def test_protos_have_all_that_the_contract_has_as_it_has_it(schema: ProtoSchema) -> None:
+    """What the rover has been given since, new fields and new messages, is the lock's business."""
+    ours = {declared[:3]: declared[3] for declared in proto_declarations(schema)}
+    for *name, entries in contract_declarations(CONTRACT):
+        assert entries <= ours[tuple(name)], name
 
 
 def test_every_message_is_in_proto3_without_a_package_and_every_field_single(schema: ProtoSchema) -> None:
