@@ -38,6 +38,7 @@ class _Sender:
 class _Route:
     """What dispatch needs of a route. `senders` is by whatever `Engine._key` makes of an address."""
 
+    case: str
     parse: Callable[[bytes], Message]
     handle: Handle
     senders: Mapping[object, _Sender]
@@ -93,6 +94,7 @@ class Engine:
         }
         addresses: list[tuple[object, str]] = [*self._by_host.items(), *self._by_address.items()]
         return _Route(
+            case=case,
             parse=handler.case.message_class.FromString,
             handle=handle,
             senders={key: senders[name] for key, name in addresses if name in senders},
@@ -140,11 +142,11 @@ class Engine:
                 try:
                     route, message = settle(data)
                 except _Rejected as rejected:
-                    reject(rejected.reason, peer, rejected)
+                    reject(rejected.reason, peer, str(rejected))
                     return
             sender = route.senders.get(sender_key, route.stranger)
             if sender is None:
-                reject("source_mismatch", peer, None)
+                reject("source_mismatch", peer, route.case)
                 return
             counts[sender.slot] += 1
             route.handle(message, data, received_at, now, sender.name)
@@ -208,14 +210,14 @@ class Engine:
     def _count_unhandled(self, case: str) -> None:
         self._counts[self._program.books.slot("unhandled", case)] += 1
 
-    def _rejecter(self, listener: str) -> Callable[[str, Peer, Exception | None], None]:
+    def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
         books, counts, report = self._program.books, self._counts, self._report
         slots = {reason: books.slot("datagrams_rejected", listener, reason) for reason in REJECT_REASONS}
 
-        def reject(reason: str, peer: Peer, error: Exception | None) -> None:
+        def reject(reason: str, peer: Peer, what: str) -> None:
             counts[slots[reason]] += 1
             if reason != "ignored":
-                detail = f"from {peer[0]}:{peer[1]}" + (f": {error}" if error and str(error) else "")
+                detail = f"from {peer[0]}:{peer[1]}" + (f": {what}" if what else "")
                 report(Report("reject", listener, "", reason, None, detail))
 
         return reject

@@ -176,6 +176,12 @@ def test_the_report_names_the_sender_and_the_trouble(rig: Rig) -> None:
     assert (report.kind, report.place, report.detail) == ("reject", "trimmed", "from 192.168.0.99:1234: field 27")
 
 
+def test_the_report_of_a_wrong_sender_says_what_it_sent(rig: Rig) -> None:
+    rig.receive(framed(GPS, b""), ("192.168.0.99", 1234))
+    [report] = rig.reports
+    assert (report.reason, report.detail) == ("source_mismatch", "from 192.168.0.99:1234: gps_info")
+
+
 def test_unhandled_cases_are_counted_by_name(rig: Rig) -> None:
     rig.receive(framed(MANUAL_DRIVE + 1, b""))
     rig.receive(framed(27, b""))
