@@ -11,6 +11,7 @@ import io
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from router.errors import RouterError, TableError
 
@@ -21,6 +22,8 @@ BAD_TABLE = 78
 INTERRUPTED = 130
 BROKEN_PIPE = 141
 
+DEFAULT_TABLE = Path("routes/rover.yaml")
+
 VERBS = {
     "run": "run a route table between UDP and ROS 2",
     "validate": "say what is wrong with route tables",
@@ -28,7 +31,7 @@ VERBS = {
     "send": "send envelopes with payloads of your choice",
     "tap": "decode the envelopes that arrive on a port",
     "sim": "play the boards and the basestation",
-    "schema": "inspect the wire types and lock their field numbers",
+    "schema": "keep the field numbers of the wire types",
 }
 
 
@@ -60,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(prog="router", description="Routes messages between protobuf over UDP and ROS 2.")
+    parser = argparse.ArgumentParser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)

@@ -12,17 +12,15 @@ from pathlib import Path
 
 import yaml
 
-from router.cli import BAD_TABLE, OK, VERBS
-from router.cli.findings import print_findings
+from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
+from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table
 from router.edges.log import LEVELS as LOG_LEVELS
 from router.edges.log import configure_log
 from router.errors import StartError
 from router.runtime import Router, tune_interpreter
 
-DEFAULT_TABLE = Path("routes/rover.yaml")
-
-_DESCRIPTION = f"""Routes as a table says, until SIGINT or SIGTERM.
+_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM.
 Exit code: {OK} stopped, {BAD_TABLE} the table has errors, or what it names cannot be opened."""
 
 _EPILOG = """\
@@ -42,14 +40,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "table", type=Path, nargs="?", default=DEFAULT_TABLE, metavar="TABLE", help="route table (default: %(default)s)"
     )
-    parser.add_argument("--log-level", choices=LOG_LEVELS, default="info", help="(default: %(default)s)")
+    parser.add_argument(
+        "--log-level", choices=LOG_LEVELS, default="info", help="least that is logged (default: %(default)s)"
+    )
     parser.add_argument(
         "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="ARG", help="everything from here on is for ROS"
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    configure_log(args.log_level)
+    configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     checked = check_table(args.table, {**os.environ, **table_variables(args.ros_args)})
     print_findings(checked.diagnostics, sys.stderr)
     if checked.program is None:

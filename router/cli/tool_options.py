@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.assets import asset
+from router.cli import BAD_USAGE, DEFAULT_TABLE
 from router.errors import TransportError
 from router.tools import UsageError
 
@@ -17,12 +18,10 @@ if TYPE_CHECKING:
     from router.table.model import RouteTable
     from router.tools.wire import Wire
 
-DEFAULT_TABLE = Path("routes/rover.yaml")
-
 
 def add_wire_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_mutually_exclusive_group()
-    group.add_argument("--table", type=Path, metavar="FILE", help=f"route table (default: {DEFAULT_TABLE}, if there)")
+    group.add_argument("--table", type=Path, metavar="TABLE", help=f"route table (default: {DEFAULT_TABLE}, if there)")
     group.add_argument("--protos", type=Path, metavar="DIR", help="folder of .proto files, instead of a table")
 
 
@@ -45,7 +44,7 @@ def explained(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Na
             return run(args)
         except (UsageError, TransportError) as error:
             print(f"router {args.verb}: {error}", file=sys.stderr)
-            return 2 if isinstance(error, UsageError) else 1
+            return BAD_USAGE if isinstance(error, UsageError) else 1
 
     return explaining
 
@@ -53,7 +52,7 @@ def explained(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Na
 def positive(text: str) -> float:
     value = float(text)
     if not 0 < value <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1000000")
+        raise argparse.ArgumentTypeError(f"{text} is not above 0 and at most 1000000")
     return value
 
 

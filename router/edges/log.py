@@ -25,12 +25,16 @@ SUMMARY_INTERVAL_NS = 10_000_000_000
 MOST_KEYS = 1000
 
 
-def configure_log(level: str = "info") -> None:
-    """Sets up structlog for the whole process. `level` is one of LEVELS."""
+def configure_log(level: str = "info", *, coloured: bool = False) -> None:
+    """Sets up structlog for the whole process. `level` is one of LEVELS; colours are for terminals only."""
     on_terminal = sys.stderr.isatty()
     rendering: list[structlog.typing.Processor] = (
         # The plain traceback names file and line of the route table and nothing else is worth drawing boxes for.
-        [structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)]
+        [
+            structlog.dev.ConsoleRenderer(
+                colors=coloured, sort_keys=False, exception_formatter=structlog.dev.plain_traceback
+            )
+        ]
         if on_terminal
         else [structlog.processors.format_exc_info, structlog.processors.JSONRenderer(default=str)]
     )
@@ -118,5 +122,5 @@ class FloodLog:
 
 def _summarise(flood: _Flood, now: int) -> None:
     seconds = round((now - flood.last_line_ns) / 1e9, 1)
-    flood.emit(flood.event, more=flood.pending, in_seconds=seconds, **flood.values)
+    flood.emit(flood.event, **flood.values, more=flood.pending, in_seconds=seconds)
     flood.pending, flood.last_line_ns = 0, now

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from typing import Any
 
 import pytest
+import structlog
 
 from router.edges import log
 from router.edges.log import SUMMARY_INTERVAL_NS, FloodLog
@@ -75,3 +78,22 @@ def test_the_number_of_kinds_is_bounded(lines: Lines, monkeypatch: pytest.Monkey
         lines.note(kind)
     lines.floods.flush(final=True)
     assert [event for event, _ in lines.written] == ["a", "b"] + 2 * ["events of many further kinds"]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_on_a_terminal_a_line_is_for_reading(coloured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    log.configure_log(coloured=coloured)
+    try:
+        structlog.get_logger().warning("datagram rejected", reason="empty", detail="from here")
+    finally:
+        structlog.reset_defaults()
+    line = terminal.getvalue()
+    assert ("\x1b[" in line) is coloured
+    if not coloured:
+        assert line.split()[1:] == ["[warning", "]", "datagram", "rejected", "reason=empty", "detail='from", "here'"]
