@@ -61,6 +61,7 @@ def unusable_character(text: str) -> tuple[int, str] | None:
 
 
 def _read(path: Path, file: str) -> bytes:
+    hint = ""
     try:
         if path.is_dir():
             what = "this is a folder, not a route table"
@@ -74,6 +75,8 @@ def _read(path: Path, file: str) -> bytes:
             what = f"the file is larger than {MAX_BYTES >> 20} MiB"
     except OSError as error:
         what = f"the file cannot be read: {(error.strerror or str(error)).lower()}"
+        if isinstance(error, FileNotFoundError) and not path.is_absolute():
+            hint = f"paths are relative to the working directory, here {Path.cwd()}"
     except ValueError as error:  # a path that no file system takes: NUL, half a surrogate pair
         what = f"the file cannot be read: {error}"
-    raise TableError([Diagnostic(SourceSpan(file), Code.BAD_FILE, what)])
+    raise TableError([Diagnostic(SourceSpan(file), Code.BAD_FILE, what, hint)])

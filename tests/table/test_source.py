@@ -51,6 +51,14 @@ def test_lines_end_as_editors_see_them(tmp_path: Path) -> None:
 def test_what_is_no_file_is_one_finding(tmp_path: Path) -> None:
     assert "folder" in refused(tmp_path).message
     assert "no such file" in refused(tmp_path / "nope.yaml").message
+
+
+def test_a_relative_path_that_leads_nowhere_says_where_it_began(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert str(tmp_path) in refused(Path("nope.yaml")).hint
+    assert refused(tmp_path / "nope.yaml").hint == ""
     assert "not a directory" in refused(Path(__file__) / "nope.yaml").message
     assert "too long" in refused(tmp_path / ("x" * 300)).message
     assert refused(tmp_path / "a\0b").code is Code.BAD_FILE
