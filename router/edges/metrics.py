@@ -106,9 +106,11 @@ class MetricsServer:
         try:
             self._server, self._thread = start_http_server(address.port, address.host, registry)
         except OSError as error:
-            holder = f": {port_holder('tcp', address.port)} has the port" if error.errno == errno.EADDRINUSE else ""
-            what = f"metrics cannot be served at {address}: {error.strerror}{holder}"
-            raise StartError(f"{span}: {what}; choose another metrics.address") from error
+            in_use = error.errno == errno.EADDRINUSE
+            why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
+            raise StartError(
+                f"{span}: metrics cannot be served at {address}: {why}; choose another metrics.address"
+            ) from error
         self.address = Address(address.host, self._server.server_port)
 
     def close(self) -> None:

@@ -221,5 +221,5 @@ def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, pe
 
 
 def test_a_broadcast_destination_is_refused_at_the_start() -> None:
-    with pytest.raises(StartError, match=r"rover.yaml:12:20: cannot send .* 'basestation' at 255.255.255.255:9"):
-        Sender(SenderPlan("basestation", Address("255.255.255.255", 9)), SPAN)
+    with pytest.raises(StartError, match=r"rover.yaml:12:20: cannot send .* 'basestation' at 127.255.255.255:9"):
+        Sender(SenderPlan("basestation", Address("127.255.255.255", 9)), SPAN)
