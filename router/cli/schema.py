@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from router.types.protobuf import Envelope, ProtoSchema
 
 ENVELOPE, ONEOF = "PBEnvelope", "payload"
-_DESCRIPTION = f"""Writes envelope.lock.json beside the .proto files, or adds to it what is new there.
+_DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there.
 A number that is reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written."""
 
 

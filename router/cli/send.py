@@ -7,6 +7,7 @@ import contextlib
 import sys
 from typing import TYPE_CHECKING
 
+from router.cli import VERBS
 from router.cli.tool_options import add_wire_options, explained, load_wire, positive, whole
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ examples:
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "send",
-        help="build a payload and send it to an address",
+        help=VERBS["send"],
         description="Build a payload from field=value words and send it in an envelope.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from router.cli import VERBS
 from router.cli.tool_options import explained, positive
 
 if TYPE_CHECKING:
@@ -24,13 +25,15 @@ LINE_REFRESH = 5.0
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "sim",
-        help="play all boards and the basestation",
+        help=VERBS["sim"],
         description="Send plausible, moving values from every endpoint of a table and show what comes back to it. "
         "The endpoints' addresses must be this machine's, as they are in routes/sim.yaml.",
     )
     default = Path("routes/sim.yaml")
-    parser.add_argument("table", nargs="?", type=Path, default=default, metavar="TABLE", help=f"default: {default}")
-    parser.add_argument("--duration", type=positive, metavar="SECONDS", help="default: until Ctrl-C")
+    parser.add_argument(
+        "table", nargs="?", type=Path, default=default, metavar="TABLE", help=f"route table (default: {default})"
+    )
+    parser.add_argument("--duration", type=positive, metavar="SECONDS", help="how long (default: until Ctrl-C)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="the same seed sends the same values")
     parser.add_argument("--rate-scale", type=positive, default=1.0, metavar="X", help="2 sends twice as often")
     parser.add_argument("--json", action="store_true", help="statistics as JSON lines, the last one final")

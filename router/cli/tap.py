@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 
+from router.cli import VERBS
 from router.cli.tool_options import add_wire_options, explained, load_wire, whole
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "tap",
-        help="decode envelopes arriving on a port",
+        help=VERBS["tap"],
         description="Bind a UDP port and print each arriving envelope as one line: the fields that are not default.",
     )
     place = parser.add_mutually_exclusive_group(required=True)
@@ -29,8 +31,10 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.tapping import listen
 
     wire, table = load_wire(args)
-    address = places.listening(args.place or args.listen, table)
-    with places.open_udp(address, "tap") as receiver:
+    place = args.place or args.listen
+    with places.open_udp(places.listening(place, table), place) as receiver:
+        host, port = receiver.getsockname()
+        print(f"listening on {host}:{port}; Ctrl-C ends it", file=sys.stderr)
         try:
             for heard in itertools.islice(listen(receiver, wire, places.peer_names(table)), args.count):
                 print(heard.json(args.hex) if args.json else heard.line(args.hex), flush=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from router.table.model import RouteTable
 
 DEFAULT = Path("routes")
-_DESCRIPTION = f"""Reports every finding in the tables, with file, line, column and a hint.
+_DESCRIPTION = f"""Report every finding in the tables, with file, line, column and a hint.
 A folder stands for the *.yaml and *.yml in it (not in folders below it, and not *.test.yaml);
 without a PATH it is '{DEFAULT}'. Exit code: {OK} clean, {BAD_TABLE} errors, {BAD_USAGE} wrong usage."""
 

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -102,14 +101,14 @@ def test_tap_prints_what_arrives(table_path: Callable[..., Path]) -> None:
     station = read_table(path).endpoints["station"].address.value
     command = [sys.executable, "-m", "router", "tap", "station", "--table", str(path), "--count", "1"]
     with (
-        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as tap,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
     ):
         board.bind(("127.0.6.30", 0))
-        while tap.poll() is None:
-            board.sendto(EMPTY_PLAIN, station)
-            time.sleep(0.02)
         assert tap.stdout is not None
+        assert tap.stderr is not None
+        assert tap.stderr.readline() == f"listening on {station}; Ctrl-C ends it\n"
+        board.sendto(EMPTY_PLAIN, station)
         assert tap.stdout.read().split(" ", 1)[1] == "board plain (all default)\n"
     assert tap.returncode == 0
 
