@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
+from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.compiler import Checked, check_table, compile_handler
 from router.compiler.books import Books
@@ -21,16 +21,18 @@ from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.routes import CheckedRoute, CheckedTarget
 from router.compiler.topics import qos_of
 from router.errors import did_you_mean
-from router.table.model import ANY, ROS, RouteTable
+from router.table.model import ANY, ROS, Route, RouteTable
 from router.types.sizes import framed_size
 
 _WIDEST_CELL = 48
+_DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides,
+largest sizes, and the code that the router runs."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("explain", help=VERBS["explain"])
+    parser = subparsers.add_parser("explain", help=VERBS["explain"], description=_DESCRIPTION)
     parser.add_argument("cases", nargs="*", metavar="CASE", help="payload cases; all of the table when none is named")
-    parser.add_argument("--table", type=Path, default=Path("routes/rover.yaml"), help="default: %(default)s")
+    parser.add_argument("--table", type=Path, default=DEFAULT_TABLE, help="route table (default: %(default)s)")
     parser.add_argument("--no-code", action="store_true", help="leave the generated code out")
 
 
@@ -71,7 +73,7 @@ def _explained(checked: CheckedRoute, table: RouteTable, everything: Checked) ->
     yield f"  source: {', '.join(_source(source.value, table) for source in route.sources)}"
     for served in checked.targets:
         yield ""
-        yield from _target(served, table, outbound=route.is_outbound)
+        yield from _target(served, route, table)
     if route.is_outbound:
         yield ""
         yield "  checked only: this version carries no messages from ROS to UDP"
@@ -85,9 +87,9 @@ def _source(name: str, table: RouteTable) -> str:
     return f"{name} ({endpoint.address.value.host}{port})"
 
 
-def _target(served: CheckedTarget, table: RouteTable, *, outbound: bool) -> Iterator[str]:
+def _target(served: CheckedTarget, route: Route, table: RouteTable) -> Iterator[str]:
     target, topic = served.target, served.topic
-    if topic is None or outbound:
+    if topic is None or route.is_outbound:
         endpoint = table.endpoints[target.name]
         how = f"from topic {topic.topic.value} ({topic.type.value})" if topic else "unchanged"
         trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
@@ -103,6 +105,10 @@ def _target(served: CheckedTarget, table: RouteTable, *, outbound: bool) -> Iter
                 if exact
                 else f"    CDR: {size} bytes and the contents of strings and sequences"
             )
+    destination = next((each for each in route.destinations if each.endpoint.value == target.name), None)
+    for named in (destination, topic):
+        if named is not None and named.when is not None:
+            yield f"    when {named.when.text}"
     if target.max_rate is not None:
         yield f"    at most {target.max_rate:g} Hz"
     yield from _mapping(served.rows)
