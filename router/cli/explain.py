@@ -13,9 +13,10 @@ from pathlib import Path
 
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
-from router.compiler import Checked, check_table, compile_handler
+from router.compiler import Checked, check_table
 from router.compiler.books import Books
 from router.compiler.cdr import message_size
+from router.compiler.link import compile_handler
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.routes import CheckedRoute, CheckedTarget

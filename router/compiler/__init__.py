@@ -6,7 +6,6 @@ Knows no socket, no rclpy and no clock.
 from __future__ import annotations
 
 from router.compiler.check import Checked, check_table
-from router.compiler.link import compile_handler
 from router.compiler.program import STRANGER, source_label
 
-__all__ = ["check_table", "Checked", "compile_handler", "STRANGER", "source_label"]
+__all__ = ["check_table", "Checked", "STRANGER", "source_label"]

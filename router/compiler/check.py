@@ -11,7 +11,6 @@ from functools import cached_property
 from pathlib import Path
 
 from router.compiler.definitions import Definitions
-from router.compiler.link import link
 from router.compiler.network import network_findings
 from router.compiler.program import Program
 from router.compiler.routes import CheckedRoute, RouteChecker, sorted_findings
@@ -40,7 +39,9 @@ class Checked:
 
     @cached_property
     def program(self) -> Program | None:
-        """Made when first asked for: `validate` needs none."""
+        """Made when first asked for: `validate` needs none, nor what makes it."""
+        from router.compiler.link import link
+
         if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
             return None
         return link(self.table, self.schema, self.envelope, self.routes)

@@ -9,31 +9,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from router.compiler.books import DROP_REASONS, Books
 from router.compiler.cdr import write_message
-from router.compiler.expressions import Locals, Typed
+from router.compiler.expressions import Locals
 from router.compiler.plan import Record
 from router.compiler.program import TargetPlan
 from router.compiler.source import Source, namespace_name
 from router.compiler.syntax import attribute, name, placed
+from router.compiler.target import Target
 from router.errors import SourceSpan
 
 PARAMETERS = ("m", "datagram", "received_at", "now", "source")
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """A checked target: a destination, or with a `plan` a topic. `name` is its label in the books."""
-
-    name: str
-    span: SourceSpan
-    locals: Locals
-    when: Typed | None = None
-    max_rate: float | None = None
-    trim: bool = False
-    plan: Record | None = None
 
 
 class HandlerSource:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 from router.compiler.definitions import Definitions
 from router.compiler.expressions import Finding, Locals, Scope, Typed, check
-from router.compiler.handlers import Target
 from router.compiler.kinds import BoolKind
 from router.compiler.mapping import Row, build
 from router.compiler.network import loop_finding
+from router.compiler.target import Target
 from router.compiler.topics import qos_findings, topic_name_finding
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, nearest
 from router.table.model import ANY, ROS, Destination, EndpointKind, Expression, FieldMap, Route, RouteTable, Topic
