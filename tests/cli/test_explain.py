@@ -47,7 +47,7 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
         "    when is_calibrated\n"
         "    at most 5 Hz\n"
         "\n"
-        f"  topic x: std_msgs/msg/Float32  ({table}:8:9)\n"
+        f"  topic x: std_msgs/msg/Float32  ({table}:8:10)\n"
         "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
         "    CDR: 8 bytes\n"
         "    when accel_x > 1 or accel_y > 1\n"

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -18,7 +17,7 @@ def routes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder `routes` in the working directory, with one good table."""
     folder = tmp_path / "routes"
     folder.mkdir()
-    text = BASE.read_text(encoding="utf-8").replace("../../../protos", str(REPOSITORY / "protos"))
+    text = BASE.read_text(encoding="utf-8").replace("../protos", str(BASE.parents[1] / "protos"))
     (folder / "good.yaml").write_text(text)
     monkeypatch.chdir(tmp_path)
     return folder
@@ -26,8 +25,7 @@ def routes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_good_table_is_ok_in_one_line(routes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["validate", "routes/good.yaml"]) == OK
-    counts = r"\d+ payload cases, 1 topic, 2 endpoints"
-    assert re.fullmatch(rf"routes/good.yaml: ok \({counts}\)\n", capsys.readouterr().out)
+    assert capsys.readouterr().out == "routes/good.yaml: ok (3 payload cases, 1 topic, 2 endpoints)\n"
 
 
 def test_the_tables_of_the_repository_have_no_errors(
