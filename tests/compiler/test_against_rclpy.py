@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from router.compiler import Checked
 from router.compiler.definitions import Definitions
 from router.compiler.reference import fill
 from router.engine.binding import MAPPING_FAILURES
@@ -15,26 +14,12 @@ from router.types.model import MessageType
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer
 from tests.compiler.generated_types import mirror, values
+from tests.compiler.in_use import ROS_TYPES
 
 pytest.importorskip("rclpy")
 
 from tests.compiler.ros_objects import deserialized, serialized
 
-IN_USE = [
-    "comms/msg/ArmBoardActualPositions", "comms/msg/ArmBoardControlSignals", "comms/msg/ArmBoardDiagnostics",
-    "comms/msg/ArmBoardMovementFeedback", "comms/msg/ArmBoardObstructions", "comms/msg/ArmBoardTargetMovement",
-    "comms/msg/BasestationControlMode", "comms/msg/BasestationDetectedObject",
-    "comms/msg/BasestationManualArmMovement", "comms/msg/BasestationManualBrake", "comms/msg/BasestationManualDrive",
-    "comms/msg/BasestationObjectSelection", "comms/msg/BasestationRockMeasureRequest",
-    "comms/msg/BasestationRockMeasureResult", "comms/msg/BasestationRoverLocalization",
-    "comms/msg/DrivingBoardDiagnostics", "comms/msg/DrivingBoardMotorMessage",
-    "comms/msg/DrivingBoardMotorPeriodicProgress", "comms/msg/ImuSensorInformation",
-    "comms/msg/SensorBoardDiagnostics", "comms/msg/SensorBoardFlowSensorInfo", "comms/msg/SensorBoardGPSInfo",
-    "comms/msg/SensorBoardLoadCellInfo", "comms/msg/SensorBoardPHInfo", "comms/msg/SensorBoardPressureInfo",
-    "comms/msg/SensorBoardPumpInfo", "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/FluidPressure",
-    "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField", "sensor_msgs/msg/NavSatFix",
-    "sensor_msgs/msg/Temperature",
-]  # fmt: skip
 OTHERS = [
     "geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped", "geometry_msgs/msg/Wrench", "sensor_msgs/msg/BatteryState",
@@ -58,7 +43,7 @@ def assert_equal_bytes(declared: MessageType, source: MessageType, message: Any)
     assert same(deserialized(declared.name, ours), value)
 
 
-@pytest.mark.parametrize("name", [*IN_USE, *OTHERS])
+@pytest.mark.parametrize("name", [*ROS_TYPES, *OTHERS])
 def test_type_is_written_as_rclpy_does(definitions: Definitions, name: str) -> None:
     declared = definitions.interfaces.get(name)
     assert declared is not None
@@ -70,7 +55,3 @@ def test_type_is_written_as_rclpy_does(definitions: Definitions, name: str) -> N
         assert_equal_bytes(declared, source, message)
 
     equal()
-
-
-def test_every_type_of_the_rover_is_among_them(rover: Checked) -> None:
-    assert {target.type.name for route in rover.routes for target in route.targets if target.type} == set(IN_USE)
