@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import ast
 import copy
+import linecache
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import CodeType
 
@@ -84,8 +85,24 @@ class Source:
         return grafted
 
     def compile(self, file: str) -> CodeType:
-        """Code whose tracebacks name `file`."""
-        return compile(self.tree(), file, "exec", dont_inherit=True, optimize=0)
+        """Code whose tracebacks name `file` and have their carets under what is blamed in it."""
+        tree = self.tree()
+        linecache.checkcache(file)
+        _count_bytes(tree, linecache.getlines(file))
+        return compile(tree, file, "exec", dont_inherit=True, optimize=0)
+
+
+def _count_bytes(tree: ast.Module, lines: Sequence[str]) -> None:
+    """Turns columns from characters into UTF-8 bytes, which is what they are for Python when it sets carets.
+
+    `lines` are from where a traceback will have them; a line that cannot be shown will have no carets.
+    """
+    for node in ast.walk(tree):
+        if isinstance(node, PLACEABLE) and node.lineno <= len(lines):
+            line = lines[node.lineno - 1]
+            if not line.isascii():
+                node.col_offset = len(line[: node.col_offset].encode())
+                node.end_col_offset = len(line[: node.end_col_offset].encode())
 
 
 class _Graft(ast.NodeTransformer):
