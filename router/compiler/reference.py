@@ -1,6 +1,6 @@
 """The oracle: a plain, slow answer to what a table makes of one message, for tests and for `router test`.
 
-Of the compiler it shares the functions and the type model, and must not know expressions, conversion,
+Of the compiler it shares the functions and the type model, and must not know expressions, scalars, conversion,
 mapping, cdr or source: what both agree on is right for two reasons. Expects a table that the compiler
 has accepted. `reference_cdr` makes bytes of what comes out here.
 """

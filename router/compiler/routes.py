@@ -13,7 +13,7 @@ from router.compiler.network import loop_finding
 from router.compiler.target import Target
 from router.compiler.topics import qos_findings, topic_name_finding
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, nearest
-from router.table.model import ANY, ROS, Destination, EndpointKind, Expression, FieldMap, Route, RouteTable, Topic
+from router.table.model import ANY, ROS, Destination, Endpoint, EndpointKind, Expression, Route, RouteTable, Topic
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
@@ -40,7 +40,7 @@ class CheckedRoute:
 
 @dataclass(slots=True)
 class RouteChecker:
-    """Checks the routes of one table; `findings` fills up."""
+    """Checks the routes of one table; `findings` fills up, with what several routes share once for each of them."""
 
     table: RouteTable
     schema: ProtoSchema
@@ -113,29 +113,29 @@ class RouteChecker:
         if route.fields is not None:
             self._report(route.fields.span, Code.UNKNOWN_KEY, "'fields' of a route belongs to `source: ros`",
                          "a topic has its own 'fields'")  # fmt: skip
-        targets: list[CheckedTarget] = []
-        for destination in route.destinations:
-            trim = self._destination(route, case, destination)
-            if destination.fields is not None:
-                self._report(destination.fields.span, Code.UNKNOWN_KEY, "a datagram is forwarded unchanged",
-                             "'fields' of a destination belongs to `source: ros`")  # fmt: skip
-            scope = self._scope(case.type)
-            when = self._when(destination.when, scope)
-            target = Target(destination.endpoint.value, destination.span, scope.locals, when,
-                            destination.max_rate.value if destination.max_rate else None, trim=trim)  # fmt: skip
-            targets.append(CheckedTarget(target, None, None))
+        targets = [self._forward(route, case, destination) for destination in route.destinations]
         for topic in route.topics:
             ros_type = self._ros_type(topic)
             if ros_type is not None:
                 targets.append(self._publish(topic, ros_type, self._scope(case.type, ros_type)))
         return targets
 
+    def _forward(self, route: Route, case: PayloadCase, destination: Destination) -> CheckedTarget:
+        endpoint = self._destination(route, case, destination)
+        if destination.fields is not None:
+            self._report(destination.fields.span, Code.UNKNOWN_KEY, "a datagram is forwarded unchanged",
+                         "'fields' of a destination belongs to `source: ros`")  # fmt: skip
+        scope = self._scope(case.type)
+        when = self._when(destination.when, scope)
+        trim = endpoint is not None and endpoint.trim_trailing_zeros
+        name, rate = destination.endpoint.value, _rate(destination)
+        return CheckedTarget(Target(name, destination.span, scope.locals, when, rate, trim=trim), None, None)
+
     def _publish(self, topic: Topic, ros_type: MessageType, scope: Scope) -> CheckedTarget:
         when = self._when(topic.when, scope)
         mapping = build(topic.fields, ros_type, scope, topic.topic.span)
         self.findings += mapping.findings
-        rate = topic.max_rate.value if topic.max_rate else None
-        target = Target(topic.topic.value, topic.span, scope.locals, when, rate, plan=mapping.plan)
+        target = Target(topic.topic.value, topic.span, scope.locals, when, _rate(topic), plan=mapping.plan)
         return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
 
     # ROS to UDP
@@ -165,20 +165,19 @@ class RouteChecker:
         scope = self._scope(ros_type, ros_type)
         self._when(topic.when, scope)
         when = self._when(destination.when, scope)
-        fields: FieldMap | None = destination.fields or route.fields
-        mapping = build(fields, case.type, scope, route.case.span)
-        self.findings += [finding for finding in mapping.findings if finding not in self.findings]
-        rate = destination.max_rate.value if destination.max_rate else None
-        target = Target(destination.endpoint.value, destination.span, scope.locals, when, rate, plan=mapping.plan)
+        mapping = build(destination.fields or route.fields, case.type, scope, route.case.span)
+        self.findings += mapping.findings
+        name, rate = destination.endpoint.value, _rate(destination)
+        target = Target(name, destination.span, scope.locals, when, rate, plan=mapping.plan)
         return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
 
     # names
 
-    def _destination(self, route: Route, case: PayloadCase, destination: Destination) -> bool:
-        """Whether the endpoint wants trailing zeros trimmed; an unknown one is reported."""
+    def _destination(self, route: Route, case: PayloadCase, destination: Destination) -> Endpoint | None:
+        """The endpoint that a destination names, None where there is none; what is wrong with it is reported."""
         name = destination.endpoint
         if not self._known_endpoint(name.value, name.span):
-            return False
+            return None
         twice = [other for other in route.destinations if other.endpoint.value == name.value]
         if twice[0] is not destination:
             self._report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
@@ -188,14 +187,14 @@ class RouteChecker:
             self.findings.append(finding)  # an endpoint that is the router itself is one mistake, not one per route
         if endpoint.kind is EndpointKind.BOARD:
             self.findings += board_findings(case, self.schema, self.board_limit, name.span)
-        return endpoint.trim_trailing_zeros
+        return endpoint
 
     def _ros_type(self, topic: Topic) -> MessageType | None:
         name = topic.type.value
         try:
             found = self.definitions.interfaces.get(name)
         except TableError as error:
-            self.findings += [finding for finding in error.diagnostics if finding not in self.findings]
+            self.findings += error.diagnostics
             return None
         if found is None:
             hint = did_you_mean(name, self.definitions.interfaces.names())
@@ -215,10 +214,13 @@ class RouteChecker:
                 hint = "compare something, as in fix_quality != GPSFixQuality.NO_FIX"
                 raise Finding(typed.span, Code.TYPE_MISMATCH, f"'when' takes a bool, not {typed.kind}", hint)
         except Finding as finding:
-            if finding.diagnostic not in self.findings:
-                self.findings.append(finding.diagnostic)
+            self.findings.append(finding.diagnostic)
             return None
         return typed
+
+
+def _rate(limited: Destination | Topic) -> float | None:
+    return limited.max_rate.value if limited.max_rate else None
 
 
 def nested_types(declared: Type) -> Iterable[MessageType]:
