@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import shutil
-import socket
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 from router.table.model import RouteTable
 from router.tools.wire import Wire, read_table, wire_of_protos
 from router.types.protobuf import PayloadCase
+from tests.ports import free_port
 
 HERE = Path(__file__).parent
 
@@ -25,13 +25,6 @@ routes:
   every_kind: {{source: {source}, destinations: [station]}}
   plain: {{source: station, destinations: [board]}}
 """
-
-
-def free_port(host: str) -> int:
-    """A UDP port that nobody had a moment ago."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="session")
