@@ -56,6 +56,7 @@ PEERS = [
 ]
 
 IMU, GPS, ARM_POS, DRIVE_DIAG, MANUAL_DRIVE, PH = 13, 12, 5, 8, 24, 1
+UNKNOWN = 99
 X_IS_ONE = bytes.fromhex("0d0000803f")
 Y_IS_TWO = bytes.fromhex("1500000040")
 TIMEOUT = tag(30, 0) + varint(250)
@@ -148,7 +149,7 @@ REJECTED = [
     ("malformed", framed(IMU, X_IS_ONE) + tag(30, 0) + b"\x80"),
     ("malformed", b"\xff" * 20),
     ("no_payload", bytes(4)),
-    ("unknown_case", framed(27, X_IS_ONE)),
+    ("unknown_case", framed(UNKNOWN, X_IS_ONE)),
     ("unknown_case", TIMEOUT),
     ("unhandled", framed(MANUAL_DRIVE + 1, b"")),
     ("ignored", framed(PH, b"")),
@@ -171,9 +172,9 @@ def test_every_reason_has_its_datagram() -> None:
 
 
 def test_the_report_names_the_sender_and_the_trouble(rig: Rig) -> None:
-    rig.receive(framed(27, b""), STRANGER)
+    rig.receive(framed(UNKNOWN, b""), STRANGER)
     [report] = rig.reports
-    assert (report.kind, report.place, report.detail) == ("reject", "trimmed", "from 192.168.0.99:1234: field 27")
+    assert (report.kind, report.place, report.detail) == ("reject", "trimmed", "from 192.168.0.99:1234: field 99")
 
 
 def test_the_report_of_a_wrong_sender_says_what_it_sent(rig: Rig) -> None:
@@ -184,7 +185,7 @@ def test_the_report_of_a_wrong_sender_says_what_it_sent(rig: Rig) -> None:
 
 def test_unhandled_cases_are_counted_by_name(rig: Rig) -> None:
     rig.receive(framed(MANUAL_DRIVE + 1, b""))
-    rig.receive(framed(27, b""))
+    rig.receive(framed(UNKNOWN, b""))
     assert rig.counted("unhandled") == {("unhandled", "manual_brake"): 1, ("unhandled", "unknown"): 1}
 
 
