@@ -179,8 +179,8 @@ class _Evaluator:
         function = FUNCTIONS[name]
         if function.optional and len(arguments) < len(function.parameters) and isinstance(expected, Int):
             arguments += [expected.low, expected.high]
-        result = function.implementation(*arguments)
-        return Nanoseconds(result) if name.startswith("time_from_") else result  # type: ignore[call-overload]
+        result: Any = function.implementation(*arguments)
+        return Nanoseconds(result) if name.startswith("time_from_") else result
 
     def _has(self, node: ast.expr) -> bool:
         if isinstance(node, ast.Attribute):

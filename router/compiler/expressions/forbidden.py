@@ -13,7 +13,7 @@ ALLOWED = "allowed: fields, literals, arithmetic, comparison, and/or/not, if/els
 def forbidden(node: ast.AST, span: SourceSpan) -> Finding:
     """The finding for an expression, or an operator, that is not part of the language."""
     hint = _HINTS.get(type(node), ALLOWED if isinstance(node, ast.expr) else "")
-    word = _WORDS.get(type(node).__name__, type(node).__name__)
+    word = _WORDS.get(type(node), type(node).__name__)
     return Finding(span, Code.FORBIDDEN_EXPRESSION, f"{word} is not part of the language", hint)
 
 
@@ -30,11 +30,11 @@ _HINTS: dict[type[ast.AST], str] = {
     ast.Is: "use ==",
     ast.IsNot: "use ==",
 }
-# By name: some of them do not exist in every Python that we support.
-_WORDS = {
-    "Constant": "this literal", "JoinedStr": "an f-string", "NamedExpr": "':='", "ListComp": "a comprehension",
-    "SetComp": "a comprehension", "DictComp": "a comprehension", "GeneratorExp": "a comprehension",
-    "Tuple": "a tuple", "Dict": "a dictionary", "Set": "a set", "Lambda": "lambda", "Starred": "'*'",
-    "BitAnd": "'&'", "BitOr": "'|'", "BitXor": "'^'", "LShift": "'<<'", "RShift": "'>>'", "Invert": "'~'",
-    "MatMult": "'@'", "Is": "'is'", "IsNot": "'is not'", "Await": "await", "Yield": "yield", "Slice": "a slice",
+_WORDS: dict[type[ast.AST], str] = {
+    ast.Constant: "this literal", ast.JoinedStr: "an f-string", ast.NamedExpr: "':='", ast.ListComp: "a comprehension",
+    ast.SetComp: "a comprehension", ast.DictComp: "a comprehension", ast.GeneratorExp: "a comprehension",
+    ast.Tuple: "a tuple", ast.Dict: "a dictionary", ast.Set: "a set", ast.Lambda: "lambda", ast.Starred: "'*'",
+    ast.BitAnd: "'&'", ast.BitOr: "'|'", ast.BitXor: "'^'", ast.LShift: "'<<'", ast.RShift: "'>>'", ast.Invert: "'~'",
+    ast.MatMult: "'@'", ast.Is: "'is'", ast.IsNot: "'is not'", ast.Await: "await", ast.Yield: "yield",
+    ast.Slice: "a slice",
 }  # fmt: skip

@@ -20,15 +20,14 @@ def named(text: str, span: SourceSpan, scope: Scope) -> Typed:
     """A name that stands alone."""
     if member := scope.message.field(text):
         return scope.read((), member, span)
-    match text:
-        case "message":
-            return scope.whole_message(span)
-        case "source":
-            return Typed.at(span, StringKind(), name(SOURCE))
-        case "received_at":
-            return Typed.at(span, TimeKind(), name(RECEIVED_AT))
-        case "true" | "false":  # as YAML spells them
-            return constant(text == "true", span)
+    if text == MESSAGE:
+        return scope.whole_message(span)
+    if text == SOURCE:
+        return Typed.at(span, StringKind(), name(SOURCE))
+    if text == RECEIVED_AT:
+        return Typed.at(span, TimeKind(), name(RECEIVED_AT))
+    if text in ("true", "false"):  # as YAML spells them
+        return constant(text == "true", span)
     if text in FUNCTIONS or text == HAS:
         raise Finding(span, Code.WRONG_ARGUMENTS, f"'{text}' is a function", f"call it: {text}(...)")
     if scope.holders(text):
