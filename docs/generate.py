@@ -6,12 +6,14 @@ tests/test_docs.py fails when a page is not what this would write.
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 
 from router.compiler.books import DROP_REASONS, HISTOGRAM_BOUNDS_NS, METRICS, REJECT_REASONS
 from router.compiler.functions import FUNCTIONS
 from router.errors import Code
 
 HERE = Path(__file__).parent
+WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 
 
@@ -19,7 +21,7 @@ def functions_page() -> str:
     """The functions of the expression language, from their declarations."""
     lines = ["# Functions in expressions", "", _MADE]
     for function in FUNCTIONS.values():
-        lines += [f"## `{function.signature}`", "", function.summary, ""]
+        lines += [f"## `{function.signature}`", "", fill(function.summary, WIDTH), ""]
         lines += [f"- `{expression}` is `{value!r}`" for expression, value in function.examples]
         lines += [""]
     lines += ["## `has(field)`", "", "Whether a submessage or an optional field is set, as in `when: has(bbox)`.", ""]
@@ -40,11 +42,11 @@ def metrics_page() -> str:
         "Every series exists at 0 from the start. The books balance: per listener, received = rejected + accepted;",
         "per route and target, accepted = delivered + dropped + filtered.",
         "",
-        f"Reasons of `router_datagrams_rejected_total`: {', '.join(REJECT_REASONS)}.",
+        fill(f"Reasons of `router_datagrams_rejected_total`: {', '.join(REJECT_REASONS)}.", WIDTH),
         "",
-        f"Reasons of `router_messages_dropped_total`: {', '.join(DROP_REASONS)}.",
+        fill(f"Reasons of `router_messages_dropped_total`: {', '.join(DROP_REASONS)}.", WIDTH),
         "",
-        f"Upper bounds of `router_route_seconds`, in microseconds: {bounds}.",
+        fill(f"Upper bounds of `router_route_seconds`, in microseconds: {bounds}.", WIDTH),
         "",
     ]
     return "\n".join(lines)
