@@ -12,7 +12,7 @@ from router.compiler.expressions import Finding, Scope, Typed
 from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.kinds import BytesKind, Kind, ListKind, MessageKind, TimeKind, kind_of
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.compiler.syntax import name
+from router.compiler.syntax import load
 from router.errors import Code, SourceSpan
 from router.types.model import Field, Int, List, MessageType, Type
 
@@ -84,7 +84,7 @@ def _to_list(value: Typed, target: List, scope: Scope) -> Plan:
     if length is not None:
         _want_length(value, target, length)
     variable = scope.locals.loop()
-    element = Typed.at(value.span, element_kind, name(variable))
+    element = Typed.at(value.span, element_kind, load(variable))
     return Each(target, value.node, variable, convert(element, target.element, scope), value.span)
 
 

@@ -16,7 +16,7 @@ from router.compiler.expressions import Locals
 from router.compiler.plan import Record
 from router.compiler.program import TargetPlan
 from router.compiler.source import Source, namespace_name
-from router.compiler.syntax import attribute, name, placed
+from router.compiler.syntax import attribute, load, placed
 from router.compiler.target import Target
 from router.errors import SourceSpan
 
@@ -109,5 +109,5 @@ class HandlerSource:
 def bind_locals(out: Source, variables: Locals, span: SourceSpan) -> None:
     """Appends an assignment for each submessage that expressions look into."""
     for path, local in variables.bound.items():
-        made = placed(attribute(name(variables.name(path[:-1])), path[-1]), span)
+        made = placed(attribute(load(variables.name(path[:-1])), path[-1]), span)
         out.line(f"{local} = {out.expression(made)}", span)

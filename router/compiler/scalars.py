@@ -21,7 +21,7 @@ from router.compiler.kinds import (
     StringKind,
     TimeKind,
 )
-from router.compiler.syntax import call, name, placed
+from router.compiler.syntax import call, load, placed
 from router.errors import Code
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
 
@@ -83,8 +83,8 @@ def _saturate(value: Typed, target: Int) -> ast.expr:
         return placed(ast.Constant(clamp(value.constant, target.low, target.high)), value.span)
     bind = ast.NamedExpr(ast.Name("v", ast.Store()), value.node)
     inside = ast.Compare(ast.Constant(target.low), [ast.LtE(), ast.LtE()], [bind, ast.Constant(target.high)])
-    clamped = call("clamp", name("v"), ast.Constant(target.low), ast.Constant(target.high))
-    return placed(ast.IfExp(inside, name("v"), clamped), value.span)
+    clamped = call("clamp", load("v"), ast.Constant(target.low), ast.Constant(target.high))
+    return placed(ast.IfExp(inside, load("v"), clamped), value.span)
 
 
 def _fit(value: Typed, target: Int, bounds: tuple[int, int] | None) -> ast.expr:

@@ -28,12 +28,12 @@ def placed(made: ast.expr, span: SourceSpan) -> ast.expr:
     return made
 
 
-def name(text: str) -> ast.Name:
-    return ast.Name(text, ast.Load())
+def load(variable: str) -> ast.Name:
+    return ast.Name(variable, ast.Load())
 
 
 def call(function: str, *arguments: ast.expr) -> ast.Call:
-    return ast.Call(name(function), list(arguments), [])
+    return ast.Call(load(function), list(arguments), [])
 
 
 def attribute(holder: ast.expr, member: str) -> ast.expr:

@@ -11,7 +11,7 @@ from router.compiler.expressions.scope import MESSAGE, RECEIVED_AT, SOURCE, Scop
 from router.compiler.expressions.typed import Finding, Typed
 from router.compiler.functions import FUNCTIONS, HAS
 from router.compiler.kinds import BoolKind, EnumKind, MessageKind, StringKind, TimeKind
-from router.compiler.syntax import attribute, name
+from router.compiler.syntax import attribute, load
 from router.errors import Code, SourceSpan, did_you_mean
 from router.types.model import Enum, MessageType
 
@@ -23,9 +23,9 @@ def named(text: str, span: SourceSpan, scope: Scope) -> Typed:
     if text == MESSAGE:
         return scope.whole_message(span)
     if text == SOURCE:
-        return Typed.at(span, StringKind(), name(SOURCE))
+        return Typed.at(span, StringKind(), load(SOURCE))
     if text == RECEIVED_AT:
-        return Typed.at(span, TimeKind(), name(RECEIVED_AT))
+        return Typed.at(span, TimeKind(), load(RECEIVED_AT))
     if text in ("true", "false"):  # as YAML spells them
         return constant(text == "true", span)
     if text in FUNCTIONS or text == HAS:
@@ -104,5 +104,5 @@ def presence(path: tuple[str, ...], field_span: SourceSpan, span: SourceSpan, sc
     if member is None or not member.has_presence:
         hint = "has() is for submessages and optional fields"
         raise Finding(field_span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always there", hint)
-    has_field = attribute(name(scope.locals.name(path[:-1])), "HasField")
+    has_field = attribute(load(scope.locals.name(path[:-1])), "HasField")
     return Typed.at(span, BoolKind(), ast.Call(has_field, [ast.Constant(path[-1])], []))

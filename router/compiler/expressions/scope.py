@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from router.compiler.expressions.typed import Typed
 from router.compiler.kinds import MessageKind, kind_of
-from router.compiler.syntax import attribute, name
+from router.compiler.syntax import attribute, load
 from router.errors import SourceSpan
 from router.types.model import Enum, Field, MessageType
 
@@ -72,7 +72,7 @@ class Scope:
         return list(own or exact or named) + [ros for ros in self.ros_types if ros.short_name == text]
 
     def whole_message(self, span: SourceSpan) -> Typed:
-        return Typed.at(span, MessageKind(self.message), name(self.locals.message), path=())
+        return Typed.at(span, MessageKind(self.message), load(self.locals.message), path=())
 
     def field_of(self, holder: Typed, member: Field, span: SourceSpan) -> Typed:
         """A field of a message that an expression gave; through a local variable where a path leads to it."""
@@ -85,5 +85,5 @@ class Scope:
         kind = kind_of(member.type)
         if isinstance(kind, MessageKind):
             path = (*holder, member.name)
-            return Typed.at(span, kind, name(self.locals.name(path)), path=path)
-        return Typed.at(span, kind, attribute(name(self.locals.name(holder)), member.name))
+            return Typed.at(span, kind, load(self.locals.name(path)), path=path)
+        return Typed.at(span, kind, attribute(load(self.locals.name(holder)), member.name))
