@@ -5,6 +5,7 @@ tests/test_docs.py fails when a page is not what this would write.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 
@@ -42,14 +43,17 @@ def metrics_page() -> str:
         "Every series exists at 0 from the start. The books balance: per listener, received = rejected + accepted;",
         "per route and target, accepted = delivered + dropped + filtered.",
         "",
-        fill(f"Reasons of `router_datagrams_rejected_total`: {', '.join(REJECT_REASONS)}.", WIDTH),
-        "",
-        fill(f"Reasons of `router_messages_dropped_total`: {', '.join(DROP_REASONS)}.", WIDTH),
-        "",
+        *_reasons("router_datagrams_rejected_total", REJECT_REASONS),
+        *_reasons("router_messages_dropped_total", DROP_REASONS),
         fill(f"Upper bounds of `router_route_seconds`, in microseconds: {bounds}.", WIDTH),
         "",
     ]
     return "\n".join(lines)
+
+
+def _reasons(metric: str, reasons: Mapping[str, str]) -> list[str]:
+    rows = (f"| `{reason}` | {meaning} |" for reason, meaning in reasons.items())
+    return [f"| reason of `{metric}` | |", "|---|---|", *rows, ""]
 
 
 def findings_page() -> str:

@@ -7,7 +7,7 @@ them from here. Counting itself is `counts[slot] += 1` in the thread that owns t
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 
@@ -33,20 +33,42 @@ METRICS = (
     Metric("sent_bytes", "counter", ("route", "destination"), "Bytes in those datagrams."),
     Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
     Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
-    Metric("messages_filtered", "counter", ("route", "target"), "Messages withheld on purpose."),
+    Metric(
+        "messages_filtered",
+        "counter",
+        ("route", "target"),
+        "Messages withheld by `when`, or because nobody subscribes.",
+    ),
     Metric("route_seconds", "histogram", ("route",), "Time from datagram received to all targets served."),
     Metric("route_last_message_timestamp_seconds", "gauge", ("route",), "When the route last took a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "gauge", ("endpoint",), "When the endpoint last sent."),
 )
 
-REJECT_REASONS = (
-    "truncated", "empty", "malformed", "no_payload", "unknown_case", "unhandled", "ignored", "source_mismatch",
-)  # fmt: skip
+REJECT_REASONS: Mapping[str, str] = {
+    "truncated": "longer than the router takes",
+    "empty": "no bytes",
+    "malformed": "no envelope, or a payload that is not of its type",
+    "no_payload": "an envelope without a payload",
+    "unknown_case": "a field number that the envelope does not have",
+    "unhandled": "a payload case without a route",
+    "ignored": "a payload case that the table ignores",
+    "source_mismatch": "from an address that the route does not take it from",
+}
+"""Why no route took a datagram, with what each means."""
 
-DROP_REASONS = (
-    "mapping_error", "non_finite", "stale", "rate_limited", "queue_full", "send_buffer_full", "send_error",
-    "publish_error", "incomplete", "loop",
-)  # fmt: skip
+DROP_REASONS: Mapping[str, str] = {
+    "mapping_error": "a mapping failed on these values, as in a division by zero",
+    "non_finite": "NaN or infinity where an integer or a time is wanted",
+    "stale": "too old; for routes from ROS to UDP",
+    "rate_limited": "more often than `max_rate`",
+    "queue_full": "faster than it could be taken; for routes from ROS to UDP",
+    "send_buffer_full": "the kernel's send buffer was full",
+    "send_error": "the network refused it; `Connection refused`: nobody listens there",
+    "publish_error": "the ROS middleware refused it",
+    "incomplete": "parts are missing; for routes from ROS to UDP",
+    "loop": "it came from this router; for routes from ROS to UDP",
+}
+"""Why a target did not get a message, with what each means."""
 
 UNKNOWN_CASE = "unknown"
 """The `payload_case` label of a field number that the envelope does not have."""
