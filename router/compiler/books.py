@@ -33,12 +33,7 @@ METRICS = (
     Metric("sent_bytes", "counter", ("route", "destination"), "Bytes in those datagrams."),
     Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
     Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
-    Metric(
-        "messages_filtered",
-        "counter",
-        ("route", "target"),
-        "Messages withheld by `when`, or because nobody subscribes.",
-    ),
+    Metric("messages_filtered", "counter", ("route", "target"), "Messages that `when` held back, or nobody wanted."),
     Metric("route_seconds", "histogram", ("route",), "Time from datagram received to all targets served."),
     Metric("route_last_message_timestamp_seconds", "gauge", ("route",), "When the route last took a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "gauge", ("endpoint",), "When the endpoint last sent."),
