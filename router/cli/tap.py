@@ -16,9 +16,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help=VERBS["tap"],
         description="Bind a UDP port and print each arriving envelope as one line: the fields that are not default.",
     )
-    place = parser.add_mutually_exclusive_group(required=True)
-    place.add_argument("place", nargs="?", metavar="[HOST:]PORT", help="or an endpoint or listener of the table")
-    place.add_argument("--listen", metavar="[HOST:]PORT", help="the same, as an option")
+    parser.add_argument("place", metavar="[HOST:]PORT", help="or an endpoint or listener of the table")
     parser.add_argument("--count", type=whole, metavar="N", help="end after N datagrams (default: at Ctrl-C)")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.add_argument("--hex", action="store_true", help="with each datagram's bytes")
@@ -31,8 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.tapping import listen
 
     wire, table = load_wire(args)
-    place = args.place or args.listen
-    with places.open_udp(places.listening(place, table), place) as receiver:
+    with places.open_udp(places.listening(args.place, table), args.place) as receiver:
         host, port = receiver.getsockname()
         print(f"listening on {host}:{port}; Ctrl-C ends it", file=sys.stderr)
         try:

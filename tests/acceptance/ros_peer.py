@@ -13,14 +13,18 @@ import sys
 import threading
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from queue import Queue
 from typing import Any
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
+
+from tests.ros_child import own_stdout, spin_until_stdin_ends
 
 PATIENCE = 20
 """Seconds that something may take on a busy machine."""
@@ -74,38 +78,41 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-def _say(**line: object) -> None:
-    print(json.dumps(line), flush=True)
+class _Lines:
+    """What the script says, a JSON object a line."""
+
+    def __init__(self) -> None:
+        self._out = own_stdout()
+
+    def say(self, **line: object) -> None:
+        print(json.dumps(line), file=self._out)
 
 
-def _subscribe(node: Node, topic: str, type_name: str) -> None:
+def _subscribe(node: Node, topic: str, type_name: str, lines: _Lines) -> None:
     package, _, name = type_name.split("/")
     # Those topics of the rover that are not of `comms` are offered as sensors' are: best effort.
     reliability = ReliabilityPolicy.RELIABLE if package == "comms" else ReliabilityPolicy.BEST_EFFORT
     node.create_subscription(
         getattr(importlib.import_module(f"{package}.msg"), name),
         topic,
-        lambda message: _say(topic=topic, message=_plain(message)),
+        lambda message: lines.say(topic=topic, message=_plain(message)),
         QoSProfile(depth=1000, reliability=reliability),
-        event_callbacks=SubscriptionEventCallbacks(matched=partial(_matched, topic)),
+        event_callbacks=SubscriptionEventCallbacks(matched=partial(_matched, topic, lines)),
     )
 
 
-def _matched(topic: str, status: Any) -> None:
+def _matched(topic: str, lines: _Lines, status: Any) -> None:
     if status.current_count:
-        _say(matched=topic)
+        lines.say(matched=topic)
 
 
 def main() -> None:
+    lines = _Lines()
     rclpy.init(args=[])
     node = rclpy.create_node("acceptance_peer")
     for topic, type_name in json.loads(sys.argv[1]).items():
-        _subscribe(node, topic, type_name)
-    threading.Thread(target=lambda: (sys.stdin.read(), rclpy.shutdown()), daemon=True).start()
-    try:
-        rclpy.spin(node)
-    except ExternalShutdownException:
-        node.destroy_node()
+        _subscribe(node, topic, type_name, lines)
+    spin_until_stdin_ends(node)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from typing import Any
 
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS, ROUTER
+from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -227,15 +228,8 @@ def udp(host: str, port: int = 0) -> socket.socket:
     return opened
 
 
-def free_port(host: str = ROUTER, kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as unused:
-        unused.bind((host, 0))
-        port: int = unused.getsockname()[1]
-        return port
-
-
 @contextmanager
 def site(folder: Path, hosts: Mapping[str, str] = HOSTS) -> Iterator[Site]:
     with ExitStack() as opened:
         endpoints = {name: opened.enter_context(udp(host)) for name, host in hosts.items()}
-        yield Site(folder, endpoints, free_port(), free_port("127.0.0.1", socket.SOCK_STREAM))
+        yield Site(folder, endpoints, free_port(ROUTER), free_port(kind=socket.SOCK_STREAM))

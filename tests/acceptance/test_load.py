@@ -9,8 +9,9 @@ from pathlib import Path
 from tests.acceptance.conftest import Rover
 from tests.acceptance.payloads import FRAME, generated
 from tests.acceptance.rover_map import FLOWS, HOSTS
-from tests.acceptance.site import ROVER, RouterProcess, arrived, balance, free_port, key, no_room, site, total, udp
+from tests.acceptance.site import ROVER, RouterProcess, arrived, balance, key, no_room, site, total, udp
 from tests.acceptance.test_rejected import REJECTED
+from tests.ports import free_port
 
 COUNT = 20_000
 GOOD = [sample for case in FLOWS for sample in generated(case)]

@@ -9,19 +9,17 @@ import argparse
 import importlib
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from time import monotonic, sleep
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
 
-from tests.own_stdout import own_stdout
+from tests.ros_child import own_stdout, spin_until_stdin_ends
 
 
 class Subscriber:
@@ -71,11 +69,7 @@ def main() -> None:
         raw=True,
         event_callbacks=SubscriptionEventCallbacks(matched=lambda _: print("matched", file=lines)),
     )
-    threading.Thread(target=lambda: (sys.stdin.read(), rclpy.shutdown()), daemon=True).start()
-    try:
-        rclpy.spin(node)
-    except ExternalShutdownException:
-        node.destroy_node()
+    spin_until_stdin_ends(node)
 
 
 if __name__ == "__main__":
