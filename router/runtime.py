@@ -19,6 +19,7 @@ from router.edges.metrics import BooksCollector, MetricsServer
 from router.edges.receiver import ReceiveThread
 from router.edges.udp import Listener, Sender
 from router.engine import MAX_DATAGRAM, Engine, Report
+from router.errors import StartError
 from router.table.model import Address
 
 
@@ -90,7 +91,14 @@ class Router:
             send[destination.endpoint] = sender.send
         bind = partial(Engine, program, self.counts, send, report=self._report, clock_ns=monotonic_ns, wall_ns=wall_ns)
         if program.publishers:
-            from router.edges.ros import PUBLISH_ERRORS, RosEdge  # a table without topics runs where there is no ROS
+            try:
+                from router.edges.ros import (
+                    PUBLISH_ERRORS,
+                    RosEdge,
+                )  # a table without topics runs where there is no ROS
+            except ImportError as error:
+                remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
+                raise StartError(f"{table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
 
             spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
             ros = RosEdge(table.node, program.publishers, spans, self._ros_args)

@@ -37,7 +37,7 @@ def table(tmp_path: Path) -> Path:
 
 def start(*arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "router", "run", *map(str, arguments)]
-    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    path = os.pathsep.join(filter(None, (environment.pop("PYTHONPATH", ""), str(ROOT), os.environ.get("PYTHONPATH"))))
     variables = {**os.environ, "PYTHONPATH": path, **environment}
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=variables)
 
@@ -67,6 +67,21 @@ def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table
     assert wait_for_start(process)["listening"] == {"rover": f"127.0.0.1:{port}"}
     process.terminate()
     process.communicate(timeout=10)
+
+
+def test_a_machine_without_ros_is_told_what_to_do(table: Path, tmp_path: Path) -> None:
+    without = tmp_path / "without_ros"
+    without.mkdir()
+    (without / "rclpy.py").write_text("raise ModuleNotFoundError(\"No module named 'rclpy'\", name='rclpy')\n")
+    topics = "topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, fields: auto}]"
+    table.write_text(table.read_text().replace("destinations: [basestation]", topics))
+    process = start(table, LISTEN_PORT=str(free_port()), PYTHONPATH=str(without))
+    _, text = process.communicate(timeout=10)
+    assert process.returncode == 78
+    assert text.splitlines()[-1] == (
+        f"router run: {table} has topics, and ROS 2 cannot be loaded: No module named 'rclpy'; "
+        "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
+    )
 
 
 def test_a_table_with_errors_is_told_and_ends_with_78(table: Path) -> None:
