@@ -91,11 +91,8 @@ class Router:
             send[destination.endpoint] = sender.send
         bind = partial(Engine, program, self.counts, send, report=self._report, clock_ns=monotonic_ns, wall_ns=wall_ns)
         if program.publishers:
-            try:
-                from router.edges.ros import (
-                    PUBLISH_ERRORS,
-                    RosEdge,
-                )  # a table without topics runs where there is no ROS
+            try:  # here, because a table without topics runs where there is no ROS
+                from router.edges.ros import PUBLISH_ERRORS, RosEdge
             except ImportError as error:
                 remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
                 raise StartError(f"{table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
