@@ -38,6 +38,10 @@ class CheckedRoute:
     targets: tuple[CheckedTarget, ...]
 
 
+_OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT})
+"""What a route may seem to do wrong because a part of it, which has a finding of its own, was left out."""
+
+
 @dataclass(slots=True)
 class RouteChecker:
     """Checks the routes of one table; `findings` fills up, with what several routes share once for each of them."""
@@ -51,8 +55,15 @@ class RouteChecker:
 
     def check_all(self) -> tuple[CheckedRoute, ...]:
         self._coverage()
-        checked = (self._route(route) for route in self.table.routes)
-        return tuple(route for route in checked if route)
+        return tuple(checked for route in self.table.routes if (checked := self._checked(route)))
+
+    def _checked(self, route: Route) -> CheckedRoute | None:
+        before = len(self.findings)
+        checked = self._route(route)
+        if f"routes/{route.case.value}" in self.table.broken:
+            mine = [finding for finding in self.findings[before:] if finding.code not in _OF_GAPS]
+            self.findings[before:] = mine
+        return checked
 
     def _report(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
         self.findings.append(Diagnostic(span, code, message, hint))

@@ -8,11 +8,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, Union
 
 from router.errors import Code, Diagnostic, SourceSpan
 from router.table.address import BadAddressError, parse_address
-from router.table.build_routes import build_route
+from router.table.build_routes import build_route, sound_part
 from router.table.model import (
     Address,
     Endpoint,
@@ -56,10 +56,18 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         metrics=builder.one(root, "metrics", _metrics),
         listeners=builder.each(root, "listen", _listener),
         endpoints=builder.each(root, "endpoints", _endpoint),
-        routes=tuple(builder.each(root, "routes", build_route).values()),
+        routes=tuple(builder.each(root, "routes", build_route, salvage=sound_part).values()),
         routes_span=routes.key.span,
         broken=frozenset(builder.broken),
     )
+
+
+Salvage = Callable[[Entry], Union[Entry, None]]
+"""What is sound in a part that is broken, if anything is."""
+
+
+def _nothing(_: Entry) -> None:
+    """Most parts are all or nothing: an endpoint without its address is none."""
 
 
 class _Builder:
@@ -74,24 +82,39 @@ class _Builder:
         entry = root.entries.get(name)
         return self._built(name, entry, build) if entry else None
 
-    def each(self, root: MappingNode, name: str, build: Callable[[Entry], T]) -> Mapping[str, T]:
-        """The parts by name under a key of the root."""
+    def each(
+        self,
+        root: MappingNode,
+        name: str,
+        build: Callable[[Entry], T],
+        salvage: Salvage = _nothing,
+    ) -> Mapping[str, T]:
+        """The parts by name under a key of the root, of a broken one what `salvage` leaves."""
         group = root.entries.get(name)
         if group is None:
             return {}
         if not isinstance(group.value, MappingNode):
             self.broken.add(name)
             return {}
-        built = {key: self._built(f"{name}/{key}", entry, build) for key, entry in group.value.entries.items()}
+        built = {key: self._built(f"{name}/{key}", entry, build, salvage) for key, entry in group.value.entries.items()}
         return {key: part for key, part in built.items() if part is not None}
 
-    def _built(self, name: str, entry: Entry, build: Callable[[Entry], T]) -> T | None:
+    def _built(
+        self,
+        name: str,
+        entry: Entry,
+        build: Callable[[Entry], T],
+        salvage: Salvage = _nothing,
+    ) -> T | None:
+        sound: Entry | None = entry
+        if not (is_sound(entry.key) and is_sound(entry.value)):
+            self.broken.add(name)
+            sound = salvage(entry)
         try:
-            if is_sound(entry.key) and is_sound(entry.value):
-                return build(entry)
+            return build(sound) if sound else None
         except UnsoundError as error:
             self._findings.append(error.diagnostic)
-        self.broken.add(name)
+            self.broken.add(name)
         return None
 
 

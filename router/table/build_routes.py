@@ -6,14 +6,37 @@ Knows the schema's shape; which names exist is the compiler's business.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from router.errors import SourceSpan
 from router.table.model import Destination, Expression, FieldEntry, FieldMap, Located, Qos, Route, Topic
-from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, is_sound
 from router.table.reading import UnsoundError, boolean, integer, items, located, mapping, optional_text, scalar, text
 from router.table.units import parse_duration, parse_rate
 
 AUTO = "auto"
+
+_INDISPENSABLE = frozenset({"source", "ignore", "topic", "type", "endpoint"})
+"""Keys without which a route, a topic or a destination says nothing."""
+
+
+def sound_part(entry: Entry) -> Entry | None:
+    """A route without what has findings of its own, so that the rest is checked in the same run."""
+    value = None if entry.key.broken else _sound_part(entry.value)
+    return Entry(entry.key, value) if value else None
+
+
+def _sound_part(node: Node) -> Node | None:
+    if node.broken:
+        return None
+    if isinstance(node, MappingNode):
+        parts = {key: entry if is_sound(entry.value) else sound_part(entry) for key, entry in node.entries.items()}
+        if any(part is None and key in _INDISPENSABLE for key, part in parts.items()):
+            return None
+        return replace(node, entries={key: part for key, part in parts.items() if part})
+    if isinstance(node, SequenceNode) and all(isinstance(item, MappingNode) for item in node.items):
+        return replace(node, items=tuple(part for item in node.items if (part := _sound_part(item))))
+    return node if is_sound(node) else None
 
 
 def build_route(entry: Entry) -> Route:

@@ -201,7 +201,8 @@ class RouteTable:
 
     `routes_span` is the place of the key `routes`. `sha256` is over the bytes of `files` in order.
     `broken` names what the table has but is left out here because of findings of its own, as
-    `endpoints/arm_board` or `routes/imu_info`, so that nobody reports its absence as well.
+    `endpoints/arm_board`, so that nobody reports its absence as well. Of a route in it, `routes/imu_info`,
+    there may be the sound part: what is missing there is no finding.
     """
 
     path: Path

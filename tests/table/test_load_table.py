@@ -115,7 +115,16 @@ def test_what_has_a_finding_is_left_out_and_named(tmp_path: Path) -> None:
     assert table
     assert table.broken == {"endpoints/sensor_board", "routes/imu_info"}
     assert list(table.endpoints) == ["basestation"]
-    assert [route.case.value for route in table.routes] == ["arm_target", "ph_info"]
+    [imu_info] = [route for route in table.routes if route.case.value == "imu_info"]
+    assert imu_info.topics[0].queue_depth is None
+    assert imu_info.topics[0].fields  # the rest of the route is checked in the same run
+
+
+def test_a_route_without_a_sound_source_is_left_out(tmp_path: Path) -> None:
+    table, findings = load(tmp_path, GOOD.replace("source: sensor_board", "source: 5"))
+    assert [found.code for found in findings] == [Code.WRONG_TYPE]
+    assert table
+    assert "imu_info" not in [route.case.value for route in table.routes]
 
 
 def test_a_misspelt_key_is_one_finding_and_read_as_what_was_meant(tmp_path: Path) -> None:
