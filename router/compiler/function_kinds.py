@@ -60,12 +60,13 @@ def extreme(pick: Callable[[list[int]], int]) -> Rule:
 
 
 def clamped(kinds: Sequence[Kind]) -> Kind:
+    low, high = _bounds(kinds[1]), _bounds(kinds[2])
+    if low and high:
+        _want_ordered(low[0], high[1])
     if any(as_int(kind) is None for kind in kinds):
         return same(kinds)
-    low, high = _bounds(kinds[1]), _bounds(kinds[2])
     if low is None or high is None:
         return ANY_INT
-    _want_ordered(low[0], high[1])
     return IntKind(min(low[0], high[0]), max(low[1], high[1]))
 
 

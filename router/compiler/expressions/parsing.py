@@ -31,7 +31,9 @@ class Parsed:
                 return ast.parse(text, mode="eval").body
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
-            raise Finding(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}") from None
+            is_plain = self._expression.verbatim and self._expression.text_column == self._expression.span.column
+            hint = "quote the expression: inside {} a comma ends it" if is_plain and "never closed" in reason else ""
+            raise Finding(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
             raise Finding(self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}") from None
 
