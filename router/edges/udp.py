@@ -9,6 +9,7 @@ import errno
 import socket
 import struct
 from collections.abc import Callable
+from contextlib import suppress
 
 from router.compiler.program import ListenerPlan, SenderPlan
 from router.edges.log import logger
@@ -53,8 +54,12 @@ class Listener:
         receiver busy for ever; shutting down then wakes a receiver that waits.
         """
         host, port = self.address
-        self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
-        self.socket.shutdown(socket.SHUT_RD)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)  # or one that has a broadcast address may not
+        # An interface may have lost the address meanwhile: then nothing comes in, and shutting down wakes all the same.
+        with suppress(OSError):
+            self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
+        with suppress(OSError):
+            self.socket.shutdown(socket.SHUT_RD)
 
     def close(self) -> None:
         self._drops_at_close = self.kernel_drops()

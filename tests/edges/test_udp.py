@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import queue
 import socket
@@ -101,9 +102,25 @@ def test_nothing_new_gets_in_after_the_end_of_input(stack: ExitStack, peer: sock
     assert (received, listener.socket.recvfrom(LIMIT)) == ((b"before", peer.getsockname()), (b"", None))
 
 
-def test_a_listener_on_all_interfaces_ends_too(stack: ExitStack) -> None:
-    everywhere = plan(host="0.0.0.0")
-    listener = stack.enter_context(closing(Listener(everywhere, SPAN)))
+@pytest.mark.parametrize("host", ["0.0.0.0", "127.255.255.255"], ids=["all interfaces", "a broadcast address"])
+def test_a_listener_on_more_than_one_address_ends_too(stack: ExitStack, host: str) -> None:
+    listener = stack.enter_context(closing(Listener(plan(host=host), SPAN)))
+    receiving = Receiving([listener])
+    receiving.thread.start()
+    receiving.thread.stop()
+    assert receiving.all_received() == []
+
+
+class _Stranded(socket.socket):
+    """A socket whose address has gone from its interface: the kernel then lets it connect to nothing."""
+
+    def connect(self, address: object) -> None:
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+
+def test_a_listener_whose_address_has_gone_ends_too(stack: ExitStack) -> None:
+    listener = listen(stack)
+    listener.socket = stack.enter_context(_Stranded(fileno=listener.socket.detach()))
     receiving = Receiving([listener])
     receiving.thread.start()
     receiving.thread.stop()
