@@ -11,6 +11,7 @@ from dataclasses import replace
 from router.errors import SourceSpan
 from router.table.model import Destination, Expression, FieldEntry, FieldMap, Located, Qos, Route, Topic
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, is_sound
+from router.table.places import TextPlace
 from router.table.reading import UnsoundError, boolean, integer, items, located, mapping, optional_text, scalar, text
 from router.table.units import parse_duration, parse_rate
 
@@ -149,17 +150,12 @@ def _part_spans(key: ScalarNode) -> Iterator[SourceSpan]:
     """The places of the names between the dots of a key; the whole key where its text is not verbatim."""
     start = 0
     for part in key.text.split("."):
-        if key.text_column is None:
-            yield key.span
-        else:
-            place = SourceSpan(key.span.file, key.span.line, key.text_column)
-            yield place.part(start, start + len(part))
+        yield key.place.part(start, start + len(part))
         start += len(part) + 1
 
 
 def _expression(node: Node) -> Expression:
     if isinstance(node, SequenceNode):
-        return Expression("", node.span, False, node.span.column, tuple(map(_expression, node.items)))
+        return Expression("", TextPlace(node.span), tuple(map(_expression, node.items)))
     found = scalar(node)
-    column = found.text_column
-    return Expression(found.text, found.span, column is not None, column or found.span.column)
+    return Expression(found.text, found.place)

@@ -13,6 +13,7 @@ import yaml
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
+from router.table.places import TextPlace, locate
 from router.table.scalars import resolve, surprise
 from router.table.source import Source, unusable_character
 from router.table.variables import fill, has_variables
@@ -122,35 +123,38 @@ class _Composer:
 
     def _scalar(self, event: yaml.ScalarEvent) -> ScalarNode:
         span = self._span(event)
-        column = self._text_column(event, span)
+        place = self._place(event, span)
         broken = self._has_tag(event, span)
         text = event.value
         if has_variables(text):
             text, problems = fill(text, self._environ)
             for problem in problems:
-                place = SourceSpan(span.file, span.line, column, column) if column else span
-                place = place.part(problem.start, problem.end) if column else span
-                self._findings.append(Diagnostic(place, problem.code, problem.message, problem.hint))
+                part = place.part(problem.start, problem.end)
+                self._findings.append(Diagnostic(part, problem.code, problem.message, problem.hint))
             broken |= bool(problems)
-            column = None
+            place = TextPlace(span)
         if unusable := unusable_character(text):
             broken |= self._report(span, f"the text holds the character {unusable[1]}", "")
         if event.style or broken:
-            return ScalarNode(span, text, text, column, broken)
+            return ScalarNode(span, text, text, place, broken)
         if found := surprise(text):
             what = f"'{text}' is {found.meaning} to some YAML readers and something else to others"
             hint = (f"{found.remedy}, or " if found.remedy else "") + f'quote it: "{text}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
-        return ScalarNode(span, text, resolve(text), column, broken)
+        return ScalarNode(span, text, resolve(text), place, broken)
 
-    def _text_column(self, event: yaml.ScalarEvent, span: SourceSpan) -> int | None:
-        """Where the text begins in its line if the file has it there word for word."""
+    def _place(self, event: yaml.ScalarEvent, span: SourceSpan) -> TextPlace:
         line, first, end_line, last = _marks(event)
         if event.style in ("'", '"'):
             first, last = first + 1, last - 1
-        verbatim = line == end_line and self._source.lines[line][first:last] == event.value
-        return first + 1 if verbatim else None
+        elif event.style in ("|", ">"):
+            line, first = line + 1, 0  # the text begins below its header
+        pieces = []
+        for number, written in enumerate(self._source.lines[line : end_line + 1], line):
+            start = first if number == line else 0
+            pieces.append((number + 1, start + 1, written[start : last if number == end_line else None]))
+        return locate(event.value, span, pieces)
 
     def _closed(self, collection: _Collection) -> Node:
         if isinstance(collection.event, yaml.SequenceStartEvent):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
 from router.errors import SourceSpan
+from router.table.places import TextPlace
 
 T = TypeVar("T")
 
@@ -88,23 +89,16 @@ class Endpoint:
 class Expression:
     """The text of an expression, not yet parsed.
 
-    `verbatim` says that the text stands in the file exactly as it is here, on one line, beginning at
-    `text_column`; then an offset into the text is a column. Otherwise (escapes, folded lines, a value
-    from a variable) findings blame the whole span. A YAML sequence becomes `items`, with empty text.
+    `place` tells where each character of it stands. A YAML sequence becomes `items`, with empty text.
     """
 
     text: str
-    span: SourceSpan
-    verbatim: bool
-    text_column: int
+    place: TextPlace
     items: tuple[Expression, ...] | None = None
 
-    def part(self, start: int, end: int) -> SourceSpan:
-        """The span of characters `start` to `end` of the text (from 0, `end` exclusive)."""
-        if not self.verbatim:
-            return self.span
-        column = self.text_column
-        return SourceSpan(self.span.file, self.span.line, column + start, column + max(end, start + 1))
+    @property
+    def span(self) -> SourceSpan:
+        return self.place.whole
 
 
 @dataclass(frozen=True, slots=True)

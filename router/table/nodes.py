@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Union
 
 from router.errors import SourceSpan
+from router.table.places import TextPlace
 
 Path = tuple[Union[str, int], ...]
 """How to get from a document's root to a node: keys and indexes."""
@@ -21,13 +22,13 @@ Plain = Union[None, bool, int, float, str]
 class ScalarNode:
     """`text` is what was written, variables filled in; `value` is what YAML makes of it.
 
-    `text_column` is where the text begins in its line if it stands there exactly as it is here, else None.
+    `place` tells where each character of the text stands, as far as the file has them word for word.
     """
 
     span: SourceSpan
     text: str
     value: Plain
-    text_column: int | None = None
+    place: TextPlace
     broken: bool = False
 
 

@@ -19,6 +19,7 @@ from router.compiler.source import Source
 from router.engine.binding import MAPPING_FAILURES, Outlets, Report, bind
 from router.errors import Diagnostic, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
+from router.table.places import TextPlace
 from router.types.model import Enum, MessageType, Type
 
 SPAN = SourceSpan("table.yaml", 7, 3, 9)
@@ -30,7 +31,8 @@ Handle = Callable[[Any, bytes, int, int, str], None]
 
 def written(text: str) -> Expression:
     """An expression that stands in line 7 of a table, from column 3."""
-    return Expression(text, SourceSpan("table.yaml", 7, 3, 3 + len(text)), verbatim=True, text_column=3)
+    span = SourceSpan("table.yaml", 7, 3, 3 + len(text))
+    return Expression(text, TextPlace(span, ((0, span),)))
 
 
 def field_map(auto: bool = False, /, **entries: str) -> FieldMap:

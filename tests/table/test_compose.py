@@ -37,28 +37,30 @@ def scalar(folder: Path, text: str) -> ScalarNode:
 
 
 @pytest.mark.parametrize(
-    ("text", "value", "columns", "text_column"),
+    ("text", "value", "columns", "stretches"),
     [
-        ("k: accel_x  # c\n", "accel_x", (4, 11), 4),
-        ("k: 'a b'\n", "a b", (4, 9), 5),
-        ('k: "a b"\n', "a b", (4, 9), 5),
-        ("k: ü x\n", "ü x", (4, 7), 4),
-        ("k: 'it''s'\n", "it's", (4, 11), None),
-        ('k: "a\\tb"\n', "a\tb", (4, 10), None),
-        ("k: a\n   b\n", "a b", (4, 5), None),
-        ('k: "a\n   b"\n', "a b", (4, 6), None),
-        ("k: |\n   a\n", "a\n", (4, 5), None),
-        ("k: ${X}\n", "filled", (4, 8), None),
-        ("k: a\r\n", "a", (4, 5), 4),
+        ("k: accel_x  # c\n", "accel_x", (4, 11), [(0, 1, 4)]),
+        ("k: 'a b'\n", "a b", (4, 9), [(0, 1, 5)]),
+        ('k: "a b"\n', "a b", (4, 9), [(0, 1, 5)]),
+        ("k: ü x\n", "ü x", (4, 7), [(0, 1, 4)]),
+        ("k: 'it''s'\n", "it's", (4, 11), []),
+        ('k: "a\\tb"\n', "a\tb", (4, 10), []),
+        ("k: a\n   b\n", "a b", (4, 5), [(0, 1, 4), (2, 2, 4)]),
+        ('k: "a\n   b"\n', "a b", (4, 6), [(0, 1, 5), (2, 2, 4)]),
+        ("k: |\n   a\n", "a\n", (4, 5), [(0, 2, 4)]),
+        ("k: >-  # c\n   a\n   b  c\n\n     d\n# c\n", "a b  c\n\n  d", (4, 11), [(0, 2, 4), (2, 3, 4), (10, 5, 6)]),
+        ('k: "a\\\n   b"\n', "ab", (4, 7), []),
+        ("k: ${X}\n", "filled", (4, 8), []),
+        ("k: a\r\n", "a", (4, 5), [(0, 1, 4)]),
     ],
 )
 def test_an_expression_knows_where_its_text_stands(
-    tmp_path: Path, text: str, value: str, columns: tuple[int, int], text_column: int | None
+    tmp_path: Path, text: str, value: str, columns: tuple[int, int], stretches: list[tuple[int, int, int]]
 ) -> None:
     found = scalar(tmp_path, text)
     assert found.value == value
     assert (found.span.line, found.span.column, found.span.end_column) == (1, *columns)
-    assert found.text_column == text_column
+    assert [(offset, span.line, span.column) for offset, span in found.place.stretches] == stretches
 
 
 def test_quoted_scalars_are_text(tmp_path: Path) -> None:

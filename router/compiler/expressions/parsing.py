@@ -31,8 +31,8 @@ class Parsed:
                 return ast.parse(text, mode="eval").body
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
-            is_plain = self._expression.verbatim and self._expression.text_column == self._expression.span.column
-            hint = "quote the expression: inside {} a comma ends it" if is_plain and "never closed" in reason else ""
+            may_be_cut = self._expression.place.is_whole_line and "never closed" in reason
+            hint = "quote the expression: inside {} a comma ends it" if may_be_cut else ""
             raise Finding(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
             raise Finding(self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}") from None
@@ -41,17 +41,17 @@ class Parsed:
         """Syntax errors count characters, from 1; some have no place, and some end on another line."""
         start = max(error.offset or 1, 1) - 1
         end = error.end_offset - 1 if error.end_offset and error.end_lineno == error.lineno else start + 1
-        return self._expression.part(self._indent + start, self._indent + end)
+        return self._expression.place.part(self._indent + start, self._indent + end)
 
     def span(self, node: ast.expr) -> SourceSpan:
         """The stretch of the table that a node stands for."""
         end = node.end_col_offset if node.end_col_offset is not None else node.col_offset + 1
-        return self._expression.part(self._characters(node.col_offset), self._characters(end))
+        return self._expression.place.part(self._characters(node.col_offset), self._characters(end))
 
     def last_span(self, node: ast.Attribute) -> SourceSpan:
         """The last name of `a.b.c` alone."""
         end = self._characters(node.end_col_offset or 0)
-        return self._expression.part(end - len(node.attr), end)
+        return self._expression.place.part(end - len(node.attr), end)
 
     def _characters(self, offset: int) -> int:
         """ast counts UTF-8 bytes, people count characters."""
