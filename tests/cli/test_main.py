@@ -83,6 +83,12 @@ def test_a_reader_that_leaves_early_is_no_reason_to_complain() -> None:
     assert process.wait() == BROKEN_PIPE
 
 
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_caller_may_close_the_standard_streams(closed: str) -> None:
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-m", "router", "validate", "routes"]
+    subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=True)
+
+
 def test_validate_imports_neither_ros_nor_what_a_person_looks_at() -> None:
     script = "import sys; from router.cli import main; main(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
     command = [sys.executable, "-c", script, "validate", "routes"]
