@@ -1,7 +1,7 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
-Knows one key, `extends`. Mappings merge key by key, everything else replaces; every node keeps the span
-of the file in which it was written.
+Knows `extends`, and that a route is either carried or ignored. Mappings merge key by key, everything else
+replaces; every node keeps the span of the file in which it was written.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ from pathlib import Path
 from router.errors import Code, Diagnostic, TableError, nearest, shown_path
 from router.table.compose import compose
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode
+from router.table.nodes import Path as Steps
 from router.table.source import Source, read_source
 
 KEY = "extends"
+IGNORE = "ignore"
+_ROUTE_DEPTH = len(("routes", "case"))
 
 
 def load_chain(
@@ -46,16 +49,22 @@ def load_chain(
     return merged
 
 
-def merge(base: MappingNode, over: MappingNode) -> MappingNode:
-    """`over` laid upon `base`."""
+def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode:
+    """`over` laid upon `base`, which stand at the path `here`."""
     entries = dict(base.entries)
     for key, entry in over.entries.items():
-        below = entries[key].value if key in entries else None
-        if isinstance(below, MappingNode) and isinstance(entry.value, MappingNode):
-            entries[key] = Entry(entry.key, merge(below, entry.value))
+        below, above, path = entries[key].value if key in entries else None, entry.value, (*here, key)
+        if isinstance(below, MappingNode) and isinstance(above, MappingNode) and not _replaces(above, below, path):
+            entries[key] = Entry(entry.key, merge(below, above, path))
         else:
             entries[key] = entry
     return replace(over, entries=entries, broken=base.broken or over.broken)
+
+
+def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
+    """A route that one of the two ignores and the other carries: there is nothing to merge."""
+    is_route = len(path) == _ROUTE_DEPTH and path[0] == "routes"
+    return is_route and (IGNORE in over.entries) != (IGNORE in base.entries)
 
 
 def _root_mapping(root: Node) -> MappingNode:

@@ -36,6 +36,20 @@ routes:
     assert len(imu.topics) == 2
 
 
+def test_a_route_is_turned_off_and_on_as_a_whole(base: Path) -> None:
+    (base / "off.yaml").write_text("extends: base.yaml\nroutes:\n  imu_info: {ignore: no sensor in this rover}\n")
+    table, findings = load(base, "extends: off.yaml\n")
+    assert table
+    assert not findings
+    assert (table.routes[0].ignore is not None, table.routes[0].topics) == (True, ())
+    table, findings = load(
+        base, "extends: off.yaml\nroutes:\n  imu_info: {source: sensor_board, destinations: [basestation]}\n"
+    )
+    assert table
+    assert not findings
+    assert (table.routes[0].ignore, table.routes[0].topics) == (None, ())
+
+
 def test_values_keep_the_place_where_they_were_written(base: Path) -> None:
     table, _ = load(base, "extends: base.yaml\nendpoints:\n  basestation: {address: 127.0.0.9:1}\n")
     assert table
