@@ -20,6 +20,9 @@ AUTO = "auto"
 _INDISPENSABLE = frozenset({"source", "ignore", "topic", "type", "endpoint"})
 """Keys without which a route, a topic or a destination says nothing."""
 
+_SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"})
+"""Keys with which it says something, whatever else it lacks or has too much."""
+
 
 def sound_part(entry: Entry) -> Entry | None:
     """A route without what has findings of its own, so that the rest is checked in the same run."""
@@ -28,13 +31,15 @@ def sound_part(entry: Entry) -> Entry | None:
 
 
 def _sound_part(node: Node) -> Node | None:
-    if node.broken:
-        return None
     if isinstance(node, MappingNode):
+        if node.broken and not any(keys <= node.entries.keys() for keys in _SUFFICIENT):
+            return None
         parts = {key: entry if is_sound(entry.value) else sound_part(entry) for key, entry in node.entries.items()}
         if any(part is None and key in _INDISPENSABLE for key, part in parts.items()):
             return None
         return replace(node, entries={key: part for key, part in parts.items() if part})
+    if node.broken:
+        return None
     if isinstance(node, SequenceNode) and all(isinstance(item, MappingNode) for item in node.items):
         return replace(node, items=tuple(part for item in node.items if (part := _sound_part(item))))
     return node if is_sound(node) else None
