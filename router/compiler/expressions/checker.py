@@ -53,7 +53,7 @@ class _Checker:
             case ast.List():
                 return literals.list_of([self.check(item) for item in node.elts], span)
             case ast.Name():
-                return names.named(node.id, span, self.scope)
+                return names.named(node.id, span, self.scope, expected)
             case ast.Attribute() if path := names.constant_path(node, self.scope):
                 return names.constant_of(path, node, self.text, self.scope)
             case ast.Attribute():

@@ -12,12 +12,12 @@ from router.compiler.expressions.typed import Finding, Typed
 from router.compiler.functions import FUNCTIONS, HAS
 from router.compiler.kinds import BoolKind, EnumKind, MessageKind, StringKind, TimeKind
 from router.compiler.syntax import attribute, load
-from router.errors import Code, SourceSpan, did_you_mean
-from router.types.model import Enum, MessageType
+from router.errors import Code, SourceSpan, did_you_mean, nearest
+from router.types.model import Enum, MessageType, String, Type
 
 
-def named(text: str, span: SourceSpan, scope: Scope) -> Typed:
-    """A name that stands alone."""
+def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Typed:
+    """A name that stands alone. `expected` is what it is to fill."""
     if member := scope.message.field(text):
         return scope.read((), member, span)
     if text == MESSAGE:
@@ -33,7 +33,10 @@ def named(text: str, span: SourceSpan, scope: Scope) -> Typed:
     if scope.holders(text):
         raise Finding(span, Code.TYPE_MISMATCH, f"'{text}' is an enum, not a value", f"name one: {text}.VALUE")
     known = [*scope.field_names(), MESSAGE, SOURCE, RECEIVED_AT]
-    raise Finding(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", did_you_mean(text, known))
+    hint = did_you_mean(text, known)
+    if isinstance(expected, String) and not nearest(text, known):
+        hint = f"text has quotes of its own: \"'{text}'\""
+    raise Finding(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
 
 
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
