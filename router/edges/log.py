@@ -5,7 +5,9 @@ Knows nothing about what is logged.
 
 from __future__ import annotations
 
+import io
 import logging
+import select
 import sys
 import threading
 from collections.abc import Callable, Hashable
@@ -51,21 +53,36 @@ def configure_log(level: str = "info", *, coloured: bool = False) -> None:
 
 
 class _Expendable:
-    """A stream whose reader may go away, or whose disk may fill up: that costs lines, and never the caller.
+    """A stream whose reader may go away or stand still, or whose disk may fill up: that costs lines, never the caller.
 
-    The counters still tell what the lines would have told.
+    The counters still tell what the lines would have told. Lines are written whole, when flushed.
     """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
+        self._line = ""
+        self._room = select.poll()
+        self._is_file = _is_file(stream)
+        if self._is_file:
+            self._room.register(stream, select.POLLOUT)
 
     def write(self, text: str) -> None:
-        with suppress(OSError):
-            self._stream.write(text)
+        self._line += text
 
     def flush(self) -> None:
+        line, self._line = self._line, ""
         with suppress(OSError):
-            self._stream.flush()
+            if not self._is_file or self._room.poll(0):
+                self._stream.write(line)
+                self._stream.flush()
+
+
+def _is_file(stream: TextIO) -> bool:
+    try:
+        stream.fileno()
+    except io.UnsupportedOperation:  # a test's, in memory
+        return False
+    return True
 
 
 Emit = Callable[..., None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from typing import Any
 
@@ -97,3 +98,18 @@ def test_on_a_terminal_a_line_is_for_reading(coloured: bool, monkeypatch: pytest
     assert ("\x1b[" in line) is coloured
     if not coloured:
         assert line.split()[1:] == ["[warning", "]", "datagram", "rejected", "reason=empty", "detail='from", "here'"]
+
+
+def test_a_reader_that_stands_still_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    with os.fdopen(reading), os.fdopen(writing, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        log.configure_log()
+        try:
+            for _ in range(2000):  # several times what a pipe holds
+                structlog.get_logger().warning("datagram rejected", reason="empty", detail="from here" * 20)
+        finally:
+            structlog.reset_defaults()
+        written = os.read(reading, 1 << 20)
+    assert 0 < written.count(b"\n") < 2000
+    assert written.endswith(b"}\n")
