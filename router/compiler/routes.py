@@ -115,7 +115,13 @@ class RouteChecker:
             return True
         if f"endpoints/{name}" not in self.table.broken:
             known = [*self.table.endpoints, *also]
-            self._report(span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name}'", did_you_mean(name, known))
+            used = [used for route in self.table.routes for used in route.endpoint_names]
+            meant = self.table.endpoints.get(nearest(name, known) or "")
+            if meant and meant.name not in used and used.count(name) > 1:  # its declaration is what is misspelt
+                message = f"no route names the endpoint '{meant.name}', several name '{name}'"
+                self._report(meant.span, Code.UNKNOWN_ENDPOINT, message, f"did you mean '{name}'?")
+            else:
+                self._report(span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name}'", did_you_mean(name, known))
         return False
 
     # UDP to ROS and UDP to UDP

@@ -188,6 +188,14 @@ class Route:
     def is_outbound(self) -> bool:
         return any(source.value == ROS for source in self.sources)
 
+    @property
+    def endpoint_names(self) -> tuple[str, ...]:
+        """What it names as sources and destinations, `any` and `ros` among them."""
+        return (
+            *(source.value for source in self.sources),
+            *(destination.endpoint.value for destination in self.destinations),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class RouteTable:
