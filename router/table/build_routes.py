@@ -30,11 +30,19 @@ def sound_part(entry: Entry) -> Entry | None:
     return Entry(entry.key, value) if value else None
 
 
+def _sound_entry(entry: Entry) -> Entry | None:
+    """What stands under a key of a route: broken as a whole it may be a mapping where a list belongs."""
+    return None if entry.value.broken else sound_part(entry)
+
+
 def _sound_part(node: Node) -> Node | None:
     if isinstance(node, MappingNode):
         if node.broken and not any(keys <= node.entries.keys() for keys in _SUFFICIENT):
             return None
-        parts = {key: entry if is_sound(entry.value) else sound_part(entry) for key, entry in node.entries.items()}
+        parts = {
+            key: entry if is_sound(entry.value) else None if key in _INDISPENSABLE else _sound_entry(entry)
+            for key, entry in node.entries.items()
+        }
         if any(part is None and key in _INDISPENSABLE for key, part in parts.items()):
             return None
         return replace(node, entries={key: part for key, part in parts.items() if part})
