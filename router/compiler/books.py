@@ -6,7 +6,6 @@ them from here. Counting itself is `counts[slot] += 1` in the thread that owns t
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -116,8 +115,3 @@ _BY_NAME = {metric.name: metric for metric in METRICS}
 
 def metric(name: str) -> Metric:
     return _BY_NAME[name]
-
-
-def histogram_part(elapsed_ns: int) -> int:
-    """Which slot of a histogram's run counts this duration."""
-    return bisect_left(HISTOGRAM_BOUNDS_NS, elapsed_ns)

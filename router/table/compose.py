@@ -35,10 +35,6 @@ class _Collection:
     children: list[Node] = field(default_factory=list)
     size: int = 1
 
-    @property
-    def expects_key(self) -> bool:
-        return isinstance(self.event, yaml.MappingStartEvent) and len(self.children) % 2 == 0
-
 
 def compose(source: Source, environ: Mapping[str, str], findings: list[Diagnostic]) -> Node:
     """The one document of the text. Findings that leave a tree are appended to `findings`."""

@@ -121,7 +121,6 @@ class MessageType:
     """
 
     name: str
-    is_ros: bool
     fields: tuple[Field, ...] = ()
     constants: Mapping[str, object] = field(default_factory=dict)
 

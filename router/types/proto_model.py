@@ -47,7 +47,7 @@ def build_types(
     declared = [enum for file in files for enum in file.enum_types_by_name.values()]
     declared += [enum for message in descriptors for enum in message.enum_types]
     enums = {enum.full_name: _enum(enum) for enum in declared}
-    messages = {message.full_name: MessageType(message.full_name, is_ros=False) for message in descriptors}
+    messages = {message.full_name: MessageType(message.full_name) for message in descriptors}
     for message in descriptors:
         messages[message.full_name].fields = tuple(
             Field(

@@ -53,7 +53,7 @@ class RosInterfaces:
             )
             for field in found.definition.fields
         )
-        return MessageType(name, is_ros=True, fields=fields, constants=found.definition.constants)
+        return MessageType(name, fields=fields, constants=found.definition.constants)
 
     def _field_type(self, field: MsgField, file: str, inside: tuple[str, ...]) -> Type:
         element = field.element

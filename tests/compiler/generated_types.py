@@ -25,14 +25,13 @@ def _name(is_ros: bool) -> str:
 
 
 def message(is_ros: bool, *fields: Field) -> MessageType:
-    return MessageType(_name(is_ros), is_ros, fields)
+    return MessageType(_name(is_ros), fields)
 
 
 def mirror(declared: MessageType) -> MessageType:
     """A source message with the fields of a ROS message, where a time is a message like others."""
     return MessageType(
         declared.name.replace("/", "_"),
-        False,
         tuple(Field(field.name, _mirrored(field.type)) for field in declared.fields),
     )
 

@@ -6,14 +6,12 @@ import pytest
 
 from router.compiler.books import (
     DROP_REASONS,
-    HISTOGRAM_BOUNDS_NS,
     HISTOGRAM_SLOTS,
     METRICS,
     REJECT_REASONS,
     UNKNOWN_CASE,
     Books,
     Series,
-    histogram_part,
     metric,
 )
 from router.compiler.program import Program
@@ -41,21 +39,6 @@ def test_wrong_number_of_labels_is_a_mistake_of_ours() -> None:
 
 def test_metric_names_are_unique() -> None:
     assert [metric(one.name) for one in METRICS] == list(METRICS)
-
-
-@pytest.mark.parametrize(
-    ("elapsed", "part"),
-    [
-        (0, 0),
-        (HISTOGRAM_BOUNDS_NS[0], 0),
-        (HISTOGRAM_BOUNDS_NS[0] + 1, 1),
-        (HISTOGRAM_BOUNDS_NS[-1], len(HISTOGRAM_BOUNDS_NS) - 1),
-        (HISTOGRAM_BOUNDS_NS[-1] + 1, len(HISTOGRAM_BOUNDS_NS)),
-        (10**12, len(HISTOGRAM_BOUNDS_NS)),
-    ],
-)
-def test_duration_falls_into_the_first_bound_that_holds_it(elapsed: int, part: int) -> None:
-    assert histogram_part(elapsed) == part
 
 
 def test_rover_has_every_series_before_the_first_datagram(rover_program: Program) -> None:

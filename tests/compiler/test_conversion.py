@@ -10,11 +10,10 @@ from tests.compiler.compiling import field_map, findings_of, scope_of
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300)))
 OTHER = Enum("Other", (("NONE", 0),))
-ONE = MessageType("One", False, (Field("value", Int(32, True)),))
-POINT = MessageType("Point", False, (Field("x", Float(32)), Field("y", Float(32))))
+ONE = MessageType("One", (Field("value", Int(32, True)),))
+POINT = MessageType("Point", (Field("x", Float(32)), Field("y", Float(32))))
 SOURCE = MessageType(
     "Source",
-    is_ros=False,
     fields=(
         Field("i8", Int(8, True)), Field("u8", Int(8, False)), Field("i32", Int(32, True)), Field("i64", Int(64, True)),
         Field("f32", Float(32)), Field("f64", Float(64)), Field("flag", Bool()), Field("text", String()),
@@ -23,10 +22,10 @@ SOURCE = MessageType(
         Field("points", List(POINT)),
     ),
 )  # fmt: skip
-TIME = MessageType("builtin_interfaces/msg/Time", True, (Field("sec", Int(32, True)), Field("nanosec", Int(32, False))))
-ROS_POINT = MessageType("m/msg/Point", True, (Field("x", Float(64)), Field("z", Float(64))))
-ROS_ONE = MessageType("m/msg/One", True, (Field("data", Int(8, False)),))
-UNRELATED = MessageType("m/msg/Unrelated", True, (Field("p", Bool()), Field("q", Bool())))
+TIME = MessageType("builtin_interfaces/msg/Time", (Field("sec", Int(32, True)), Field("nanosec", Int(32, False))))
+ROS_POINT = MessageType("m/msg/Point", (Field("x", Float(64)), Field("z", Float(64))))
+ROS_ONE = MessageType("m/msg/One", (Field("data", Int(8, False)),))
+UNRELATED = MessageType("m/msg/Unrelated", (Field("p", Bool()), Field("q", Bool())))
 
 OK, MISMATCH, LOSSY, RANGE = None, Code.TYPE_MISMATCH, Code.LOSSY_CONVERSION, Code.OUT_OF_RANGE
 RULES: list[tuple[str, Type, Code | None]] = [
@@ -141,13 +140,13 @@ RULES: list[tuple[str, Type, Code | None]] = [
 
 @pytest.mark.parametrize(("text", "target", "code"), RULES, ids=[f"{text} to {target}" for text, target, _ in RULES])
 def test_value_fills_field_or_is_refused(text: str, target: Type, code: Code | None) -> None:
-    declared = MessageType("m/msg/It", True, (Field("it", target),))
+    declared = MessageType("m/msg/It", (Field("it", target),))
     codes = [finding.code for finding in findings_of(field_map(it=text), declared, scope_of(SOURCE, [MODE, OTHER]))]
     assert codes == ([] if code is None else [code])
 
 
 def test_refusal_says_what_to_do() -> None:
-    declared = MessageType("m/msg/It", True, (Field("it", Int(8, False)),))
+    declared = MessageType("m/msg/It", (Field("it", Int(8, False)),))
     hints = {
         "i32": "clamp() or wrap()",
         "f32": "round() or trunc()",
@@ -175,7 +174,7 @@ def test_every_wrong_entry_is_reported(entries: dict[str, str], codes: list[Code
 
 
 def test_field_filled_twice_is_reported_whichever_way_round() -> None:
-    inner = MessageType("m/msg/Outer", True, (Field("inner", ROS_POINT),))
+    inner = MessageType("m/msg/Outer", (Field("inner", ROS_POINT),))
     for entries in ({"inner": "point", "inner__x": "1"}, {"inner__x": "1", "inner": "point"}):
         (finding,) = findings_of(field_map(**entries), inner, scope_of(SOURCE))
         assert finding.code is Code.DUPLICATE_FIELD
@@ -187,12 +186,12 @@ def test_auto_without_a_common_name_is_reported() -> None:
 
 
 def test_auto_says_which_field_it_cannot_fill() -> None:
-    target = MessageType("m/msg/It", True, (Field("f64", Float(32)), Field("flag", Bool())))
+    target = MessageType("m/msg/It", (Field("f64", Float(32)), Field("flag", Bool())))
     (finding,) = findings_of(field_map(True), target, scope_of(SOURCE))
     assert finding.code is Code.LOSSY_CONVERSION
     assert "f64" in finding.message
 
 
 def test_message_without_fields_needs_no_mapping() -> None:
-    empty = MessageType("std_msgs/msg/Empty", True)
+    empty = MessageType("std_msgs/msg/Empty")
     assert findings_of(field_map(), empty, scope_of(SOURCE)) == []

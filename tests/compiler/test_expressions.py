@@ -33,18 +33,17 @@ from tests.compiler.compiling import (
 from tests.compiler.generated_types import values
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300), ("LESS", -7)))
-INNER = MessageType("Inner", False, (Field("value", Int(16, True)), Field("ratio", Float(64))))
-OUTER = MessageType("Outer", False, (Field("inner", INNER, has_presence=True), Field("b_c", Int(8, True))))
+INNER = MessageType("Inner", (Field("value", Int(16, True)), Field("ratio", Float(64))))
+OUTER = MessageType("Outer", (Field("inner", INNER, has_presence=True), Field("b_c", Int(8, True))))
 SOURCE = MessageType(
     "Source",
-    is_ros=False,
     fields=(
         Field("i8", Int(8, True)), Field("u8", Int(8, False)), Field("i32", Int(32, True)),
         Field("u64", Int(64, False)),
         Field("f32", Float(32)), Field("f64", Float(64)), Field("flag", Bool()), Field("name", String()),
         Field("mode", MODE), Field("numbers", List(Int(32, True))), Field("outer", OUTER, has_presence=True),
-        Field("a", MessageType("A", False, (Field("b_c", INNER),))),
-        Field("a_b", MessageType("AB", False, (Field("c", INNER),))),
+        Field("a", MessageType("A", (Field("b_c", INNER),))),
+        Field("a_b", MessageType("AB", (Field("c", INNER),))),
     ),
 )  # fmt: skip
 TARGETS: list[Type] = [
@@ -180,7 +179,7 @@ def filled_fields(draw: st.DrawFn) -> tuple[Type, str]:
 @given(filled_fields(), present(SOURCE))
 def test_field_is_filled_alike(filled: tuple[Type, str], message: Any) -> None:
     target, text = filled
-    declared = MessageType("made/msg/One", True, (Field("before", Bool(), default=True), Field("it", target)))
+    declared = MessageType("made/msg/One", (Field("before", Bool(), default=True), Field("it", target)))
     fields = field_map(it=text)
     scope = scope_of(SOURCE, [MODE])
     assume(not build(fields, declared, scope, SPAN).findings)
@@ -244,10 +243,10 @@ def test_submessages_whose_paths_read_alike_stay_apart() -> None:
 
 def test_a_source_field_named_as_a_keyword_or_as_a_variable_is_read() -> None:
     names = ("class", "message", "source", "received_at", "m", "data", "values", "v", "abs")
-    source = MessageType("Source", False, tuple(Field(name, Int(32, True)) for name in names))
+    source = MessageType("Source", tuple(Field(name, Int(32, True)) for name in names))
     message = SimpleNamespace(**{name: index for index, name in enumerate(names)})
     for index, name in enumerate(names[1:], start=1):
         _, run = compiled(f"abs({name}) + 1", scope_of(source))
         assert run(message) == index + 1
-    target = MessageType("made/msg/Kept", True, (Field("class", Int(32, True)),))
+    target = MessageType("made/msg/Kept", (Field("class", Int(32, True)),))
     assert serializer(field_map(True), target, scope_of(source))(message)[-4:] == bytes(4)

@@ -10,7 +10,7 @@ from router.compiler.reference_expressions import evaluate
 from router.types.model import MessageType
 from tests.compiler.compiling import compiled, context_of, scope_of, written
 
-NOTHING = MessageType("Nothing", is_ros=False)
+NOTHING = MessageType("Nothing")
 EXAMPLES = [(name, text, value) for name, function in FUNCTIONS.items() for text, value in function.examples]
 PYTHON_TYPE: dict[type, tuple[type, ...]] = {
     IntKind: (int,),

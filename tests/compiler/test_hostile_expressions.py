@@ -17,10 +17,9 @@ from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType,
 from tests.compiler.compiling import SPAN, compiled, scope_of
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1)))
-INNER = MessageType("Inner", False, (Field("x", Float(32)),))
+INNER = MessageType("Inner", (Field("x", Float(32)),))
 SOURCE = MessageType(
     "Source",
-    is_ros=False,
     fields=(
         Field("a", Int(32, True)), Field("f", Float(64)), Field("flag", Bool()), Field("name", String()),
         Field("mode", MODE), Field("numbers", List(Int(8, False))), Field("inner", INNER, has_presence=True),

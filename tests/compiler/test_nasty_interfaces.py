@@ -60,7 +60,7 @@ def test_message_is_written_as_rclpy_does(package: InterfacePackage, name: str) 
 
 def test_unmapped_fields_have_the_defaults_of_rclpy(package: InterfacePackage) -> None:
     declared = declared_type(package, "Defaults")
-    source = MessageType("Source", is_ros=False, fields=(Field("number", Int(8, signed=False)),))
+    source = MessageType("Source", fields=(Field("number", Int(8, signed=False)),))
     ours = serializer(field_map(mapped="number"), declared, scope_of(source))(SimpleNamespace(number=9))
     theirs, read = package.ask("Defaults", {"mapped": 9}, ours)
     value = fill(field_map(mapped="number"), declared, context_of(SimpleNamespace(number=9), source))
@@ -72,14 +72,14 @@ def test_unmapped_fields_have_the_defaults_of_rclpy(package: InterfacePackage) -
 @pytest.mark.parametrize("text", ["", "a", "é€", "a\0b", "\N{GRINNING FACE}", "x\N{GRINNING FACE}y"])
 def test_wide_text_arrives(package: InterfacePackage, text: str) -> None:
     declared = declared_type(package, "WideText")
-    source = MessageType("Source", is_ros=False, fields=(Field("given", String()),))
+    source = MessageType("Source", fields=(Field("given", String()),))
     ours = serializer(field_map(text="given"), declared, scope_of(source))(SimpleNamespace(given=text))
     _, read = package.ask("WideText", {}, ours)
     assert read["text"] == text
 
 
 def test_text_with_a_nul_is_refused_because_rclpy_would_cut_it() -> None:
-    target = MessageType("made/msg/Text", is_ros=True, fields=(Field("text", String()),))
-    source = MessageType("Source", is_ros=False, fields=(Field("text", String()),))
+    target = MessageType("made/msg/Text", fields=(Field("text", String()),))
+    source = MessageType("Source", fields=(Field("text", String()),))
     message = SimpleNamespace(text="a\0b")
     assert outcome(lambda: serializer(AUTO, target, scope_of(source))(message)) is MAPPING_FAILURES
