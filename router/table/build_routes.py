@@ -39,12 +39,9 @@ def _sound_part(node: Node) -> Node | None:
     if isinstance(node, MappingNode):
         if node.broken and not any(keys <= node.entries.keys() for keys in _SUFFICIENT):
             return None
-        parts = {
-            key: entry if is_sound(entry.value) else None if key in _INDISPENSABLE else _sound_entry(entry)
-            for key, entry in node.entries.items()
-        }
-        if any(part is None and key in _INDISPENSABLE for key, part in parts.items()):
+        if any(key in _INDISPENSABLE and not is_sound(entry.value) for key, entry in node.entries.items()):
             return None
+        parts = {key: entry if is_sound(entry.value) else _sound_entry(entry) for key, entry in node.entries.items()}
         return replace(node, entries={key: part for key, part in parts.items() if part})
     if node.broken:
         return None
