@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from router.compiler.books import DROP_REASONS, Books
 from router.compiler.program import Handler, TargetPlan
 from router.engine.limiter import rate_limit
-from router.errors import MappingError, NonFiniteError, TransportError
+from router.errors import MappingError, NonFiniteError
 
 Handle = Callable[[object, bytes, int, int, str], None]
 """Takes the parsed message, the datagram, its arrival by wall clock and by monotonic clock (ns), the sender's name."""
@@ -52,7 +52,7 @@ def bind(handler: Handler, books: Books, outlets: Outlets) -> Handle:
     namespace: dict[str, object] = {
         **handler.constants,
         "counts": outlets.counts,
-        "FAILURES": (*MAPPING_FAILURES, OSError, TransportError, *outlets.publish_errors),
+        "FAILURES": (*MAPPING_FAILURES, OSError, *outlets.publish_errors),
     }
     for target in handler.targets:
         if target.is_topic:
