@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
-from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.compiler import STRANGER, source_label
 from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, REJECT_REASONS, UNKNOWN_CASE
@@ -16,6 +15,7 @@ from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
 from router.engine.binding import Handle, Outlets, Report, bind
 from router.engine.framing import LEN, restored
+from router.engine.payloadless import why_no_payload
 from router.table.model import Framing
 
 MAX_DATAGRAM = 16 * 1024
@@ -190,14 +190,10 @@ class Engine:
         envelope = self._program.envelope
         case = message.WhichOneof(envelope.oneof)
         if case is None:
-            fields = UnknownFieldSet(message)
-            numbers = [fields[index].field_number for index in range(len(fields))]
-            if not numbers:
-                raise _Rejected("no_payload")
-            if known := [number for number in numbers if number in self._case_numbers]:
-                raise _Rejected("malformed", f"field {known[0]} is no message here")
-            self._count_unhandled(UNKNOWN_CASE)
-            raise _Rejected("unknown_case", f"field {numbers[0]}")
+            reason, detail = why_no_payload(message, self._case_numbers)
+            if reason == "unknown_case":
+                self._count_unhandled(UNKNOWN_CASE)
+            raise _Rejected(reason, detail)
         number = envelope.cases[case].number
         route = self._routes.get(number)
         if route is not None:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
-from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.engine import MAX_DATAGRAM
 from router.engine.framing import restored
+from router.engine.payloadless import why_no_payload
 from router.errors import DecodeError, Severity, SourceSpan, TableError, did_you_mean, shown_path
 from router.table import load_table
 from router.table.model import EnvelopeSettings, Located, RouteTable
@@ -72,8 +72,8 @@ class Wire:
             raise DecodeError(f"malformed: no {self.envelope.name}") from error
         name = outer.WhichOneof(self.envelope.oneof)
         if name is None:
-            unknown = ", ".join(str(field.field_number) for field in UnknownFieldSet(outer))  # type: ignore[attr-defined]
-            raise DecodeError(f"unknown_case: field {unknown}" if unknown else "no_payload")
+            reason, detail = why_no_payload(outer, {case.number for case in self.envelope.cases.values()})
+            raise DecodeError(f"{reason}: {detail}" if detail else reason)
         return Decoded(self.envelope.cases[name], getattr(outer, name), len(whole) - len(datagram))
 
 

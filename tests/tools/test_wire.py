@@ -45,6 +45,7 @@ def test_padding_never_cuts() -> None:
         ("", "empty"),
         ("ffff", "malformed: no PBEnvelope"),
         ("1a00", "unknown_case: field 3"),
+        ("1001", "malformed: field 2 is no message here"),
         ("0000", "no_payload"),
     ],
 )
