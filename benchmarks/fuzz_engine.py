@@ -151,7 +151,7 @@ def _seeds(program: Program) -> tuple[list[Seed], list[Peer]]:
     golden = json.loads((ROOT / "tests" / "wire" / "golden_envelopes.json").read_text())
     seeds = []
     for entry in golden:
-        handler = program.handlers.get(entry["field_number"])
+        handler = program.inbound.get(entry["field_number"])
         senders = [addresses[name] for name in handler.sources if name is not None] if handler else everybody
         seeds.append(Seed(bytes.fromhex(entry["hex"]), senders))
     return seeds, everybody

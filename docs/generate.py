@@ -36,7 +36,7 @@ def metrics_page() -> str:
     for metric in METRICS:
         suffix = "_total" if metric.kind == "counter" else ""
         labels = ", ".join(metric.labels)
-        lines.append(f"| `router_{metric.name}{suffix}` | {metric.kind} | {labels} | {metric.help} |")
+        lines.append(f"| `router_{metric.name}{suffix}` | {'gauge' if metric.kind in ('time', 'number') else metric.kind} | {labels} | {metric.help} |")
     lines += [
         "| `router_build_info` | gauge | version, table_sha256, protos_sha256 | Always 1; says what is running. |",
         "",

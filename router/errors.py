@@ -94,6 +94,8 @@ class Code(enum.Enum):
     )
     BOARD_PAYLOAD = ("board-payload", "A board's firmware cannot decode this payload: no fixed size, or too large.")
     NO_TARGET = ("no-target", "A route that goes nowhere.")
+    SOURCE_CLASH = ("source-clash", "Two routes of one payload case take it from the same source.")
+    NO_DEADMAN = ("no-deadman", "Commands to a board that nothing stops when they stop coming.")
     # the mapping
     DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice.")
     NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")
@@ -113,7 +115,7 @@ class Code(enum.Enum):
         return Severity.WARNING if self in _WARNINGS else Severity.ERROR
 
 
-_WARNINGS = frozenset({Code.UNCOVERED_PAYLOAD_CASE, Code.NOT_LOCKED})
+_WARNINGS = frozenset({Code.UNCOVERED_PAYLOAD_CASE, Code.NOT_LOCKED, Code.NO_DEADMAN})
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,13 +50,11 @@ class Router:
             "router started",
             table=str(table.path),
             listening={name: str(listener.address) for name, listener in self.listeners.items()},
-            routes=len(self.program.handlers),
+            routes=len(self.program.inbound),
             destinations=len(self.program.senders),
             topics=len(self.program.publishers),
             metrics=str(self.metrics_address) if self.metrics_address else None,
         )
-        if outbound := self.program.declared_outbound:
-            logger.warning("routes from ROS to UDP are checked but not carried yet", routes=list(outbound))
         return self
 
     def __exit__(

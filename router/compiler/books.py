@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric. `kind` is counter, gauge (nanoseconds in the books, seconds exported) or histogram."""
+    """One metric. `kind` is counter, histogram, number, or time (nanoseconds in the books, seconds exported)."""
 
     name: str
     kind: str
@@ -33,9 +33,15 @@ METRICS = (
     Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
     Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
     Metric("messages_filtered", "counter", ("route", "target"), "Messages that `when` held back, or nobody wanted."),
-    Metric("route_seconds", "histogram", ("route",), "Time from datagram received to all targets served."),
-    Metric("route_last_message_timestamp_seconds", "gauge", ("route",), "When the route last took a message."),
-    Metric("endpoint_last_seen_timestamp_seconds", "gauge", ("endpoint",), "When the endpoint last sent."),
+    Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
+    Metric("route_seconds", "histogram", ("route",), "Time from message received to all targets served."),
+    Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last took a message."),
+    Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
+    Metric("deadman_active", "number", ("route",), "1 while the route's deadman sends in place of its commands."),
+    Metric("deadman_trips", "counter", ("route",), "How often commands stopped coming."),
+    Metric("deadman_datagrams_sent", "counter", ("route", "destination"), "Datagrams that the deadman sent."),
+    Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
+    Metric("qos_incompatible", "number", ("route", "topic", "policy"), "Peers that got or gave nothing for their QoS."),
 )
 
 REJECT_REASONS: Mapping[str, str] = {
@@ -53,16 +59,19 @@ REJECT_REASONS: Mapping[str, str] = {
 DROP_REASONS: Mapping[str, str] = {
     "mapping_error": "a mapping failed on these values, as in a division by zero",
     "non_finite": "NaN or infinity where an integer or a time is wanted",
-    "stale": "too old; for routes from ROS to UDP",
+    "stale": "older than `ttl`",
     "rate_limited": "more often than `max_rate`",
-    "queue_full": "faster than it could be taken; for routes from ROS to UDP",
+    "queue_full": "the endpoint's `budget` was short for longer than the queue lasts",
     "send_buffer_full": "the kernel's send buffer was full",
     "send_error": "the network refused it; `Connection refused`: nobody listens there",
     "publish_error": "the ROS middleware refused it",
-    "incomplete": "parts are missing; for routes from ROS to UDP",
-    "loop": "it came from this router; for routes from ROS to UDP",
+    "incomplete": "a frame that was not complete when its time was up, or had no room",
+    "loop": "it came from this router",
 }
 """Why a target did not get a message, with what each means."""
+
+QOS_POLICIES = ("reliability", "durability", "deadline", "liveliness")
+"""The policies that can keep a publisher and a subscriber apart."""
 
 UNKNOWN_CASE = "unknown"
 """The `payload_case` label of a field number that the envelope does not have."""

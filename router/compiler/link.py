@@ -15,8 +15,8 @@ from router.compiler.program import (
     Handler,
     ListenerPlan,
     Program,
-    PublisherPlan,
     SenderPlan,
+    TopicPlan,
     source_label,
 )
 from router.compiler.routes import CheckedRoute, nested_types
@@ -44,21 +44,23 @@ def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Seq
             SenderPlan(one.name, one.address.value) for one in table.endpoints.values() if one.name in destinations
         ),
         publishers=_publishers(inbound),
-        handlers={checked.case.number: compile_handler(checked, table, books) for checked in inbound},
+        subscriptions=(),
+        inbound={checked.case.number: (compile_handler(checked, table, books),) for checked in inbound},
+        outbound={},
+        deadmen=(),
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
-        declared_outbound=tuple(checked.case.name for checked in routes if checked.route.is_outbound),
         protos_sha256=schema.sha256,
     )
 
 
-def _publishers(routes: Sequence[CheckedRoute]) -> tuple[PublisherPlan, ...]:
+def _publishers(routes: Sequence[CheckedRoute]) -> tuple[TopicPlan, ...]:
     """One for each topic, however many routes publish on it: the check has seen to it that they agree."""
-    plans: dict[str, PublisherPlan] = {}
+    plans: dict[str, TopicPlan] = {}
     for checked in routes:
         for served in checked.targets:
             if served.topic and served.type:
                 name, qos = served.topic.topic.value, qos_of(served.topic)
-                plans.setdefault(name, PublisherPlan(name, served.type.name, qos, _definitions(served.type)))
+                plans.setdefault(name, TopicPlan(name, served.type.name, qos, _definitions(served.type)))
     return tuple(plans.values())
 
 
@@ -91,6 +93,7 @@ def compile_handler(checked: CheckedRoute, table: RouteTable, books: Books) -> H
     books.slot("route_seconds", case.name)
     books.slot("route_last_message_timestamp_seconds", case.name)
     return Handler(
+        route=route.name,
         case=case,
         function=generator.function,
         source=generator.out.text(),

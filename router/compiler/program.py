@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from types import CodeType
 
 from router.compiler.books import Books
-from router.table.model import Address, Framing, RouteTable
+from router.table.model import Address, Framing, Keep, Priority, RouteTable
 from router.types.protobuf import Envelope, PayloadCase
 
 STRANGER = None
@@ -33,10 +33,11 @@ class ListenerPlan:
 
 @dataclass(frozen=True, slots=True)
 class SenderPlan:
-    """A connected UDP socket to one destination endpoint."""
+    """A connected UDP socket to one destination endpoint. `budget` in bytes per second, None for no limit."""
 
     endpoint: str
     address: Address
+    budget: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +60,10 @@ class QosPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class PublisherPlan:
-    """One ROS publisher.
+class TopicPlan:
+    """One ROS publisher or subscription.
 
-    `definitions` are what the CDR bytes were laid out after: of the type itself and of each type nested
+    `definitions` are what its CDR bytes are laid out after: of the type itself and of each type nested
     in it, by name, the fields as rclpy spells them.
     """
 
@@ -74,23 +75,42 @@ class PublisherPlan:
 
 @dataclass(frozen=True, slots=True)
 class TargetPlan:
-    """A target of a generated function: `name` is its part of the Python names, `target` its label."""
+    """A target of a generated function: `name` is its part of the Python names, `target` its label.
+
+    `is_deferred` says that it may be served later and by another thread: it has `keep: latest`, or its
+    endpoint has a budget.
+    """
 
     name: str
     target: str
     is_topic: bool
     max_rate: float | None
+    keep: Keep = Keep.FIRST
+    priority: Priority = Priority.TELEMETRY
+    is_deferred: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DeadmanPlan:
+    """A route's deadman: what is sent to which endpoints when no fresh command came for `timeout` (all ns)."""
+
+    route: str
+    timeout: int
+    repeat: int
+    datagrams: tuple[tuple[str, bytes], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Handler:
-    """One inbound or forward route as generated Python.
+    """One route as generated Python, for a route from ROS one for each of its topics.
 
     `code` defines the function called `function`. Executed in a namespace that holds `constants` and what the
-    engine binds for `targets` (see engine.binding), it serves one parsed message. `source` is the same
-    as text. `sources` are the endpoints that may send it, perhaps with STRANGER among them.
+    engine binds for `targets` (see engine.binding), it serves one message: a parsed payload, or the CDR bytes
+    from `topic`. `source` is the same as text. `sources` are the endpoints that may send it, perhaps with
+    STRANGER among them; for a route from ROS none. `ttl` and `collect_timeout` in ns, None for none.
     """
 
+    route: str
     case: PayloadCase
     function: str
     source: str
@@ -98,13 +118,18 @@ class Handler:
     constants: Mapping[str, object]
     targets: tuple[TargetPlan, ...]
     sources: frozenset[str | None]
+    topic: str | None = None
+    ttl: int | None = None
+    collect_timeout: int | None = None
+    has_deadman: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
     """A compiled table.
 
-    Handlers are by envelope field number. `ignored` are the numbers of cases that the table ignores.
+    `inbound` has the handlers by envelope field number: several where a case has several routes, which differ
+    in their sources. `outbound` has them by topic. `ignored` are the numbers of cases that the table ignores.
     """
 
     table: RouteTable
@@ -112,8 +137,10 @@ class Program:
     books: Books
     listeners: tuple[ListenerPlan, ...]
     senders: tuple[SenderPlan, ...]
-    publishers: tuple[PublisherPlan, ...]
-    handlers: Mapping[int, Handler]
+    publishers: tuple[TopicPlan, ...]
+    subscriptions: tuple[TopicPlan, ...]
+    inbound: Mapping[int, tuple[Handler, ...]]
+    outbound: Mapping[str, tuple[Handler, ...]]
+    deadmen: tuple[DeadmanPlan, ...]
     ignored: frozenset[int]
-    declared_outbound: tuple[str, ...]
     protos_sha256: str

@@ -146,13 +146,13 @@ class RouteChecker:
         when = self._when(destination.when, scope)
         trim = endpoint is not None and endpoint.trim_trailing_zeros
         name, rate = destination.endpoint.value, _rate(destination)
-        return CheckedTarget(Target(name, destination.span, scope.locals, when, rate, trim=trim), None, None)
+        return CheckedTarget(Target(name, destination.span, False, scope.locals, when, rate, trim=trim), None, None)
 
     def _publish(self, topic: Topic, ros_type: MessageType, scope: Scope) -> CheckedTarget:
         when = self._when(topic.when, scope)
         mapping = build(topic.fields, ros_type, scope, topic.topic.span)
         self.findings += mapping.findings
-        target = Target(topic.topic.value, topic.span, scope.locals, when, _rate(topic), plan=mapping.plan)
+        target = Target(topic.topic.value, topic.span, True, scope.locals, when, _rate(topic), plan=mapping.plan)
         return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
 
     # ROS to UDP
@@ -185,7 +185,7 @@ class RouteChecker:
         mapping = build(destination.fields or route.fields, case.type, scope, route.case.span)
         self.findings += mapping.findings
         name, rate = destination.endpoint.value, _rate(destination)
-        target = Target(name, destination.span, scope.locals, when, rate, plan=mapping.plan)
+        target = Target(name, destination.span, False, scope.locals, when, rate, plan=mapping.plan)
         return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
 
     # names

@@ -7,16 +7,21 @@ from dataclasses import dataclass
 from router.compiler.expressions import Locals, Typed
 from router.compiler.plan import Record
 from router.errors import SourceSpan
+from router.table.model import Keep, Priority
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A destination, or with a `plan` a topic. `name` is its label in the books."""
+    """A destination or a topic. `name` is its label in the books. Without a `plan` the datagram is forwarded."""
 
     name: str
     span: SourceSpan
+    is_topic: bool
     locals: Locals
     when: Typed | None = None
     max_rate: float | None = None
+    keep: Keep = Keep.FIRST
+    priority: Priority = Priority.TELEMETRY
+    has_budget: bool = False
     trim: bool = False
     plan: Record | None = None

@@ -28,13 +28,14 @@ PREFIX = "router_"
 SAMPLES_PER_REST = 16
 REST_SECONDS = 1e-4
 
+_EXPORTED_AS = {"time": "gauge", "number": "gauge"}
 _BUCKETS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
 
 class BooksCollector(Collector):
     """All series of the books, each from its first scrape on, at 0 while nothing has happened.
 
-    `counts` has the list of each thread that counts: a counter is their sum, a gauge the latest of them.
+    `counts` has the list of each thread that counts: a counter is their sum, a number or a time the largest of them.
     `kernel_drops` is asked by listener at each scrape. `build` has the labels of `router_build_info`.
     """
 
@@ -57,7 +58,7 @@ class BooksCollector(Collector):
     def collect(self) -> Iterator[Family]:
         threads = [counts.copy() for counts in self._counts]  # at one instant each: copying holds the interpreter lock
         for metric in METRICS:
-            family = Family(PREFIX + metric.name, metric.help, metric.kind)
+            family = Family(PREFIX + metric.name, metric.help, _EXPORTED_AS.get(metric.kind, metric.kind))
             family.samples = _with_rests(self._samples(metric, threads))  # type: ignore[assignment]  # read once, in order
             yield family
         yield self._build
@@ -67,8 +68,10 @@ class BooksCollector(Collector):
         for labels, slot in self._slots[metric.name]:
             if metric.kind == "histogram":
                 yield from _histogram(name, labels, [thread[slot : slot + HISTOGRAM_SLOTS] for thread in threads])
-            elif metric.kind == "gauge":
+            elif metric.kind == "time":
                 yield Sample(name, labels, max(thread[slot] for thread in threads) / 1e9)
+            elif metric.kind == "number":
+                yield Sample(name, labels, max(thread[slot] for thread in threads))
             elif metric.name == "kernel_drops":
                 yield Sample(f"{name}_total", labels, self._kernel_drops[labels["listener"]]())
             else:

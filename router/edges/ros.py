@@ -26,7 +26,7 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 
-from router.compiler.program import PublisherPlan, QosPlan
+from router.compiler.program import QosPlan, TopicPlan
 from router.edges.log import logger
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
@@ -48,7 +48,7 @@ class RosEdge:
     def __init__(
         self,
         node: NodeSettings,
-        publishers: Sequence[PublisherPlan],
+        publishers: Sequence[TopicPlan],
         spans: Mapping[str, SourceSpan],
         ros_args: Sequence[str] = (),
     ) -> None:
@@ -83,7 +83,7 @@ class RosEdge:
         self._thread = threading.Thread(target=self._spin, name="ros")
         self._thread.start()
 
-    def _open(self, plan: PublisherPlan, message_class: type) -> None:
+    def _open(self, plan: TopicPlan, message_class: type) -> None:
         wanted = [plan.qos.serves_late_joiners]
         publisher = self._node.create_publisher(
             message_class, plan.topic, _qos_profile(plan.qos), event_callbacks=_events(plan, wanted)
@@ -114,7 +114,7 @@ class RosEdge:
         self._context.try_shutdown()
 
 
-def _events(plan: PublisherPlan, wanted: list[bool]) -> PublisherEventCallbacks:
+def _events(plan: TopicPlan, wanted: list[bool]) -> PublisherEventCallbacks:
     def on_matched(status: Any) -> None:
         wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
 
@@ -133,7 +133,7 @@ def _events(plan: PublisherPlan, wanted: list[bool]) -> PublisherEventCallbacks:
     )
 
 
-def _message_class(plan: PublisherPlan, span: SourceSpan) -> type:
+def _message_class(plan: TopicPlan, span: SourceSpan) -> type:
     """The installed Python class; it and all in it must be laid out as the table was compiled for."""
     for name, compiled in plan.definitions.items():
         installed = tuple(_installed(name, span).get_fields_and_field_types().items())

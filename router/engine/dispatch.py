@@ -83,7 +83,7 @@ class Engine:
         outlets = Outlets(counts, send, publish, wanted, report, publish_errors)
         self._routes = {
             number: self._route(handler, bind(handler, program.books, outlets))
-            for number, handler in program.handlers.items()
+            for number, [handler] in program.inbound.items()
         }
 
     def _route(self, handler: Handler, handle: Handle) -> _Route:

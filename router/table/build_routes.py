@@ -55,6 +55,7 @@ def build_route(entry: Entry) -> Route:
     source = settings.get("source")
     names = source.items if isinstance(source, SequenceNode) else (source,) if source else ()
     return Route(
+        name=entry.key.text,
         case=Located(entry.key.text, entry.key.span),
         sources=tuple(map(located, names)),
         destinations=tuple(map(_destination, items(settings, "destinations"))),

@@ -47,6 +47,21 @@ class EndpointKind(enum.Enum):
     TOOL = "tool"
 
 
+class Priority(enum.Enum):
+    """Who goes first when an endpoint's budget is short; in this order."""
+
+    COMMAND = "command"
+    TELEMETRY = "telemetry"
+    BULK = "bulk"
+
+
+class Keep(enum.Enum):
+    """Which of the messages that `max_rate` holds back is sent after all: none, or the latest as soon as it may."""
+
+    FIRST = "first"
+    LATEST = "latest"
+
+
 @dataclass(frozen=True, slots=True)
 class EnvelopeSettings:
     """`protos` is an absolute path; `message` and `oneof` name the envelope in them."""
@@ -75,7 +90,7 @@ class Listener:
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """`span` is the endpoint's name in the table."""
+    """`span` is the endpoint's name in the table. `budget` is in bytes per second, None for no limit."""
 
     name: str
     span: SourceSpan
@@ -83,6 +98,7 @@ class Endpoint:
     kind: EndpointKind
     source_port: Located[int] | None
     trim_trailing_zeros: bool
+    budget: Located[int] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +159,13 @@ class Qos:
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """A destination endpoint of a route. `max_rate` is in Hz."""
+    """A destination endpoint of a route. `max_rate` is in Hz; `keep` stands beside it only."""
 
     endpoint: Located[str]
     span: SourceSpan
     when: Expression | None = None
     max_rate: Located[float] | None = None
+    keep: Located[Keep] | None = None
     fields: FieldMap | None = None
 
 
@@ -163,7 +180,34 @@ class Topic:
     qos: Qos | None = None
     when: Expression | None = None
     max_rate: Located[float] | None = None
+    keep: Located[Keep] | None = None
     fields: FieldMap | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Deadman:
+    """What is sent in place of commands that stopped coming: the payload `case` with `fields`, to `to`.
+
+    `span` is the key `deadman`. Durations in ns.
+    """
+
+    span: SourceSpan
+    timeout: Located[int]
+    case: Located[str]
+    fields: FieldMap
+    to: tuple[Located[str], ...]
+    repeat: Located[int]
+
+
+@dataclass(frozen=True, slots=True)
+class Collect:
+    """How the datagrams of one frame are found and put in order. `span` is the key `collect`; `timeout` in ns."""
+
+    span: SourceSpan
+    by: Expression
+    count: Expression
+    order: Expression
+    timeout: Located[int]
 
 
 ANY = "any"
@@ -172,17 +216,27 @@ ROS = "ros"
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """What happens to one payload case. `ignore` holds the reason of a case that goes nowhere.
+    """What happens to one payload case, or to that part of it that comes from certain sources.
 
-    `sources` are endpoint names, or just `any`, or just `ros`. `fields` belongs to `source: ros`.
+    `name` tells the routes of a table apart, in metrics and log: the payload case, or where a case has
+    several routes `imu_info_from_ros`. `ignore` holds the reason of a case that goes nowhere. `sources` are endpoint
+    names, or just `any`, or just `ros`. `fields` and `for_each` belong to `source: ros`, `collect` to others.
+    `ttl` in ns. `no_deadman` is the reason why a command route has none.
     """
 
+    name: str
     case: Located[str]
     sources: tuple[Located[str], ...]
     destinations: tuple[Destination, ...]
     topics: tuple[Topic, ...]
     fields: FieldMap | None = None
     ignore: Located[str] | None = None
+    ttl: Located[int] | None = None
+    deadman: Deadman | None = None
+    no_deadman: Located[str] | None = None
+    for_each: Expression | None = None
+    collect: Collect | None = None
+    priority: Located[Priority] | None = None
 
     @property
     def is_outbound(self) -> bool:

@@ -50,7 +50,7 @@ def nested(declared: Type) -> list[MessageType]:
 
 
 def assert_agreement(checked: Checked, program: Program, route: CheckedRoute, message: Any) -> None:
-    serve = Published(program, program.handlers[route.case.number])
+    serve = Published(program, program.inbound[route.case.number][0])
     published = serve(message)
     assert published == expected(checked, route, message)
     assert {report.reason for report in serve.reports} <= {"mapping_error", "non_finite"}
@@ -64,12 +64,12 @@ def test_golden_envelope_fills_every_topic_as_the_reference_does(
 ) -> None:
     route = next(checked for checked in rover.routes if checked.case.name == entry["payload_case"])
     if route.route.is_outbound:
-        assert route.case.number not in rover_program.handlers
+        assert route.case.number not in rover_program.inbound
         return
     envelope = rover_program.envelope.message_class.FromString(bytes.fromhex(entry["hex"]))
     message = getattr(envelope, route.case.name)
     assert_agreement(rover, rover_program, route, message)
-    serve = Published(rover_program, rover_program.handlers[route.case.number])
+    serve = Published(rover_program, rover_program.inbound[route.case.number][0])
     assert serve(message).keys() == serve.topics.keys(), "every golden envelope is published on every topic"
 
 

@@ -153,7 +153,7 @@ def test_traceback_points_into_the_table(name: str, check_text: CheckText) -> No
     routes, line, blamed, kind = FAILING[name]
     program = check_text(routes).program
     assert program is not None
-    (handler,) = program.handlers.values()
+    ((handler,),) = program.inbound.values()
     serve = Published(program, handler)
     assert serve(handler.case.message_class(accel_x=1.0, mag_x=1e6)) == {}
     (report,) = serve.reports

@@ -72,7 +72,7 @@ def test_every_metric_of_the_books_is_there_from_the_start_at_zero(scraped: Scra
     values = scraped.values()
     for metric in METRICS:
         labels = frozenset((label, LABELS[label]) for label in metric.labels)
-        suffix = {"counter": "_total", "gauge": "", "histogram": "_count"}[metric.kind]
+        suffix = {"counter": "_total", "time": "", "number": "", "histogram": "_count"}[metric.kind]
         assert values[f"router_{metric.name}{suffix}", labels] == 0, metric.name
 
 

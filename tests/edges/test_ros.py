@@ -13,7 +13,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 from structlog.testing import capture_logs
 
-from router.compiler.program import PublisherPlan, QosPlan
+from router.compiler.program import QosPlan, TopicPlan
 from router.edges.ros import RosEdge
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
@@ -25,11 +25,11 @@ SPAN = SourceSpan("routes/rover.yaml", 40, 16, 24)
 HELLO = bytes(serialize_message(String(data="hello, rover...")))  # 24 bytes: DDS pads to a multiple of four
 
 
-def string_topic(qos: QosPlan = RELIABLE, topic: str = "greeting") -> PublisherPlan:
-    return PublisherPlan(topic, "std_msgs/msg/String", qos, {"std_msgs/msg/String": (("data", "string"),)})
+def string_topic(qos: QosPlan = RELIABLE, topic: str = "greeting") -> TopicPlan:
+    return TopicPlan(topic, "std_msgs/msg/String", qos, {"std_msgs/msg/String": (("data", "string"),)})
 
 
-def open_ros(*plans: PublisherPlan, args: tuple[str, ...] = ()) -> RosEdge:
+def open_ros(*plans: TopicPlan, args: tuple[str, ...] = ()) -> RosEdge:
     return RosEdge(NodeSettings("router_test", "/"), plans, {plan.topic: SPAN for plan in plans}, args)
 
 
@@ -88,7 +88,7 @@ def test_every_qos_that_a_table_can_name_opens() -> None:
 def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
     stale = (("data", "string"), ("more", "uint8"))
     with pytest.raises(StartError) as refused:
-        open_ros(PublisherPlan("greeting", "std_msgs/msg/String", RELIABLE, {"std_msgs/msg/String": stale}))
+        open_ros(TopicPlan("greeting", "std_msgs/msg/String", RELIABLE, {"std_msgs/msg/String": stale}))
     assert str(refused.value) == (
         "routes/rover.yaml:40:16: std_msgs/msg/String as installed is not what the table was compiled for; "
         "run 'make setup', or install the ROS package 'std_msgs'\n"
@@ -103,12 +103,12 @@ def test_a_type_with_one_in_it_that_was_compiled_otherwise_is_refused() -> None:
     definitions = {name: definition(found) for name, found in types.items() if found}
     definitions["builtin_interfaces/msg/Time"] = (("sec", "int64"), ("nanosec", "uint32"))
     with pytest.raises(StartError, match="builtin_interfaces/msg/Time as installed is not what"):
-        open_ros(PublisherPlan("stamps", "std_msgs/msg/Header", RELIABLE, definitions))
+        open_ros(TopicPlan("stamps", "std_msgs/msg/Header", RELIABLE, definitions))
 
 
 @pytest.mark.parametrize("type_name", ["no_such_msgs/msg/String", "std_msgs/msg/NoSuch"])
 def test_a_type_that_is_not_installed_is_refused(type_name: str) -> None:
-    missing = PublisherPlan("greeting", type_name, RELIABLE, {type_name: ()})
+    missing = TopicPlan("greeting", type_name, RELIABLE, {type_name: ()})
     with pytest.raises(StartError, match=rf"rover.yaml:40:16: {type_name} is not installed .* run 'make setup'"):
         open_ros(missing)
 

@@ -31,7 +31,7 @@ class Ledger:
         received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")
         if received != (accepted := self.total("messages_received")) + rejected:
             yield f"received {received}, but accepted {accepted} and rejected {rejected}"
-        for handler in self._program.handlers.values():
+        for [handler] in self._program.inbound.values():
             yield from self._of_route(handler)
 
     def _of_route(self, handler: Handler) -> Iterator[str]:

@@ -18,7 +18,7 @@ class Naive:
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.program = rig.program
-        handlers = self.program.handlers.items()
+        handlers = [(number, handler) for number, [handler] in self.program.inbound.items()]
         self.handles = {number: bind(handler, self.program.books, rig.outlets) for number, handler in handlers}
 
     def receive(self, data: bytes, peer: tuple[str, int], listener: str) -> None:
@@ -65,11 +65,11 @@ class Naive:
         number = self.program.envelope.cases[name].number
         if number in self.program.ignored:
             return "ignored"
-        if number not in self.program.handlers:
+        if number not in self.program.inbound:
             self._add(1, "unhandled", name)
             return "unhandled"
         sender = self._endpoint(peer)
-        if sender not in self.program.handlers[number].sources:
+        if sender not in self.program.inbound[number][0].sources:
             return "source_mismatch"
         label = sender or "unknown"
         self._add(1, "messages_received", name, label)
