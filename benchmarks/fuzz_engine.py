@@ -151,9 +151,9 @@ def _seeds(program: Program) -> tuple[list[Seed], list[Peer]]:
     golden = json.loads((ROOT / "tests" / "wire" / "golden_envelopes.json").read_text())
     seeds = []
     for entry in golden:
-        handler = program.inbound.get(entry["field_number"])
-        senders = [addresses[name] for name in handler.sources if name is not None] if handler else everybody
-        seeds.append(Seed(bytes.fromhex(entry["hex"]), senders))
+        handlers = program.inbound.get(entry["field_number"], ())
+        senders = [addresses[name] for handler in handlers for name in handler.sources if name is not None]
+        seeds.append(Seed(bytes.fromhex(entry["hex"]), senders or everybody))
     return seeds, everybody
 
 
