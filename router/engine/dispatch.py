@@ -13,8 +13,9 @@ from router.compiler import STRANGER, source_label
 from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, REJECT_REASONS, UNKNOWN_CASE
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
-from router.engine.binding import Handle, Outlets, Report, bind
+from router.engine.binding import Handle, Outlets, bind
 from router.engine.framing import LEN, restored
+from router.engine.outcome import Report
 from router.engine.payloadless import why_no_payload
 from router.table.model import Framing
 

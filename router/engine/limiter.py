@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import ceil
 
 NS = 1_000_000_000
 
 
-def rate_limit(hertz: float) -> Callable[[int], bool]:
-    """A function of the monotonic time in ns that says whether a message may pass now.
+class RateLimit:
+    """Lets through at most `hertz` messages per second; all times are monotonic, in ns.
 
-    Passes keep to a grid of one period. A message up to half a period off takes its place on the grid (an
+    Passes keep to a grid of one period. A message up to half a period early takes its place on the grid (an
     interval throttle would wait for the next and undershoot: 25 instead of 30 Hz out of 100); after a pause
     the grid starts anew, so nothing is saved up for a burst. In any second at most `hertz` + 1 pass.
+
+    `next_pass` is the time from which on a message may pass.
     """
-    period = ceil(NS / hertz)
-    early = period // 2
-    late = period - early
-    due: int | None = None
 
-    def may_pass(now: int) -> bool:
-        nonlocal due
-        if due is None or now - due >= late:
-            due = now + period
-        elif now < due - early:
+    __slots__ = ("_late", "_period", "next_pass")
+
+    def __init__(self, hertz: float) -> None:
+        self._period = ceil(NS / hertz)
+        self._late = self._period - self._period // 2
+        self.next_pass = -self._period  # a whole period ago at any time, for monotonic time is not negative
+
+    def may_pass(self, now: int) -> bool:
+        """Whether a message may pass now; if so, it has taken the place."""
+        waited = now - self.next_pass
+        if waited < 0:
             return False
-        else:
-            due += period
+        self.next_pass = self.next_pass + self._period if waited < self._period else now + self._late
         return True
-
-    return may_pass

@@ -16,7 +16,8 @@ from router.compiler.reference import fill
 from router.compiler.reference_cdr import cdr
 from router.compiler.reference_expressions import Context, View
 from router.compiler.source import Source
-from router.engine.binding import MAPPING_FAILURES, Outlets, Report, bind
+from router.engine.binding import Outlets, bind
+from router.engine.outcome import MAPPING_FAILURES, Report
 from router.errors import Diagnostic, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.places import TextPlace

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 
 from router.compiler.definitions import Definitions
 from router.compiler.reference import fill
-from router.engine.binding import MAPPING_FAILURES
+from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import MessageType
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer

@@ -15,7 +15,7 @@ from router.compiler.program import Program
 from router.compiler.reference import fill
 from router.compiler.reference_cdr import cdr
 from router.compiler.routes import CheckedRoute
-from router.engine.binding import MAPPING_FAILURES
+from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import Published, context_of
 from tests.compiler.in_use import INBOUND_CASES

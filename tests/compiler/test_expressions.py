@@ -15,7 +15,7 @@ from router.compiler.expressions import Finding
 from router.compiler.kinds import BoolKind, FloatKind, IntKind, Kind, StringKind
 from router.compiler.mapping import build
 from router.compiler.reference_expressions import evaluate
-from router.engine.binding import MAPPING_FAILURES
+from router.engine.outcome import MAPPING_FAILURES
 from router.errors import Code
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same

@@ -12,7 +12,7 @@ from rosbags.typesys.msg import get_types_from_msg
 
 from router.compiler.reference import Value, fill
 from router.compiler.reference_cdr import cdr
-from router.engine.binding import MAPPING_FAILURES
+from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import AUTO, context_of, outcome, reference_bytes, scope_of, serializer
 from tests.compiler.generated_types import STATE, pairs, values

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from router.compiler.expressions import DEEPEST, Finding
 from router.compiler.source import Source
-from router.engine.binding import MAPPING_FAILURES
+from router.engine.outcome import MAPPING_FAILURES
 from router.errors import Code
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String
 from tests.compiler.compiling import SPAN, compiled, scope_of

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 
 from router.compiler.reference import fill
 from router.compiler.reference_cdr import cdr
-from router.engine.binding import MAPPING_FAILURES
+from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Field, Int, MessageType, String
 from router.types.ros import RosInterfaces
 from router.types.ros_sources import MsgFiles, RosbagsDefinitions

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine.limiter import NS, rate_limit
+from router.engine.limiter import NS, RateLimit
 
 rates = st.integers(1, 1000) | st.floats(0.5, 1000)
 
 
 def passed(hertz: float, times: Iterable[int]) -> list[int]:
-    limit = rate_limit(hertz)
-    return [time for time in times if limit(time)]
+    limit = RateLimit(hertz)
+    return [time for time in times if limit.may_pass(time)]
 
 
 @given(rates, st.lists(st.floats(0, 3), min_size=1, max_size=200), st.integers(0, 2**62))
@@ -40,6 +40,36 @@ def test_a_steady_stream_above_the_rate_comes_down_to_it(hertz: int, factor: flo
     assert abs(len(kept) - 10 * hertz) <= 1
 
 
+@given(st.integers(2, 200), st.floats(1, 20), st.integers(0, 9 * NS))
+def test_so_it_is_in_every_second(hertz: int, factor: float, start: int) -> None:
+    kept = passed(hertz, range(0, 11 * NS, int(NS / hertz / factor)))
+    assert abs(sum(start <= time < start + NS for time in kept) - hertz) <= 1
+
+
+def test_a_hundred_come_down_to_thirty() -> None:
+    assert abs(len(passed(30, range(0, NS, NS // 100))) - 30) <= 1
+
+
+@given(st.integers(1, 200), st.floats(0, 1), st.lists(st.floats(0, 0.5), min_size=2, max_size=200))
+def test_a_stream_not_above_the_rate_passes_whole_with_jitter_up_to_half_a_period(
+    hertz: int, slowness: float, delays: list[float]
+) -> None:
+    period = math.ceil(NS / hertz)
+    interval = round(period * (1 + slowness))
+    times = [index * interval + int(delay * period) for index, delay in enumerate(delays)]
+    assert passed(hertz, times) == times
+
+
+@given(rates, st.lists(st.floats(0, 3), min_size=1, max_size=50))
+def test_it_tells_from_when_on_the_next_may_pass(hertz: float, gaps: list[float]) -> None:
+    limit, now = RateLimit(hertz), 0
+    for gap in gaps:
+        now += round(gap * NS / hertz)
+        may = limit.next_pass <= now
+        assert limit.may_pass(now) == may
+        assert limit.next_pass > now
+
+
 @pytest.mark.parametrize("hertz", [1, 10, 30, 60, 100, 500])
 @pytest.mark.parametrize("jitter", [0.0, 0.05, 0.2])
 def test_a_stream_at_the_rate_loses_nothing_to_jitter(hertz: int, jitter: float) -> None:
@@ -58,12 +88,12 @@ def test_heavy_jitter_at_the_rate_costs_little() -> None:
 @given(st.lists(st.floats(0.5, 100), min_size=1, max_size=20))
 def test_after_a_pause_nothing_was_saved_up(pauses: list[float]) -> None:
     """A message, a pause, then a flood: of it one passes at once and the next half a period later."""
-    limit, now = rate_limit(10), 0
+    limit, now = RateLimit(10), 0
     for pause in pauses:
-        limit(now)
+        limit.may_pass(now)
         now += NS // 10 + round(pause * NS)
         flood = [now + index * 1_000_000 for index in range(100)]
-        assert [time - now for time in flood if limit(time)] == [0, 50_000_000]
+        assert [time - now for time in flood if limit.may_pass(time)] == [0, 50_000_000]
         now = flood[-1]
 
 

@@ -1,0 +1,91 @@
+"""What becomes of a message at one target, counted and reported: for whatever serves targets beside generated code."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from router.compiler.books import DROP_REASONS, Books
+from router.compiler.program import TargetPlan
+from router.errors import MappingError, NonFiniteError
+
+MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
+"""What a value can make of a mapping. Everything else is a fault of ours and goes up, loudly."""
+
+_FULL = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Something was lost. `kind` is `drop` (one target) or `reject` (a whole datagram).
+
+    `place` is the route for a drop, the listener for a reject; `target` is empty for a reject.
+    """
+
+    kind: str
+    place: str
+    target: str
+    reason: str
+    error: BaseException | None = None
+    detail: str = ""
+
+
+def reason_of(error: Exception, is_topic: bool) -> str:
+    """The drop reason of what a mapping, the network or the middleware raised."""
+    if isinstance(error, NonFiniteError):
+        return "non_finite"
+    if isinstance(error, MAPPING_FAILURES):
+        return "mapping_error"
+    if is_topic:
+        return "publish_error"
+    return "send_buffer_full" if isinstance(error, OSError) and error.errno in _FULL else "send_error"
+
+
+class Outcome:
+    """The books of one target of one route, in a list of counts that its user owns.
+
+    Every loss is reported but `rate_limited`, which is what the table asks for.
+    """
+
+    def __init__(
+        self, books: Books, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
+    ) -> None:
+        self._books = books
+        self._counts = counts
+        self._route = route
+        self._target = target.target
+        self._is_topic = target.is_topic
+        self._report = report
+        self._dropped = {
+            reason: books.slot("messages_dropped", route, target.target, reason) for reason in DROP_REASONS
+        }
+        self._filtered = books.slot("messages_filtered", route, target.target)
+        self._delivered = books.slot(
+            "messages_published" if target.is_topic else "datagrams_sent", route, target.target
+        )
+        self._sent_bytes = None if target.is_topic else books.slot("sent_bytes", route, target.target)
+
+    def delivered(self, size: int) -> None:
+        """Handed over: published, or sent with `size` bytes."""
+        self._counts[self._delivered] += 1
+        if self._sent_bytes is not None:
+            self._counts[self._sent_bytes] += size
+
+    def dropped(self, reason: str, error: Exception | None = None, detail: str = "") -> None:
+        """Lost for one of DROP_REASONS."""
+        self._counts[self._dropped[reason]] += 1
+        if reason != "rate_limited":
+            self._report(Report("drop", self._route, self._target, reason, error, detail))
+
+    def failed(self, error: Exception) -> None:
+        """Lost because mapping it or handing it over raised `error`."""
+        self.dropped(reason_of(error, self._is_topic), error)
+
+    def filtered(self) -> None:
+        self._counts[self._filtered] += 1
+
+    def collected(self) -> None:
+        """Joined a frame. Only a target of a route that collects has this series, so the slot is looked up."""
+        self._counts[self._books.slot("messages_collected", self._route, self._target)] += 1
