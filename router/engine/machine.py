@@ -6,7 +6,11 @@ two calls at once.
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import ParamSpec, Protocol, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class Machine(Protocol):
@@ -18,4 +22,10 @@ class Machine(Protocol):
     next_due: int | None
 
     def due(self, now: int) -> None:
-        """Does what is due at `now`, if anything is, and sets `next_due` to a later time."""
+        """Does what is due at `now`, if anything is, and sets `next_due` to a time after `now`."""
+
+
+class Guard(Protocol):
+    """Has `machine` served from now on, and makes one of its methods (or a function that calls them) safe for others."""
+
+    def __call__(self, machine: Machine, call: Callable[P, R], /) -> Callable[P, R]: ...

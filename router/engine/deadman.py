@@ -1,0 +1,101 @@
+"""What is sent in a route's place when its commands stop coming. Knows no clock: whoever calls tells the time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from router.compiler.books import Books
+from router.compiler.program import DeadmanPlan
+from router.engine.outcome import Report
+
+
+@dataclass(frozen=True, slots=True)
+class _Destination:
+    """One datagram that is ready to be sent, and the slots in which it is counted."""
+
+    endpoint: str
+    datagram: bytes
+    send: Callable[[bytes], int]
+    sent: int
+    errors: int
+
+
+class Deadman:
+    """A machine with three states.
+
+    unarmed: no command came yet, and nothing is due.
+    armed:   the next thing due is `timeout` after the last fresh command. Then it trips.
+    tripped: sends at once, then on the grid of the time at which it was due to trip. A fresh command arms it again.
+
+    `feed` is to be called before the command is sent, so that nothing the deadman sends comes behind the
+    command. `send` is by endpoint and may raise OSError, which ends nothing. `changed` hears the route's name and
+    whether the deadman is active now. All times in ns of the monotonic clock.
+    """
+
+    def __init__(
+        self,
+        plan: DeadmanPlan,
+        books: Books,
+        counts: list[int],
+        send: Mapping[str, Callable[[bytes], int]],
+        report: Callable[[Report], None],
+        changed: Callable[[str, bool], None],
+    ) -> None:
+        self.next_due: int | None = None
+        self._plan = plan
+        self._tripped = False
+        self._counts = counts
+        self._active = books.slot("deadman_active", plan.route)
+        self._trips = books.slot("deadman_trips", plan.route)
+        self._destinations = [
+            _Destination(
+                endpoint,
+                datagram,
+                send[endpoint],
+                books.slot("deadman_datagrams_sent", plan.route, endpoint),
+                books.slot("deadman_send_errors", plan.route, endpoint),
+            )
+            for endpoint, datagram in plan.datagrams
+        ]
+        self._report = report
+        self._changed = changed
+
+    def feed(self, now: int) -> None:
+        """A fresh command is about to be sent."""
+        self.next_due = now + self._plan.timeout
+        if self._tripped:
+            self._tripped = False
+            self._counts[self._active] = 0
+            self._changed(self._plan.route, False)
+
+    def due(self, now: int) -> None:
+        due, repeat = self.next_due, self._plan.repeat
+        if due is None or now < due:
+            return
+        # Before anything can fail; and what a stalled process has missed is left out, not made up for in a burst.
+        self.next_due = due + repeat * ((now - due) // repeat + 1)
+        if self._tripped:
+            self._send()
+            return
+        self._tripped = True
+        self._counts[self._active] = 1
+        self._counts[self._trips] += 1
+        self._send()
+        self._changed(self._plan.route, True)
+
+    def end(self) -> None:
+        """Orderly shutdown: sends a last time unless no command ever came. Then nothing is due any more."""
+        if self.next_due is not None:
+            self.next_due = None
+            self._send()
+
+    def _send(self) -> None:
+        for destination in self._destinations:
+            try:
+                destination.send(destination.datagram)
+            except OSError as error:
+                self._counts[destination.errors] += 1
+                self._report(Report("deadman", self._plan.route, destination.endpoint, "send_error", error))
+            else:
+                self._counts[destination.sent] += 1
