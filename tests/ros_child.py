@@ -1,15 +1,42 @@
-"""What ROS child processes of tests have in common: a standard output of their own, and an end with standard input."""
+"""What ROS child processes of tests have in common: a standard output of their own, and an end with standard input.
+
+`RosProcess` is their handle in the test.
+"""
 
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from typing import TextIO
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+
+
+class RosProcess:
+    """A running child, talked to line by line; close it."""
+
+    def __init__(self, script: str, *arguments: str) -> None:
+        command = [sys.executable, script, *arguments]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def line(self) -> str:
+        """The next line that it prints; waits for it."""
+        assert self.process.stdout
+        return self.process.stdout.readline().strip()
+
+    def kill(self) -> None:
+        """As `kill -9` does: ROS is told nothing."""
+        self.process.kill()
+        self.process.communicate()
+
+    def close(self) -> None:
+        self.process.communicate(timeout=20)
+        assert self.process.returncode == 0
 
 
 def own_stdout() -> TextIO:
@@ -23,8 +50,15 @@ def own_stdout() -> TextIO:
     return lines
 
 
-def spin_until_stdin_ends(node: Node) -> None:
-    threading.Thread(target=lambda: (sys.stdin.read(), rclpy.shutdown()), daemon=True).start()
+def spin_until_stdin_ends(node: Node, heard: Callable[[str], None] = lambda _: None) -> None:
+    """Each line from standard input goes to `heard`, on a thread of its own."""
+
+    def listen() -> None:
+        for line in sys.stdin:
+            heard(line.strip())
+        rclpy.shutdown()
+
+    threading.Thread(target=listen, daemon=True).start()
     try:
         rclpy.spin(node)
     except ExternalShutdownException:

@@ -6,8 +6,6 @@ It prints "matched" once a publisher is there, then each message's bytes in hex,
 from __future__ import annotations
 
 import argparse
-import importlib
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,24 +17,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
 
-from tests.ros_child import own_stdout, spin_until_stdin_ends
+from router.edges.ros_node import installed_class
+from tests.ros_child import RosProcess, own_stdout, spin_until_stdin_ends
 
 
-class Subscriber:
+class Subscriber(RosProcess):
     """`Subscriber("imu_data", "comms/msg/ImuSensorInformation", "--transient-local")`; close it."""
 
     def __init__(self, topic: str, type_name: str, *options: str) -> None:
-        command = [sys.executable, __file__, topic, type_name, *options]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-    def line(self) -> str:
-        """The next line that it prints; waits for it."""
-        assert self.process.stdout
-        return self.process.stdout.readline().strip()
-
-    def close(self) -> None:
-        self.process.communicate(timeout=20)
-        assert self.process.returncode == 0
+        super().__init__(__file__, topic, type_name, *options)
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -53,7 +42,6 @@ def main() -> None:
     parser.add_argument("--transient-local", action="store_true")
     arguments = parser.parse_args()
     lines = own_stdout()
-    package, _, name = arguments.type.split("/")
     qos = QoSProfile(
         depth=100,
         reliability=ReliabilityPolicy.RELIABLE,
@@ -62,7 +50,7 @@ def main() -> None:
     rclpy.init(args=[])
     node = rclpy.create_node("peer")
     node.create_subscription(
-        getattr(importlib.import_module(f"{package}.msg"), name),
+        installed_class(arguments.type),
         arguments.topic,
         lambda data: print(data.hex(), file=lines),
         qos,

@@ -1,0 +1,82 @@
+"""Listens to one ROS topic for somebody who wants to see what it carries. Knows no table and no router."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from itertools import islice
+from time import sleep
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+
+from router.edges.ros_node import RCL_ERRORS, close_node, installed_class, open_node
+from router.edges.ros_wait import RawSubscription, WaitSet
+from router.errors import StartError
+
+DEPTH = 100
+"""Messages that are kept between two calls of `take`; the oldest go first."""
+
+_LOOK_INTERVAL = 0.05
+
+
+class TopicListener:
+    """Subscribed to `topic` on a node of its own. Raises StartError; close it.
+
+    Without a `type_name` opening waits for the first publisher. When all publishers that are there keep messages
+    for late joiners, `take` gives those as well.
+    """
+
+    def __init__(self, topic: str, type_name: str | None = None, ros_args: Sequence[str] = ()) -> None:
+        if type_name is not None and type_name.count("/") != 2:
+            raise StartError(f"'{type_name}' is no message type; they are written like std_msgs/msg/String")
+        with ExitStack() as opening:
+            node = open_node("router_tap", ros_args=ros_args)
+            opening.callback(close_node, node)
+            try:
+                publishers = _publishers(node, topic, wait=type_name is None)
+                self.type_name = type_name or publishers[0].topic_type
+                self._message_class = installed_class(self.type_name)
+                self._subscription = RawSubscription(node, self._message_class, topic, _qos(publishers))
+            except (*RCL_ERRORS, ValueError) as error:
+                raise StartError(f"topic '{topic}' cannot be listened to: {error}") from error
+            self._wait_set = WaitSet(node, [self._subscription])
+            opening.callback(self._wait_set.close)
+            self._open = opening.pop_all()
+
+    def take(self, timeout: float) -> list[tuple[bytes, int]]:
+        """Waits up to `timeout` seconds for messages: the CDR bytes of each, and its arrival in wall clock ns.
+
+        Ctrl-C is only noticed when the wait is over.
+        """
+        self._wait_set.wait(int(timeout * 1e9))
+        return list(islice(iter(self._subscription.take, None), DEPTH))
+
+    def message(self, cdr: bytes) -> Any:
+        """The ROS message object that the bytes are."""
+        return deserialize_message(cdr, self._message_class)
+
+    def close(self) -> None:
+        self._open.close()
+
+
+def _publishers(node: Node, topic: str, *, wait: bool) -> list[Any]:
+    """rclpy's TopicEndpointInfo of each publisher that has been discovered."""
+    while not (publishers := node.get_publishers_info_by_topic(topic)) and wait:
+        sleep(_LOOK_INTERVAL)
+    return publishers  # type: ignore[no-any-return]
+
+
+def _qos(publishers: Sequence[Any]) -> QoSProfile:
+    """Best effort hears every publisher and makes none of them wait; kept messages come to reliable ones alone."""
+    if publishers and all(_keeps_for_late_joiners(publisher.qos_profile) for publisher in publishers):
+        reliability, durability = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
+    else:
+        reliability, durability = ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE
+    return QoSProfile(depth=DEPTH, reliability=reliability, durability=durability)
+
+
+def _keeps_for_late_joiners(qos: QoSProfile) -> bool:
+    return (qos.durability, qos.reliability) == (DurabilityPolicy.TRANSIENT_LOCAL, ReliabilityPolicy.RELIABLE)
