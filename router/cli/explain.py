@@ -16,10 +16,10 @@ from router.cli.findings import is_coloured, print_findings
 from router.compiler import Checked, check_table
 from router.compiler.books import Books
 from router.compiler.cdr import message_size
+from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.link import compile_handler
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
-from router.compiler.routes import CheckedRoute, CheckedTarget
 from router.compiler.topics import qos_of
 from router.errors import did_you_mean
 from router.table.model import ANY, ROS, Route, RouteTable

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from router.compiler.checked import CheckedRoute
 from router.compiler.definitions import Definitions
 from router.compiler.network import network_findings
 from router.compiler.program import Program
-from router.compiler.routes import CheckedRoute, RouteChecker, sorted_findings
+from router.compiler.routes import RouteChecker, sorted_findings
 from router.compiler.topics import meeting_findings
 from router.errors import Diagnostic, Severity, TableError
 from router.table import load_table

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.definitions import Definitions
 from router.compiler.expressions import Finding, Locals, Scope, Typed, check
 from router.compiler.kinds import BoolKind
-from router.compiler.mapping import Row, build
+from router.compiler.mapping import build
 from router.compiler.network import loop_finding
 from router.compiler.target import Target
 from router.compiler.topics import qos_findings, topic_name_finding
@@ -17,26 +18,6 @@ from router.table.model import ANY, ROS, Destination, Endpoint, EndpointKind, Ex
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
-
-
-@dataclass(frozen=True, slots=True)
-class CheckedTarget:
-    """A target with what its mapping came to, for `explain`. `type` is None for unchanged forwarding."""
-
-    target: Target
-    topic: Topic | None
-    type: MessageType | None
-    rows: tuple[Row, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class CheckedRoute:
-    """A route whose names all exist. Findings that it has beside that keep it out of a program."""
-
-    route: Route
-    case: PayloadCase
-    targets: tuple[CheckedTarget, ...]
-
 
 _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT})
 """What a route may seem to do wrong because a part of it, which has a finding of its own, was left out."""
@@ -90,7 +71,7 @@ class RouteChecker:
             )
             return None
         if route.ignore is not None:
-            return CheckedRoute(route, case, ())
+            return CheckedRoute(route, case)
         self._sources(route)
         if not route.destinations and not route.topics:
             self._report(route.case.span, Code.NO_TARGET, f"'{route.case.value}' goes nowhere",
@@ -146,7 +127,7 @@ class RouteChecker:
         when = self._when(destination.when, scope)
         trim = endpoint is not None and endpoint.trim_trailing_zeros
         name, rate = destination.endpoint.value, _rate(destination)
-        return CheckedTarget(Target(name, destination.span, False, scope.locals, when, rate, trim=trim), None, None)
+        return CheckedTarget(Target(name, destination.span, False, scope.locals, when, rate, trim=trim))
 
     def _publish(self, topic: Topic, ros_type: MessageType, scope: Scope) -> CheckedTarget:
         when = self._when(topic.when, scope)

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from router.compiler import Checked
+from router.compiler.checked import CheckedRoute
 from router.compiler.program import Program
 from router.compiler.reference import fill
 from router.compiler.reference_cdr import cdr
-from router.compiler.routes import CheckedRoute
 from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import Published, context_of

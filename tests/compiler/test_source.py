@@ -10,9 +10,9 @@ import pytest
 
 from router.compiler import check_table
 from router.compiler.books import Books
+from router.compiler.checked import CheckedRoute
 from router.compiler.definitions import Definitions
 from router.compiler.handlers import HandlerSource
-from router.compiler.routes import CheckedRoute
 from router.compiler.source import Source
 from router.errors import SourceSpan
 from tests.compiler.compiling import Published

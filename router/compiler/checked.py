@@ -1,0 +1,83 @@
+"""A route after its check: what the generation of its code, and `explain`, take it from.
+
+Plain data. Who finds out what is in it: `routes` and the modules that it asks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from router.compiler.expressions import Locals, Typed
+from router.compiler.mapping import Row
+from router.compiler.plan import Record
+from router.compiler.target import Target
+from router.errors import SourceSpan
+from router.table.model import Route, Topic
+from router.types.model import MessageType
+from router.types.protobuf import PayloadCase
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedTarget:
+    """A target with what its mapping came to, for `explain`.
+
+    `topic` and `type` are those of a ROS topic that is published. `rows` are empty for unchanged forwarding.
+    """
+
+    target: Target
+    topic: Topic | None = None
+    type: MessageType | None = None
+    rows: tuple[Row, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedFeed:
+    """A topic that an outbound route is fed from, with a target for each destination.
+
+    `reads` serves all expressions in it. `when` is the topic's own. With `for_each`, a list, `when` and the
+    targets are evaluated for each element: `item` and `index` of `count`. `stamp` is the message's `header.stamp`
+    (ns) where the route has a `ttl` and the type has the stamp.
+    """
+
+    topic: Topic
+    type: MessageType
+    reads: Locals
+    when: Typed | None
+    for_each: Typed | None
+    stamp: Typed | None
+    targets: tuple[CheckedTarget, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedCollect:
+    """The three numbers of a datagram that is part of a frame. `reads` serves them, and nothing else."""
+
+    span: SourceSpan
+    reads: Locals
+    by: Typed
+    count: Typed
+    order: Typed
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedDeadman:
+    """The payload that is sent when commands stop coming: `plan` has constants only. `to` are endpoint names."""
+
+    case: PayloadCase
+    plan: Record
+    to: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedRoute:
+    """A route whose names all exist. Findings that it has beside that keep it out of a program.
+
+    `targets` are those of a route from UDP, `feeds` those topics that a route from ROS is fed from.
+    """
+
+    route: Route
+    case: PayloadCase
+    targets: tuple[CheckedTarget, ...] = ()
+    feeds: tuple[CheckedFeed, ...] = ()
+    collect: CheckedCollect | None = None
+    deadman: CheckedDeadman | None = None
