@@ -1,0 +1,130 @@
+"""`collect`: the messages of a frame, which arrive one by one and in any order, come out as one list.
+
+Knows no message: a part is any object, and its place in the frame is told.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field
+
+from router.engine.machine import Machine
+from router.engine.outcome import Outcome
+from router.errors import MappingError
+
+MOST_FRAMES = 64
+MOST_PARTS = 8192
+MOST_CLOSED = 1024
+"""What is held at most, whatever the numbers say: open frames, parts of all of them, keys of closed frames."""
+
+
+@dataclass(slots=True)
+class _Frame:
+    count: int
+    ends_at: int
+    parts: dict[int, object] = field(default_factory=dict)
+
+
+class Collector(Machine):
+    """Collects the frames of one route. A frame has `timeout` ns from its first part.
+
+    `outcomes` are those of the targets that get the frames; in each, every part counts once. The first part of a
+    frame stands for the whole: if it becomes complete, who offered the last part counts what becomes of the
+    list; if not, it is dropped as `incomplete` here. The others are collected. Copies are filtered, and so is, for
+    another `timeout`, what comes after the end of its frame: that is a copy too, or a loss that was told already.
+
+    A frame also ends when there is no room, the oldest first, and when a part with the same key tells another
+    count: that one opens a new frame. A part of a frame that would never have room is dropped as `incomplete`.
+    """
+
+    def __init__(self, timeout: int, outcomes: Sequence[Outcome]) -> None:
+        self.next_due: int | None = None
+        self._timeout = timeout
+        self._outcomes = outcomes
+        self._frames: OrderedDict[Hashable, _Frame] = OrderedDict()  # the oldest first
+        self._closed: OrderedDict[Hashable, int] = OrderedDict()  # until when, the earliest first
+        self._held = 0
+
+    def offer(self, now: int, key: Hashable, count: int, index: int, part: object) -> list[object] | None:
+        """The parts 0 to `count` - 1 of a frame that is complete with this one, None for any other part.
+
+        Raises MappingError for numbers that no frame has; the part is then not counted here.
+        """
+        if not 0 <= index < count:
+            raise MappingError(f"a frame of {count} has no part {index}")
+        self.due(now)
+        if count > MOST_PARTS:
+            self._drop(f"a frame of {count} parts, more than {MOST_PARTS}")
+            return None
+        frame = self._frames.get(key)
+        if frame is not None and frame.count != count:
+            self._give_up(key)
+            frame = None
+        if key in self._closed or (frame is not None and index in frame.parts):
+            for outcome in self._outcomes:
+                outcome.filtered()
+            return None
+        if frame is None:
+            frame = self._open(now, key, count)
+        else:
+            for outcome in self._outcomes:
+                outcome.collected()
+        frame.parts[index] = part
+        self._held += 1
+        return self._settle(now, key, frame)
+
+    def due(self, now: int) -> None:
+        while self._frames and self._oldest.ends_at <= now:
+            self._close_oldest(now)
+        while self._closed and next(iter(self._closed.values())) <= now:
+            self._closed.popitem(last=False)
+        self._set_due()
+
+    def _open(self, now: int, key: Hashable, count: int) -> _Frame:
+        if len(self._frames) == MOST_FRAMES:
+            self._close_oldest(now)
+        frame = self._frames[key] = _Frame(count, now + self._timeout)
+        return frame
+
+    def _settle(self, now: int, key: Hashable, frame: _Frame) -> list[object] | None:
+        """Takes the frame out if it is complete; makes room if it is not."""
+        complete = None
+        if len(frame.parts) == frame.count:
+            complete = [frame.parts[index] for index in range(frame.count)]
+            self._remove(key)
+            self._close(now, key)
+        elif self._held > MOST_PARTS:
+            self._close_oldest(now)
+        self._set_due()
+        return complete
+
+    @property
+    def _oldest(self) -> _Frame:
+        return next(iter(self._frames.values()))
+
+    def _set_due(self) -> None:
+        self.next_due = self._oldest.ends_at if self._frames else None
+
+    def _close_oldest(self, now: int) -> None:
+        key = next(iter(self._frames))
+        self._give_up(key)
+        self._close(now, key)
+
+    def _give_up(self, key: Hashable) -> None:
+        frame = self._remove(key)
+        self._drop(f"{len(frame.parts)} of {frame.count} parts")
+
+    def _remove(self, key: Hashable) -> _Frame:
+        frame = self._frames.pop(key)
+        self._held -= len(frame.parts)
+        return frame
+
+    def _close(self, now: int, key: Hashable) -> None:
+        self._closed[key] = now + self._timeout
+        if len(self._closed) > MOST_CLOSED:
+            self._closed.popitem(last=False)
+
+    def _drop(self, detail: str) -> None:
+        for outcome in self._outcomes:
+            outcome.dropped("incomplete", detail=detail)

@@ -1,0 +1,321 @@
+"""Frames come out complete, in order and once, whatever way their parts come in; and each part is counted once."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+from unittest.mock import patch
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.engine import collecting
+from router.engine.collecting import MOST_CLOSED, MOST_FRAMES, MOST_PARTS, Collector
+from router.engine.limiter import NS
+from router.errors import MappingError
+from tests.engine.served import serve
+from tests.engine.target import Topic
+
+MS = 1_000_000
+Part = tuple[Hashable, int, int]
+"""A part as the tests offer it: key, count and index; it stands for itself."""
+
+
+class Frames:
+    """A collector with a timeout of 1 s for two topics, and what came out of it."""
+
+    def __init__(self) -> None:
+        self.topics = Topic("first"), Topic("second")
+        self.collector = Collector(NS, [topic.outcome for topic in self.topics])
+        self.complete: list[list[object]] = []
+        self.now = 0
+
+    def offer(self, *parts: Part) -> None:
+        for part in parts:
+            frame = self.collector.offer(self.now, *part, part)
+            if frame is not None:
+                self.complete.append(frame)
+                for topic in self.topics:  # as generated code does
+                    topic.outcome.delivered(0)
+
+    def wait(self, until: int) -> None:
+        serve(self.collector, until)
+        self.now = until
+
+    @property
+    def counted(self) -> Mapping[str, int]:
+        first, second = (topic.counted() for topic in self.topics)
+        assert first == second
+        return first
+
+
+@pytest.fixture
+def frames() -> Frames:
+    return Frames()
+
+
+def parts_of(key: Hashable, count: int) -> list[Part]:
+    return [(key, count, index) for index in range(count)]
+
+
+# ---- complete
+
+
+@given(st.permutations(range(6)))
+def test_a_frame_comes_out_in_order_whatever_the_order_of_arrival(order: list[int]) -> None:
+    frames = Frames()
+    frames.offer(*(("a", 6, index) for index in order))
+    assert frames.complete == [parts_of("a", 6)]
+    assert frames.counted == {"messages_collected": 5, "messages_published": 1}
+    assert frames.collector.next_due is None
+
+
+def test_a_frame_of_one_is_complete_at_once(frames: Frames) -> None:
+    frames.offer(("a", 1, 0))
+    assert frames.complete == [[("a", 1, 0)]]
+    assert frames.counted == {"messages_published": 1}
+
+
+def test_copies_are_filtered_before_and_after_the_frame_is_complete(frames: Frames) -> None:
+    frames.offer(("a", 2, 1), ("a", 2, 1), ("a", 2, 0), ("a", 2, 0), ("a", 2, 1))
+    frames.wait(NS - 1)
+    frames.offer(("a", 2, 0))
+    assert frames.complete == [parts_of("a", 2)]
+    assert frames.counted == {"messages_filtered": 4, "messages_collected": 1, "messages_published": 1}
+
+
+def test_a_key_may_come_again_when_the_timeout_is_over(frames: Frames) -> None:
+    frames.offer(*parts_of("a", 2))
+    frames.wait(NS)
+    frames.offer(*parts_of("a", 2))
+    assert frames.complete == [parts_of("a", 2)] * 2
+
+
+# ---- incomplete
+
+
+def test_a_frame_whose_time_is_up_counts_once(frames: Frames) -> None:
+    frames.now = 5 * MS
+    frames.offer(("a", 4, 0), ("a", 4, 3))
+    frames.now = 900 * MS
+    frames.offer(("a", 4, 1))
+    assert frames.collector.next_due == 5 * MS + NS
+    frames.wait(2 * NS)
+    assert frames.complete == []
+    assert frames.counted == {"messages_collected": 2, "incomplete": 1}
+    assert [report.detail for report in frames.topics[0].reports] == ["3 of 4 parts"]
+
+
+def test_what_comes_after_the_end_of_an_incomplete_frame_is_filtered_and_opens_none(frames: Frames) -> None:
+    frames.offer(("a", 2, 0))
+    frames.wait(NS)
+    frames.offer(("a", 2, 1))
+    assert frames.counted == {"incomplete": 1, "messages_filtered": 1}
+    frames.wait(2 * NS)
+    frames.offer(*parts_of("a", 2))
+    assert frames.complete == [parts_of("a", 2)]
+
+
+def test_a_part_that_comes_in_time_for_nobody_to_have_looked_is_still_too_late(frames: Frames) -> None:
+    """Whoever serves the collector is late."""
+    frames.offer(("a", 2, 0))
+    frames.now = NS
+    frames.offer(("a", 2, 1))
+    assert frames.complete == []
+    assert frames.counted == {"incomplete": 1, "messages_filtered": 1}
+
+
+def test_a_part_that_tells_another_count_opens_a_new_frame(frames: Frames) -> None:
+    frames.offer(("a", 3, 0), ("a", 3, 1), ("a", 2, 0), ("a", 2, 1))
+    assert frames.complete == [parts_of("a", 2)]
+    assert frames.counted == {"messages_collected": 2, "incomplete": 1, "messages_published": 1}
+
+
+# ---- hostile numbers
+
+
+@pytest.mark.parametrize(("count", "index"), [(0, 0), (3, 3), (3, -1), (-1, 0), (-1, -2), (2**32 - 1, 2**32 - 1)])
+def test_numbers_that_no_frame_has_are_a_failure_of_the_mapping(frames: Frames, count: int, index: int) -> None:
+    frames.offer(("a", 3, 0))
+    with pytest.raises(MappingError):
+        frames.offer(("a", count, index))
+    frames.offer(("a", 3, 1), ("a", 3, 2))
+    assert frames.complete == [parts_of("a", 3)]
+
+
+def test_a_frame_that_would_never_have_room_is_not_opened(frames: Frames) -> None:
+    frames.offer(("a", 2, 0), ("a", 2**32 - 1, 1), ("a", MOST_PARTS + 1, 1), ("a", 2, 1))
+    assert frames.complete == [parts_of("a", 2)]
+    assert frames.counted == {"incomplete": 2, "messages_collected": 1, "messages_published": 1}
+
+
+def test_the_largest_frame_has_room(frames: Frames) -> None:
+    frames.offer(*parts_of("a", MOST_PARTS))
+    assert frames.complete == [parts_of("a", MOST_PARTS)]
+
+
+def test_the_oldest_frame_makes_room_for_a_new_one(frames: Frames) -> None:
+    for key in range(MOST_FRAMES + 1):
+        frames.offer((key, 2, 0))
+    frames.offer((0, 2, 1), (1, 2, 1))
+    assert frames.complete == [parts_of(1, 2)]
+    assert frames.counted["incomplete"] == 1
+
+
+def test_the_oldest_frame_makes_room_for_more_parts(frames: Frames) -> None:
+    half = MOST_PARTS // 2
+    frames.offer(*parts_of("a", half + 2)[:-1])
+    frames.offer(*parts_of("b", half + 1))
+    assert frames.complete == [parts_of("b", half + 1)]
+    assert frames.counted["incomplete"] == 1
+
+
+class Alive:
+    """Counts how many of it there are."""
+
+    now: ClassVar[int] = 0
+
+    def __init__(self) -> None:
+        Alive.now += 1
+
+    def __del__(self) -> None:
+        Alive.now -= 1
+
+
+@pytest.mark.parametrize("most", [2, 200, MOST_PARTS, 2**32 - 1])
+def test_what_is_held_stays_bounded(most: int) -> None:
+    noise, topic = random.Random(most), Topic()
+    collector = Collector(NS, [topic.outcome])
+    for now in range(30_000):
+        count = noise.randint(1, most)
+        collector.offer(now, noise.randint(0, 3000), count, noise.randrange(count), Alive())
+        assert Alive.now <= MOST_PARTS
+    serve(collector, 2 * NS)
+    assert Alive.now == 0
+
+
+# ---- two cameras on a bad network
+
+
+def test_shuffled_duplicated_lost_and_interleaved(frames: Frames) -> None:
+    """Complete frames come out once; of the others each counts as incomplete, but those of which nothing arrived."""
+    noise = random.Random(3)
+    arrived: dict[Hashable, set[Part]] = {}
+    for number in range(500):
+        keys = [(camera, number) for camera in ("left", "right")]
+        sent = [part for key in keys for part in parts_of(key, noise.randint(1, 8))]
+        if number % 2:
+            sent = [part for part in sent if noise.random() > 0.3]
+        sent += noise.choices(sent, k=len(sent) // 5)
+        noise.shuffle(sent)
+        frames.offer(*sent)
+        for part in sent:
+            arrived.setdefault(part[0], set()).add(part)
+        frames.wait(frames.now + 33 * MS)
+    frames.wait(frames.now + NS)
+
+    whole = [sorted(parts) for parts in arrived.values() if len(parts) == next(iter(parts))[1]]
+    assert sorted(frames.complete, key=str) == sorted(whole, key=str)
+    assert frames.counted["messages_published"] == len(whole)
+    assert frames.counted["incomplete"] == len(arrived) - len(whole) > 100
+
+
+# ---- against a plain collector
+
+
+@dataclass
+class _Open:
+    key: Hashable
+    count: int
+    opened: int
+    parts: list[tuple[int, Part]] = field(default_factory=list)
+
+
+class Plain:
+    """Does what Collector does, in lists that are searched from end to end."""
+
+    def __init__(self, frames: int, parts: int, closed: int) -> None:
+        self.limits = frames, parts
+        self.most_closed = closed
+        self.open: list[_Open] = []
+        self.closed: list[tuple[Hashable, int]] = []
+        self.counted: Counter[str] = Counter()
+
+    def tick(self, now: int) -> None:
+        for frame in [frame for frame in self.open if frame.opened + NS <= now]:
+            self.end(frame, now)
+
+    def end(self, frame: _Open, now: int) -> None:
+        self.counted["incomplete"] += 1
+        self.open.remove(frame)
+        self.close(frame.key, now)
+
+    def close(self, key: Hashable, now: int) -> None:
+        self.closed = [*self.closed, (key, now + NS)][-self.most_closed :]
+
+    def offer(self, now: int, part: Part) -> list[Part] | None:
+        key, count, index = part
+        self.tick(now)
+        if count > self.limits[1]:
+            self.counted["incomplete"] += 1
+            return None
+        for frame in [frame for frame in self.open if frame.key == key and frame.count != count]:
+            self.counted["incomplete"] += 1
+            self.open.remove(frame)
+        found = [frame for frame in self.open if frame.key == key]
+        copies = [place for frame in found for place, _ in frame.parts if place == index]
+        if copies or any(closed == key and until > now for closed, until in self.closed):
+            self.counted["messages_filtered"] += 1
+            return None
+        if found:
+            self.counted["messages_collected"] += 1
+        else:
+            if len(self.open) == self.limits[0]:
+                self.end(self.open[0], now)
+            self.open.append(_Open(key, count, now))
+            found = [self.open[-1]]
+        found[0].parts.append((index, part))
+        if len(found[0].parts) == count:
+            self.open.remove(found[0])
+            self.close(key, now)
+            return [held for _, held in sorted(found[0].parts)]
+        if sum(len(frame.parts) for frame in self.open) > self.limits[1]:
+            self.end(self.open[0], now)
+        return None
+
+
+@st.composite
+def arrivals(draw: st.DrawFn) -> tuple[int, Part]:
+    """Pauses (ns) and parts of few small frames, so that all of the rules have something to do."""
+    count = draw(st.sampled_from([1, 2, 2, 3, 3, 3, 7, 8]))
+    part = (draw(st.integers(0, 6)), count, draw(st.integers(0, count - 1)))
+    return draw(st.sampled_from([0, 0, 0, 1, 100 * MS, 300 * MS, NS])), part
+
+
+@given(st.lists(arrivals(), max_size=120))
+def test_it_does_what_a_plain_collector_does(steps: list[tuple[int, Part]]) -> None:
+    frames, plain = Frames(), Plain(3, 7, 4)
+    with patch.multiple(collecting, MOST_FRAMES=3, MOST_PARTS=7, MOST_CLOSED=4):
+        for pause, part in steps:
+            for now in sorted({frame.opened + NS for frame in plain.open} | {frames.now + pause}):
+                if now <= frames.now + pause:
+                    plain.tick(now)
+            frames.wait(frames.now + pause)
+            complete, before = plain.offer(frames.now, part), len(frames.complete)
+            frames.offer(part)
+            assert frames.complete[before:] == ([] if complete is None else [complete])
+            plain.counted["messages_published"] += complete is not None
+            assert frames.counted == {name: count for name, count in plain.counted.items() if count}
+        frames.wait(frames.now + NS)
+    assert sum(frames.counted.values()) == len(steps)
+
+
+def test_keys_of_closed_frames_are_forgotten_when_there_are_too_many(frames: Frames) -> None:
+    for key in range(MOST_CLOSED + 1):
+        frames.offer((key, 1, 0))
+    frames.offer((0, 1, 0), (MOST_CLOSED, 1, 0))
+    assert frames.counted == {"messages_published": MOST_CLOSED + 2, "messages_filtered": 1}

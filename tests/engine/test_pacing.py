@@ -1,0 +1,267 @@
+"""An endpoint's budget is kept and used up; when it is short, the urgent goes first and the least urgent is dropped."""
+
+from __future__ import annotations
+
+import errno
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.engine.dispatch import MAX_DATAGRAM
+from router.engine.limiter import NS
+from router.engine.pacing import BURST, LEAST_QUEUE, Pacer
+from router.table.model import Priority
+from tests.engine.served import play, serve
+from tests.engine.target import Destination
+
+COMMAND, TELEMETRY, BULK = Priority
+MS = 1_000_000
+
+
+class Link:
+    """A pacer and what it sent: when, and which datagram. Each is a target of its own, so its fate is known."""
+
+    def __init__(self, budget: int) -> None:
+        self.now = 0
+        self.sent: list[tuple[int, int]] = []
+        self.bytes_sent = 0
+        self.error: OSError | None = None
+        self.targets: list[Destination] = []
+        self.pacer = Pacer(budget, self._send)
+
+    def _send(self, data: bytes) -> int:
+        if self.error is not None:
+            raise self.error
+        self.sent.append((self.now, int.from_bytes(data, "little")))
+        self.bytes_sent += len(data)
+        return len(data)
+
+    def offer(self, priority: Priority, size: int = 100, expires: int | None = None) -> int:
+        """Returns the datagram's number: they count from 0."""
+        number = len(self.targets)
+        self.targets.append(Destination())
+        deliver = self.pacer.queue(priority, self.targets[-1].outcome)
+        deliver(self.now, number.to_bytes(size, "little"), expires)
+        return number
+
+    def wait(self, until: int) -> None:
+        """Serves the pacer in time."""
+        while self.pacer.next_due is not None and self.pacer.next_due <= until:
+            self.now = self.pacer.next_due
+            self.pacer.due(self.now)
+        self.now = until
+
+    @property
+    def numbers(self) -> list[int]:
+        return [number for _, number in self.sent]
+
+    def fate(self, number: int) -> str | None:
+        """None while it waits."""
+        return next(iter(self.targets[number].counted()), None)
+
+
+# ---- the rate
+
+
+def measured(budget: int, size: int, hertz: float, priority: Priority, late: int) -> int:
+    """The bytes that were sent in 10 s."""
+    sent = 0
+
+    def send(data: bytes) -> int:
+        nonlocal sent
+        sent += len(data)
+        return len(data)
+
+    pacer = Pacer(budget, send)
+    deliver = pacer.queue(priority, Destination().outcome)
+    datagram = bytes(size)
+
+    def offer(now: int) -> None:
+        deliver(now, datagram, None)
+
+    play(pacer, ((now, offer) for now in range(0, 10 * NS, round(NS / hertz))), 10 * NS, late)
+    return sent
+
+
+@pytest.mark.parametrize("budget", [2_000, 50_000, 500_000])
+@pytest.mark.parametrize("size", [40, 1000])
+@pytest.mark.parametrize("load", [0.5, 0.99, 1.01, 2])
+@pytest.mark.parametrize("priority", Priority)
+def test_over_ten_seconds_the_budget_is_kept_and_used_up(
+    budget: int, size: int, load: float, priority: Priority
+) -> None:
+    hertz = budget * load / size
+    sent = measured(budget, size, hertz, priority, late=0)
+    overdraft = max(budget // 10, 2048) if priority is COMMAND else 0
+    assert sent <= 10 * budget + budget * BURST // NS + overdraft + size
+    assert sent >= min(load, 0.99) * 10 * budget - size
+
+
+def test_a_timekeeper_that_is_late_by_half_a_burst_costs_nothing() -> None:
+    assert measured(500_000, 100, 10_000, BULK, late=BURST // 2) >= 0.99 * 10 * 500_000
+
+
+def test_after_a_pause_there_is_no_more_than_a_burst() -> None:
+    link = Link(100_000)
+    link.wait(60 * NS)
+    for _ in range(100):
+        link.offer(TELEMETRY)
+    assert link.bytes_sent == 100_000 * BURST // NS + 100
+
+
+def test_the_longest_datagram_goes_through_the_smallest_budget_and_pays_for_itself() -> None:
+    link = Link(1000)
+    link.offer(BULK, MAX_DATAGRAM)
+    link.offer(BULK, 10)
+    link.wait(20 * NS)
+    assert [number for _, number in link.sent] == [0, 1]
+    assert link.sent[0][0] == 0
+    assert MAX_DATAGRAM * MS - BURST <= link.sent[1][0] <= MAX_DATAGRAM * MS
+
+
+# ---- who goes first
+
+
+def test_what_waits_goes_by_priority_and_then_by_age() -> None:
+    link = Link(10_000)
+    link.offer(BULK, 5000)
+    waiting = [link.offer(priority, 3000) for priority in (BULK, TELEMETRY, COMMAND, BULK, TELEMETRY, COMMAND)]
+    link.wait(10 * NS)
+    assert link.numbers == [0] + [waiting[index] for index in (2, 5, 1, 4, 0, 3)]
+
+
+def test_a_command_does_not_wait_for_what_others_have_used_up() -> None:
+    link = Link(500_000)
+    for _ in range(400):
+        link.offer(BULK, 1400)
+    command = link.offer(COMMAND)
+    assert link.sent[-1] == (0, command)
+
+
+def test_commands_wait_for_each_other_when_they_are_too_far_ahead() -> None:
+    """Beyond the burst of 20 ms, 100 ms of the budget; what they used up, the others wait for."""
+    link = Link(100_000)
+    bulk = [link.offer(BULK) for _ in range(30)]
+    commands = [link.offer(COMMAND) for _ in range(200)]
+    assert link.numbers == bulk[:21] + commands[:100]
+    link.wait(10 * NS)
+    assert link.numbers == bulk[:21] + commands + bulk[21:]
+
+
+def test_with_a_small_budget_two_kilobytes_of_commands_go_ahead() -> None:
+    link = Link(1000)
+    link.offer(BULK)
+    for _ in range(50):
+        link.offer(COMMAND)
+    assert link.bytes_sent == 2100
+
+
+# ---- what is dropped
+
+
+def test_the_oldest_of_the_least_urgent_is_dropped_when_there_is_no_room() -> None:
+    link = Link(1000)
+    link.offer(BULK, MAX_DATAGRAM)
+    oldest, newest = link.offer(BULK, 1000), link.offer(BULK, 1000)
+    telemetry = [link.offer(TELEMETRY, 1000) for _ in range(LEAST_QUEUE // 1000)]
+    assert link.fate(oldest) == link.fate(newest) == "queue_full"
+    assert [link.fate(number) for number in telemetry] == [None] * len(telemetry)
+
+    late = link.offer(BULK, 1000)
+    assert link.fate(late) == "queue_full"
+    link.offer(TELEMETRY, 1000)
+    assert link.fate(telemetry[0]) == "queue_full"
+    assert link.fate(telemetry[1]) is None
+    assert [report.reason for report in link.targets[oldest].reports] == ["queue_full"]
+
+
+def test_a_large_budget_has_room_for_a_second() -> None:
+    link = Link(1_000_000)
+    waiting = [link.offer(BULK, 1000) for _ in range(1100)]
+    assert sum(link.fate(number) == "datagrams_sent" for number in waiting) == 21
+    assert sum(link.fate(number) is None for number in waiting) == 1000
+
+
+def test_what_gets_too_old_while_it_waits_is_dropped_and_uses_up_nothing() -> None:
+    link = Link(10_000)
+    link.offer(BULK, 2000)
+    stale, fresh = link.offer(BULK, 5000, expires=100 * MS), link.offer(BULK, expires=NS)
+    link.wait(200 * MS)
+    assert link.fate(stale) == "stale"
+    assert link.sent[-1] == (190 * MS, fresh)
+
+
+def test_what_the_network_refuses_is_counted_and_the_next_is_tried() -> None:
+    link = Link(100_000)
+    link.error = ConnectionRefusedError(errno.ECONNREFUSED, "nobody there")
+    refused = link.offer(TELEMETRY)
+    link.error = BlockingIOError(errno.EAGAIN, "full")
+    full = link.offer(TELEMETRY)
+    link.error = None
+    sent = link.offer(TELEMETRY)
+    assert [link.fate(number) for number in (refused, full, sent)] == [
+        "send_error",
+        "send_buffer_full",
+        "datagrams_sent",
+    ]
+    assert link.targets[refused].reports[0].error is not None
+
+
+# ---- all together
+
+offers = st.tuples(
+    st.integers(0, 2), st.integers(10, 30_000), st.none() | st.integers(0, NS), st.just(0) | st.integers(0, NS)
+)
+"""The priority's place in their order, size, time until stale, time until the next (ns)."""
+
+
+class Waiting(NamedTuple):
+    rank: int
+    number: int
+    size: int
+    expires: int | None
+
+
+@given(st.integers(1000, 200_000), st.lists(offers, max_size=40))
+def test_the_rules_hold_at_every_step(budget: int, messages: list[tuple[int, int, int | None, int]]) -> None:
+    link, waiting = Link(budget), list[Waiting]()
+    for rank, size, fresh_for, pause in messages:
+        expires = None if fresh_for is None else link.now + fresh_for
+        waiting.append(Waiting(rank, link.offer([*Priority][rank], size, expires), size, expires))
+        waiting = still_waiting(link, waiting)
+        assert sum(one.size for one in waiting) <= max(budget, LEAST_QUEUE)
+        until = link.now + pause
+        while link.pacer.next_due is not None and link.pacer.next_due <= until:
+            link.wait(link.pacer.next_due)
+            waiting = still_waiting(link, waiting)
+        link.now = until
+        assert (link.pacer.next_due is None) == (not waiting)
+
+
+def still_waiting(link: Link, waiting: list[Waiting]) -> list[Waiting]:
+    """What still waits of what did, after a look at what became of the others."""
+    remaining = [one for one in waiting if link.fate(one.number) is None]
+    for one in waiting:
+        fate = link.fate(one.number)
+        if fate == "datagrams_sent":
+            assert one.expires is None or link.now <= one.expires
+            assert all(one[:2] < other[:2] for other in remaining)
+        elif fate == "stale":
+            assert one.expires is not None
+            assert link.now > one.expires
+        elif fate == "queue_full":
+            assert all((-one.rank, one.number) < (-other.rank, other.number) for other in remaining)
+    return remaining
+
+
+def test_it_is_not_disturbed_by_being_called_too_early() -> None:
+    link = Link(10_000)
+    link.offer(BULK, 2000)
+    link.offer(BULK, 1000)
+    for now in range(0, 180 * MS, 7 * MS):
+        link.pacer.due(now)
+    assert link.numbers == [0]
+    serve(link.pacer, NS)
+    assert link.numbers == [0, 1]
