@@ -9,7 +9,7 @@ from collections import deque
 from dataclasses import dataclass
 
 TOLERANCE = 10_000_000
-"""ns by which wall clock minus monotonic clock may wander (slewing, a pause between reading one and the other)."""
+"""ns by which a time that `born` gives may be wrong because the wall clock is being slewed, at up to 1 ms/s."""
 
 MEMORY = 10_000_000_000
 """ns for which a past setting of the wall clock is remembered after the next one was noticed."""
@@ -29,21 +29,22 @@ class _Setting:
 class Freshness:
     """Follows the wall clock through its jumps. For one thread, which calls `born` with every stamp.
 
-    Each call tells how far the wall clock is ahead of the monotonic one. Where that has changed by more than
-    TOLERANCE since the last call, the clock was set in between. A stamp means a different time under each
-    setting, but only a time at which that setting may have been in force can be right; of several such times
-    the latest is taken.
+    Each call tells how far the wall clock is ahead of the monotonic one. Where that is no longer what it was, the
+    clock was set since the last call. A stamp means another time under each setting, but can only mean a time
+    at which that setting may have been in force; of several such times the latest is taken.
 
-    Provided that the clock was set at most once between two calls, and that the stamp was made by a clock
-    that is set together with ours, it follows, within TOLERANCE:
+    Provided that the clock was set at most once between two calls, and that stamps come from clocks that are set
+    together with ours, it follows for an event of the last MEMORY, within TOLERANCE:
 
-    - An event is never taken to be older than it is: no jump makes a fresh message stale.
-    - An event is taken to be younger than it is only if the wall clock has shown the stamped time twice, by being
-      set back since: by `d`, for an event at least `d` ago, which then counts as `d` younger. So a message
-      that is stale by 2 s passes for fresh if the clock was set back by about 2 s on its way, and not if it was set
-      back by another amount, set forward, or set before the message was stamped. A stamp alone cannot tell these
-      two times apart, and taking the earlier one would refuse every message for `d` after such a jump.
-    - A message that was under way for longer than MEMORY when the clock was set back counts as just made.
+    - It is never taken to be older than it is: no jump makes a fresh message stale.
+    - It is taken to be younger than it is only if the wall clock was set since, or since the last call before it, by
+      some `d` no greater than its age: then it may pass for `d` younger. So a message that is stale by 2 s
+      passes for fresh if the clock was set by about 2 s while it was under way or in the silence before it,
+      and not if it was set by more or less, or earlier. A stamp cannot tell then which of two times is meant:
+      set back, the wall clock has shown the same time twice. To take the earlier time would be to refuse every
+      message for `d` after the clock was set back by `d`.
+
+    An older event may pass for any age if the clock was set since.
 
     A stamp in the future under all settings is that of another computer whose clock is ahead; it counts as
     now. For MEMORY after our clock was set back by more than theirs is ahead, it is instead taken for one made before.
@@ -64,7 +65,7 @@ class Freshness:
         offset = received_at - now
         if self._offset is None:
             self._offset = offset
-        elif abs(offset - self._offset) > TOLERANCE:
+        elif abs(offset - self._offset) > TOLERANCE // 2:
             self._past.append(_Setting(self._offset, self._since, now))
             self._offset, self._since = offset, self._seen
         self._seen = now

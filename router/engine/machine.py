@@ -26,6 +26,6 @@ class Machine(Protocol):
 
 
 class Guard(Protocol):
-    """Has `machine` served from now on, and makes one of its methods (or a function that calls them) safe for others."""
+    """Has `machine` served from now on, and returns `call`, one of its methods, as others may call it meanwhile."""
 
     def __call__(self, machine: Machine, call: Callable[P, R], /) -> Callable[P, R]: ...

@@ -9,11 +9,13 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
+from time import monotonic
 
 import pytest
 from structlog.testing import capture_logs
 
 from router.compiler.program import ListenerPlan, SenderPlan
+from router.edges.clock import wall_ns
 from router.edges.receiver import ReceiveThread
 from router.edges.udp import Listener, Sender
 from router.errors import SourceSpan, StartError
@@ -146,6 +148,45 @@ def test_a_fault_is_handed_over_and_receiving_goes_on(several: list[Listener], p
     assert receiving.got.get(timeout=5)[1] == b"fine"
     receiving.thread.stop()
     assert isinstance(receiving.failures.get_nowait(), LookupError)
+
+
+def test_the_kernel_tells_when_each_datagram_arrived_however_long_it_was_left_lying(
+    stack: ExitStack, peer: socket.socket
+) -> None:
+    listener = listen(stack)
+    wait_until_the_kernel_stamps(listener, peer)
+    sent = []
+    for number in range(5):
+        before = wall_ns()
+        peer.sendto(b"%d" % number, listener.address)
+        sent.append((before, wall_ns()))
+    told = []
+    for _ in sent:
+        listener.socket.recv(LIMIT)
+        told.append(listener.arrived_at())
+    assert all(before <= at <= after for (before, after), at in zip(sent, told, strict=True))
+
+
+def wait_until_the_kernel_stamps(listener: Listener, peer: socket.socket) -> None:
+    """It begins to some time after it was asked to. What it has not stamped counts as arrived when it is looked at."""
+    deadline = monotonic() + 5
+    while monotonic() < deadline:
+        peer.sendto(b"", listener.address)
+        sent = wall_ns()
+        listener.socket.recv(LIMIT)
+        if listener.arrived_at() <= sent:
+            return
+    raise AssertionError("the kernel stamps nothing")
+
+
+def test_a_datagram_without_a_stamp_counts_as_just_arrived(stack: ExitStack, peer: socket.socket) -> None:
+    listener = listen(stack)
+    with pytest.raises(FileNotFoundError):
+        listener.arrived_at()
+    before = wall_ns()
+    peer.sendto(b"first", listener.address)
+    listener.socket.recv(LIMIT)
+    assert before <= listener.arrived_at() <= wall_ns()
 
 
 def test_datagrams_that_the_kernel_drops_are_known(stack: ExitStack, peer: socket.socket) -> None:

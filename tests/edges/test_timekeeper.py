@@ -1,0 +1,187 @@
+"""The thread that serves machines: what is due is done, in order and one at a time, whatever a machine raises."""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from time import monotonic_ns
+
+import pytest
+
+from router.edges.timekeeper import Timekeeper
+
+MS = 1_000_000
+HOUR = 3600 * 1000 * MS
+PATIENCE = 10
+
+
+class Bell:
+    """A machine that rings into a queue when it is due, once each time it was set."""
+
+    def __init__(self, rung: queue.SimpleQueue[str], name: str = "bell") -> None:
+        self.next_due: int | None = None
+        self.name = name
+        self.error: Exception | None = None
+        self.calls = 0
+        self._rung = rung
+        self._busy = threading.Lock()
+
+    def ring_at(self, time: int) -> None:
+        assert self._busy.acquire(blocking=False), "two calls at once"
+        self.next_due = time
+        self.calls += 1
+        self._busy.release()
+
+    def due(self, now: int) -> None:
+        assert self._busy.acquire(blocking=False), "two calls at once"
+        assert self.next_due is not None
+        assert self.next_due <= now
+        self._rung.put(self.name)
+        self._busy.release()
+        if self.error is not None:
+            raise self.error
+        self.next_due = None
+
+
+class Keeping:
+    """A running timekeeper and what came of it."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.rung: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.failures: queue.SimpleQueue[Exception] = queue.SimpleQueue()
+        self.keeper = Timekeeper("test", monotonic_ns, self.failures.put)
+        self._stack = stack
+
+    def start(self) -> None:
+        self.keeper.start()
+        self._stack.callback(self.keeper.stop)
+
+    def heard(self) -> str:
+        return self.rung.get(timeout=PATIENCE)
+
+
+@pytest.fixture
+def keeping() -> Iterator[Keeping]:
+    with ExitStack() as stack:
+        yield Keeping(stack)
+
+
+def test_what_is_due_at_the_start_is_done(keeping: Keeping) -> None:
+    bell = Bell(keeping.rung)
+    bell.next_due = monotonic_ns()
+    keeping.keeper.add(bell)
+    keeping.start()
+    assert keeping.heard() == "bell"
+
+
+def test_a_guarded_call_that_brings_something_nearer_wakes_the_thread(keeping: Keeping) -> None:
+    bell = Bell(keeping.rung)
+    ring_at = keeping.keeper.guard(bell, bell.ring_at)
+    ring_at(monotonic_ns() + HOUR)
+    keeping.start()
+    for _ in range(50):
+        ring_at(monotonic_ns() + HOUR)
+        ring_at(monotonic_ns())
+        assert keeping.heard() == "bell"
+    assert keeping.failures.empty()
+
+
+def test_what_another_machine_is_handed_wakes_the_thread_too(keeping: Keeping) -> None:
+    """As with a limit in front of an endpoint's budget."""
+    first, second = Bell(keeping.rung, "first"), Bell(keeping.rung, "second")
+    keeping.keeper.add(second)
+    hand_on = keeping.keeper.guard(first, second.ring_at)
+    keeping.start()
+    hand_on(monotonic_ns())
+    assert keeping.heard() == "second"
+
+
+def test_machines_are_served_in_the_order_of_their_times(keeping: Keeping) -> None:
+    names = ["third", "first", "second"]
+    now = monotonic_ns()
+    for name, delay in zip(names, (200, 40, 120), strict=True):
+        bell = Bell(keeping.rung, name)
+        keeping.keeper.guard(bell, bell.ring_at)(now + delay * MS)
+    keeping.start()
+    assert [keeping.heard() for _ in names] == ["first", "second", "third"]
+
+
+def test_nothing_is_done_before_its_time(keeping: Keeping) -> None:
+    """The bell checks the time it is told, this the time that has passed."""
+    bell = Bell(keeping.rung)
+    ring_at = keeping.keeper.guard(bell, bell.ring_at)
+    keeping.start()
+    for delay in (0, 1, 10, 50):
+        time = monotonic_ns() + delay * MS
+        ring_at(time)
+        keeping.heard()
+        assert monotonic_ns() >= time
+
+
+def test_a_failure_is_handed_over_and_the_other_machines_are_served(keeping: Keeping) -> None:
+    broken, sound = Bell(keeping.rung, "broken"), Bell(keeping.rung, "sound")
+    broken.error = LookupError("a bug")
+    broken.next_due = sound.next_due = monotonic_ns()
+    keeping.keeper.add(broken)
+    keeping.keeper.add(sound)
+    keeping.start()
+    assert [keeping.heard(), keeping.heard()] == ["broken", "sound"]
+    assert keeping.failures.get(timeout=PATIENCE) is broken.error
+
+
+def test_a_machine_that_failed_is_tried_again_but_not_all_the_time(keeping: Keeping) -> None:
+    broken = Bell(keeping.rung)
+    broken.error = LookupError("a bug")
+    broken.next_due = begun = monotonic_ns()
+    keeping.keeper.add(broken)
+    keeping.start()
+    for _ in range(3):
+        assert keeping.failures.get(timeout=PATIENCE) is broken.error
+    keeping.keeper.stop()
+    assert 3 + keeping.failures.qsize() <= 1 + (monotonic_ns() - begun) / (100 * MS)
+
+
+def test_a_guarded_call_returns_and_raises_what_the_call_does(keeping: Keeping) -> None:
+    bell = Bell(keeping.rung)
+    keeping.start()
+    divided = keeping.keeper.guard(bell, divmod)
+    assert divided(7, 2) == (3, 1)
+    with pytest.raises(ZeroDivisionError):
+        divided(7, 0)
+    assert divided(4, 2) == (2, 0)
+
+
+def test_no_two_calls_happen_at_once(keeping: Keeping) -> None:
+    bells = [Bell(keeping.rung, name) for name in ("left", "right")]
+    ring_at = [keeping.keeper.guard(bell, bell.ring_at) for bell in bells]
+    keeping.start()
+
+    def hammer(index: int) -> None:
+        for _ in range(2000):
+            ring_at[index % 2](monotonic_ns())
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    threads = [threading.Thread(target=hammer, args=(index,)) for index in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    sys.setswitchinterval(interval)
+    assert keeping.failures.empty()
+    assert [bell.calls for bell in bells] == [4000, 4000]
+
+
+@pytest.mark.parametrize("due", [None, HOUR], ids=["nothing due", "something far away"])
+def test_stopping_does_not_wait_for_what_is_due_later(keeping: Keeping, due: int | None) -> None:
+    bell = Bell(keeping.rung)
+    ring_at = keeping.keeper.guard(bell, bell.ring_at)
+    keeping.keeper.start()
+    if due is not None:
+        ring_at(monotonic_ns() + due)
+    keeping.keeper.stop()
+    ring_at(monotonic_ns())  # last words are possible, and nothing comes of them
+    assert keeping.rung.empty()

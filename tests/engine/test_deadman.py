@@ -1,0 +1,204 @@
+"""A deadman trips in time, repeats on its grid, and never speaks behind a fresh command."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.compiler.books import Books
+from router.compiler.program import DeadmanPlan
+from router.engine.deadman import Deadman
+from router.engine.outcome import Report
+
+TIMEOUT = 500
+REPEAT = 100
+PLAN = DeadmanPlan("drive", TIMEOUT, REPEAT, (("driving_board", b"brake"), ("arm_board", b"hold")))
+FAULT = OSError(errno.ENETUNREACH, "Network is unreachable")
+
+
+class Watched:
+    """A deadman and everything that came out of it.
+
+    Datagrams are recorded with the time of the call, `now`; what it told, with how many were sent by then and
+    what the gauge said.
+    """
+
+    def __init__(self, plan: DeadmanPlan = PLAN) -> None:
+        self.now = 0
+        self.sent: list[tuple[int, str, bytes]] = []
+        self.failures: dict[str, Exception] = {}
+        self.reports: list[Report] = []
+        self.told: list[tuple[str, bool, int, int]] = []
+        self.books = Books()
+        self._counts = [0] * 100
+        send = {endpoint: self._sender(endpoint) for endpoint, _ in plan.datagrams}
+        self.deadman = Deadman(plan, self.books, self._counts, send, self.reports.append, self._changed)
+
+    def feed(self, now: int) -> None:
+        self.now = now
+        self.deadman.feed(now)
+
+    def due(self, now: int) -> None:
+        self.now = now
+        self.deadman.due(now)
+
+    def run(self, until: int) -> None:
+        """What a timekeeper does that is never late."""
+        while self.deadman.next_due is not None and self.deadman.next_due <= until:
+            self.due(self.deadman.next_due)
+
+    def times(self, endpoint: str = "driving_board") -> list[int]:
+        return [time for time, name, _ in self.sent if name == endpoint]
+
+    def count(self, metric: str, *labels: str) -> int:
+        return self._counts[self.books.slot(metric, "drive", *labels)]
+
+    def _changed(self, route: str, active: bool) -> None:
+        self.told.append((route, active, len(self.sent), self.count("deadman_active")))
+
+    def _sender(self, endpoint: str) -> Callable[[bytes], int]:
+        def send(datagram: bytes) -> int:
+            if endpoint in self.failures:
+                raise self.failures[endpoint]
+            self.sent.append((self.now, endpoint, datagram))
+            return len(datagram)
+
+        return send
+
+
+def test_without_a_command_nothing_is_ever_due() -> None:
+    watched = Watched()
+    watched.due(10**12)
+    watched.deadman.end()
+    assert (watched.deadman.next_due, watched.sent, watched.told) == (None, [], [])
+
+
+def test_it_trips_after_the_timeout_and_sends_at_once_and_then_at_every_repeat() -> None:
+    watched = Watched()
+    watched.feed(1000)
+    watched.run(1000 + TIMEOUT - 1)
+    assert watched.sent == []
+    watched.run(1000 + TIMEOUT + 2 * REPEAT)
+    assert watched.sent == [
+        (time, endpoint, datagram) for time in (1500, 1600, 1700) for endpoint, datagram in PLAN.datagrams
+    ]
+
+
+def test_commands_that_keep_coming_keep_it_silent() -> None:
+    watched = Watched()
+    for now in range(0, 100 * TIMEOUT, TIMEOUT):
+        watched.run(now - 1)
+        watched.feed(now)
+    assert (watched.sent, watched.count("deadman_trips")) == ([], 0)
+
+
+def test_it_tells_once_each_way() -> None:
+    watched = Watched()
+    seen = []
+    for now in (0, 10, 1000, 1010, 5000):
+        watched.run(now)
+        seen.append(watched.count("deadman_active"))
+        watched.feed(now)
+        seen.append(watched.count("deadman_active"))
+    assert seen == [0, 0, 0, 0, 1, 0, 0, 0, 1, 0]
+    assert [told[:2] for told in watched.told] == 2 * [("drive", True), ("drive", False)]
+    assert watched.count("deadman_trips") == 2
+
+
+def test_it_is_active_and_has_sent_when_it_tells_that_it_tripped() -> None:
+    watched = Watched()
+    watched.feed(0)
+    watched.run(TIMEOUT)
+    assert watched.told == [("drive", True, 2, 1)]
+
+
+def test_after_a_stall_it_sends_once_and_returns_to_its_grid() -> None:
+    watched = Watched()
+    watched.feed(0)
+    watched.due(5 * TIMEOUT + 30)
+    watched.run(5 * TIMEOUT + 250)
+    assert watched.times() == [2530, 2600, 2700]
+
+
+def test_a_lost_datagram_is_counted_and_reported_and_ends_nothing() -> None:
+    watched = Watched()
+    watched.failures["driving_board"] = FAULT
+    watched.feed(0)
+    watched.run(TIMEOUT + REPEAT)
+    watched.failures.clear()
+    watched.run(TIMEOUT + 2 * REPEAT)
+    assert watched.times() == [700]
+    assert watched.times("arm_board") == [500, 600, 700]
+    assert watched.reports == 2 * [Report("deadman", "drive", "driving_board", "send_error", FAULT)]
+    counted = [
+        watched.count(metric, endpoint)
+        for endpoint in ("driving_board", "arm_board")
+        for metric in ("deadman_datagrams_sent", "deadman_send_errors")
+    ]
+    assert counted == [1, 2, 3, 0]
+
+
+def test_a_fault_of_ours_goes_up_and_the_repeating_goes_on() -> None:
+    watched = Watched()
+    watched.failures["driving_board"] = LookupError("a bug")
+    watched.feed(0)
+    with pytest.raises(LookupError):
+        watched.due(TIMEOUT)
+    assert (watched.deadman.next_due, watched.count("deadman_active")) == (TIMEOUT + REPEAT, 1)
+
+
+@pytest.mark.parametrize("now", [10, TIMEOUT + 10], ids=["armed", "tripped"])
+def test_at_the_end_it_sends_once_more_and_then_nothing(now: int) -> None:
+    watched = Watched()
+    watched.feed(0)
+    watched.run(now)
+    watched.sent.clear()
+    watched.deadman.end()
+    watched.run(10**6)
+    assert [endpoint for _, endpoint, _ in watched.sent] == ["driving_board", "arm_board"]
+
+
+gaps = st.lists(st.integers(0, 5 * TIMEOUT), min_size=1, max_size=30)
+
+
+def expected(feeds: list[int], end: int) -> list[int]:
+    """When a deadman sends that is served in time: from each silence's timeout on, until the next command."""
+    silences = zip(feeds, [*feeds[1:], end + 1], strict=True)
+    return [time for fed, next_fed in silences for time in range(fed + TIMEOUT, next_fed, REPEAT)]
+
+
+@given(gaps)
+def test_it_sends_exactly_in_the_silences(gaps: list[int]) -> None:
+    watched, now, feeds = Watched(), 0, []
+    for gap in gaps:
+        now += gap
+        watched.run(now - 1)
+        watched.feed(now)
+        feeds.append(now)
+    watched.run(now + 3 * TIMEOUT)
+    assert watched.times() == expected(feeds, now + 3 * TIMEOUT)
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 2 * TIMEOUT)), max_size=60))
+def test_served_at_any_time_it_neither_speaks_too_soon_nor_twice_for_one_repeat(calls: list[tuple[bool, int]]) -> None:
+    watched, now, fed = Watched(), 0, None
+    for is_command, gap in calls:
+        now += gap
+        before = len(watched.times())
+        if is_command:
+            watched.feed(now)
+            fed = now
+            assert len(watched.times()) == before
+            continue
+        watched.due(now)
+        sent = watched.times()[before:]
+        if fed is None or now < fed + TIMEOUT:
+            assert sent == []
+            continue
+        slot = (now - fed - TIMEOUT) // REPEAT
+        earlier = [(time - fed - TIMEOUT) // REPEAT for time in watched.times()[:before] if time > fed]
+        assert sent == ([] if slot in earlier else [now])

@@ -1,0 +1,175 @@
+"""The age of a message is that of the monotonic clock, whatever is done to the wall clock meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.engine.freshness import MEMORY, TOLERANCE, Freshness
+
+MS = 1_000_000
+SECOND = 1000 * MS
+HOUR = 3600 * SECOND
+JUMPS = [sign * size for sign in (1, -1) for size in (50 * MS, SECOND, 2 * SECOND, HOUR, 24 * 365 * 50 * HOUR)]
+
+
+@dataclass
+class Computer:
+    """Two clocks. `settings` has since when the wall clock is by how much ahead of the monotonic one."""
+
+    slew: float = 0.0
+    now: int = 10_000 * SECOND
+    freshness: Freshness = field(default_factory=Freshness)
+    settings: list[tuple[int, int]] = field(default_factory=lambda: [(-SECOND, 1_700_000_000 * SECOND)])
+
+    def ahead(self, time: int) -> int:
+        return self.setting(time) + round(self.slew * time)
+
+    def setting(self, time: int) -> int:
+        return [offset for since, offset in self.settings if since <= time][-1]
+
+    def settings_since(self, time: int) -> list[int]:
+        return [self.setting(time)] + [offset for since, offset in self.settings if since > time]
+
+    def wall(self, time: int) -> int:
+        return time + self.ahead(time)
+
+    def jump(self, by: int) -> None:
+        self.settings.append((self.now, self.settings[-1][1] + by))
+
+    def born(self, event: int) -> int:
+        """What the router makes of a message that was stamped at `event` and is looked at now."""
+        return self.freshness.born(self.wall(event), self.wall(self.now), self.now)
+
+    def command_for(self, duration: int, rate: int = 50) -> None:
+        """Fresh commands, each of them found to be so."""
+        for _ in range(duration * rate // SECOND):
+            self.now += SECOND // rate
+            assert abs(self.born(self.now - 5 * MS) - (self.now - 5 * MS)) <= TOLERANCE
+
+
+def test_without_jumps_the_age_is_exact() -> None:
+    computer = Computer()
+    for age in (0, 1, MS, HOUR, 2 * MS):
+        computer.now += SECOND
+        assert computer.born(computer.now - age) == computer.now - age
+
+
+@pytest.mark.parametrize("jump", JUMPS)
+def test_a_jump_leaves_fresh_commands_fresh(jump: int) -> None:
+    computer = Computer()
+    computer.command_for(3 * SECOND)
+    computer.jump(jump)
+    computer.command_for(3 * SECOND)
+
+
+@pytest.mark.parametrize("jump", JUMPS)
+def test_a_command_that_was_on_its_way_during_a_jump_stays_fresh(jump: int) -> None:
+    computer = Computer()
+    computer.command_for(SECOND)
+    event = computer.now
+    computer.jump(jump)
+    computer.now += 10 * MS
+    assert abs(computer.born(event) - event) <= TOLERANCE
+
+
+@pytest.mark.parametrize("jump", [jump for jump in JUMPS if jump not in (-2 * SECOND, -SECOND, -50 * MS)])
+def test_commands_that_waited_for_2_s_are_stale_although_the_clock_was_set_meanwhile(jump: int) -> None:
+    """As when the router is stopped for 2 s: its next look at the clocks is when it takes the first of them."""
+    computer = Computer()
+    computer.command_for(SECOND)
+    first = computer.now
+    computer.now += SECOND
+    computer.jump(jump)
+    computer.now += SECOND
+    for event in range(first, computer.now - SECOND, 20 * MS):
+        assert abs(computer.born(event) - event) <= TOLERANCE
+
+
+@pytest.mark.parametrize("jump", JUMPS)
+def test_a_jump_of_before_makes_no_stale_command_fresh(jump: int) -> None:
+    computer = Computer()
+    computer.command_for(SECOND)
+    computer.jump(jump)
+    computer.command_for(3 * SECOND)
+    assert computer.born(computer.now - 2 * SECOND) == computer.now - 2 * SECOND
+    computer.now += HOUR
+    assert computer.born(computer.now - 2 * SECOND) == computer.now - 2 * SECOND
+
+
+def test_a_setting_that_the_stamp_cannot_be_of_is_not_considered() -> None:
+    """Set back by 2 s; 0.4 s later comes a stamp of 2.5 s before. Under the new setting that is half a second old."""
+    computer = Computer()
+    computer.command_for(5 * SECOND)
+    computer.jump(-2 * SECOND)
+    computer.command_for(400 * MS)
+    assert abs(computer.born(computer.now - 2500 * MS) - (computer.now - 2500 * MS)) <= TOLERANCE
+
+
+def test_a_stamp_from_before_everything_that_is_remembered_is_stale() -> None:
+    computer = Computer()
+    start = computer.now
+    for _ in range(3):
+        computer.command_for(11 * SECOND)
+        computer.jump(SECOND)
+    computer.command_for(SECOND)
+    assert computer.born(start - HOUR) < start
+
+
+def test_the_clock_of_a_computer_that_is_ahead_counts_as_now() -> None:
+    computer = Computer()
+    assert computer.born(computer.now + SECOND) == computer.now
+    computer.command_for(SECOND)
+    assert computer.born(computer.now + HOUR) == computer.now
+
+
+def test_a_pause_between_reading_the_clocks_is_no_lasting_jump() -> None:
+    computer = Computer()
+    computer.command_for(SECOND)
+    read, computer.now = computer.now, computer.now + 2 * SECOND
+    assert computer.freshness.born(computer.wall(read), computer.wall(computer.now), read) == read
+    computer.command_for(SECOND)
+
+
+def test_settings_are_remembered_within_bounds() -> None:
+    computer = Computer()
+    for _ in range(10_000):
+        computer.now += MS
+        computer.jump(SECOND)
+        computer.born(computer.now)
+    assert len(computer.freshness._past) < 100
+    computer.now += MEMORY + 1
+    computer.born(computer.now)
+    assert len(computer.freshness._past) == 0
+
+
+jumps = st.just(0) | st.sampled_from(JUMPS) | st.integers(-5 * SECOND, 5 * SECOND) | st.integers(-50 * HOUR, 50 * HOUR)
+turns = st.lists(
+    st.tuples(st.integers(0, 3 * SECOND), jumps, st.floats(0, 1), st.integers(0, 12 * SECOND)), max_size=25
+)
+
+
+@given(turns, st.floats(-0.0005, 0.0005))
+def test_with_any_jumps_the_truth_or_what_a_jump_at_that_time_made_of_it_is_found(
+    turns: list[tuple[int, int, float, int]], slew: float
+) -> None:
+    """Between two messages passes a gap, in which the clock may be set once; each comes after a delay of its own."""
+    computer = Computer(slew)
+    looks = [computer.now]
+    computer.born(computer.now)
+    for gap, jump, share, delay in turns:
+        before = round(gap * share)
+        computer.now += before
+        computer.jump(jump)
+        computer.now += gap - before
+        event = computer.now - delay
+        found = computer.born(event)
+        assert found <= computer.now
+        if delay <= MEMORY:
+            last_look = max((look for look in looks if look < event), default=0)
+            errors = [computer.setting(event) - offset for offset in computer.settings_since(last_look - TOLERANCE)]
+            assert min(abs(found - event - error) for error in errors if error >= 0) <= TOLERANCE
+        looks.append(computer.now)
