@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from router.compiler.expressions import Locals, Typed
+from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.compiler.target import Target
@@ -41,7 +41,7 @@ class CheckedFeed:
 
     topic: Topic
     type: MessageType
-    reads: Locals
+    reads: Reads
     when: Typed | None
     for_each: Typed | None
     stamp: Typed | None
@@ -53,7 +53,7 @@ class CheckedCollect:
     """The three numbers of a datagram that is part of a frame. `reads` serves them, and nothing else."""
 
     span: SourceSpan
-    reads: Locals
+    reads: Reads
     by: Typed
     count: Typed
     order: Typed

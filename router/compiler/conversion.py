@@ -83,7 +83,7 @@ def _to_list(value: Typed, target: List, scope: Scope) -> Plan:
         raise scalars.mismatch(value, target, "write a list, [a, b]")
     if length is not None:
         _want_length(value, target, length)
-    variable = scope.locals.loop()
+    variable = scope.reads.loop()
     element = Typed.at(value.span, element_kind, load(variable))
     return Each(target, value.node, variable, convert(element, target.element, scope), value.span)
 

@@ -18,6 +18,8 @@ from router.types.model import Enum, MessageType, String, Type
 
 def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Typed:
     """A name that stands alone. `expected` is what it is to fill."""
+    if text in scope.names:
+        return scope.variable(text, span)
     if member := scope.message.field(text):
         return scope.read((), member, span)
     if text == MESSAGE:
@@ -40,9 +42,9 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> T
 
 
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
-    """The parts of `a.b.C` when it is to be looked up among enums and ROS types: no field is called `a`."""
+    """The parts of `a.b.C` when it is to be looked up among enums and ROS types: no field or variable is `a`."""
     path = dotted(node)
-    if path is None or path[0] in (MESSAGE, SOURCE, RECEIVED_AT) or scope.message.field(path[0]):
+    if path is None or path[0] in (MESSAGE, SOURCE, RECEIVED_AT, *scope.field_names()):
         return None
     return path
 
@@ -90,7 +92,7 @@ def _constants(holder: Enum | MessageType) -> Mapping[str, object]:
 def field_path(node: ast.expr, scope: Scope) -> tuple[str, ...] | None:
     """The names that lead from the source message to what `node` looks like; None when it is no chain of names."""
     path = dotted(node)
-    if path is None:
+    if path is None or path[0] in scope.names:
         return None
     return path[1:] if path[0] == MESSAGE and scope.message.field(MESSAGE) is None else path
 
@@ -107,5 +109,5 @@ def presence(path: tuple[str, ...], field_span: SourceSpan, span: SourceSpan, sc
     if member is None or not member.has_presence:
         hint = "has() is for submessages and optional fields"
         raise Finding(field_span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always there", hint)
-    has_field = attribute(load(scope.locals.name(path[:-1])), "HasField")
+    has_field = attribute(scope.reads.message(path[:-1]), "HasField")
     return Typed.at(span, BoolKind(), ast.Call(has_field, [ast.Constant(path[-1])], []))

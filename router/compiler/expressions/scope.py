@@ -1,16 +1,19 @@
-"""What names mean in the expressions of one target, and the local variables that its code keeps for them.
+"""What names mean in the expressions of one target.
 
 Knows the source message's type and the constants in sight; not the syntax that names stand in.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, field
+import ast
+import copy
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 
+from router.compiler.expressions.reads import Path, Reads
 from router.compiler.expressions.typed import Typed
 from router.compiler.kinds import MessageKind, kind_of
-from router.compiler.syntax import attribute, load
+from router.compiler.syntax import attribute, place
 from router.errors import SourceSpan
 from router.types.model import Enum, Field, MessageType
 
@@ -19,45 +22,31 @@ MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
 
 
 @dataclass(slots=True)
-class Locals:
-    """The local variables of one target: submessages that its expressions look into, each bound once, and loops'."""
-
-    message: str = "m"
-    bound: dict[tuple[str, ...], str] = field(default_factory=dict)
-    loops: int = 0
-
-    def name(self, path: tuple[str, ...]) -> str:
-        """The variable that holds the submessage at this path; the empty path is the message."""
-        if not path:
-            return self.message
-        if path not in self.bound:
-            self.name(path[:-1])  # a submessage's own holder comes before it
-            variable = "_".join((self.message, *path))
-            while variable in self.bound.values():  # a.b_c and a_b.c
-                variable += "_"
-            self.bound[path] = variable
-        return self.bound[path]
-
-    def loop(self) -> str:
-        """A variable for the elements of a list, another one each time."""
-        self.loops += 1
-        return f"item_{self.loops}"
-
-
-@dataclass(slots=True)
 class Scope:
     """What names mean in the expressions of one target.
 
-    `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible.
+    `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
+    variables beside the message's fields; they win over fields of the same name.
     """
 
     message: MessageType
     enums: Collection[Enum]
     ros_types: Collection[MessageType]
-    locals: Locals
+    reads: Reads
+    names: Mapping[str, Typed] = field(default_factory=dict)
 
     def field_names(self) -> list[str]:
-        return [member.name for member in self.message.fields]
+        """All that a name which stands alone can mean of the message and beside it."""
+        return [*self.names, *(member.name for member in self.message.fields)]
+
+    def variable(self, name: str, span: SourceSpan) -> Typed:
+        """One of `names`, as it is used at `span`."""
+        given = self.names[name]
+        node = copy.deepcopy(given.node)
+        for inner in ast.walk(node):
+            if isinstance(inner, ast.expr):
+                place(inner, span)
+        return replace(given, node=node, span=span)
 
     def holder_names(self) -> set[str]:
         """Everything that constants can be asked of: enums by full and short name, ROS types by short name."""
@@ -72,7 +61,7 @@ class Scope:
         return list(own or exact or named) + [ros for ros in self.ros_types if ros.short_name == text]
 
     def whole_message(self, span: SourceSpan) -> Typed:
-        return Typed.at(span, MessageKind(self.message), load(self.locals.message), path=())
+        return Typed.at(span, MessageKind(self.message), self.reads.message(()), path=())
 
     def field_of(self, holder: Typed, member: Field, span: SourceSpan) -> Typed:
         """A field of a message that an expression gave; through a local variable where a path leads to it."""
@@ -80,10 +69,10 @@ class Scope:
             return Typed.at(span, kind_of(member.type), attribute(holder.node, member.name))
         return self.read(holder.path, member, span)
 
-    def read(self, holder: tuple[str, ...], member: Field, span: SourceSpan) -> Typed:
+    def read(self, holder: Path, member: Field, span: SourceSpan) -> Typed:
         """A field of the submessage of the source message at path `holder`."""
         kind = kind_of(member.type)
         if isinstance(kind, MessageKind):
             path = (*holder, member.name)
-            return Typed.at(span, kind, load(self.locals.name(path)), path=path)
-        return Typed.at(span, kind, attribute(load(self.locals.name(holder)), member.name))
+            return Typed.at(span, kind, self.reads.message(path), path=path)
+        return Typed.at(span, kind, self.reads.field(holder, member))
