@@ -12,10 +12,11 @@ from pathlib import Path
 
 from router.compiler.checked import CheckedRoute
 from router.compiler.definitions import Definitions
+from router.compiler.lookup import Lookup
+from router.compiler.meetings import clash_findings, topic_findings
 from router.compiler.network import network_findings
 from router.compiler.program import Program
 from router.compiler.routes import RouteChecker, sorted_findings
-from router.compiler.topics import meeting_findings
 from router.errors import Diagnostic, Severity, TableError
 from router.table import load_table
 from router.table.model import RouteTable
@@ -65,13 +66,14 @@ def check_table(
         envelope = find_envelope(schema, table.envelope)
     except TableError as error:
         return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
-    checker = RouteChecker(table, schema, envelope, definitions, locked_size(schema) or envelope.max_size)
-    routes = checker.check_all()
+    lookup = Lookup(table, schema, envelope, definitions, locked_size(schema) or envelope.max_size)
+    routes = RouteChecker(lookup).check_all()
     findings = [
         *findings,
         *check_lock(schema, envelope),
         *network_findings(table),
-        *checker.findings,
-        *meeting_findings(table, [checked.route for checked in routes]),
+        *lookup.findings,
+        *clash_findings(table),
+        *topic_findings(table, [checked.route for checked in routes]),
     ]
     return Checked(path, sorted_findings(findings), table, schema, envelope, routes)

@@ -46,16 +46,22 @@ class _Branch:
     given: dict[str, Union[FieldEntry, _Branch]] = field(default_factory=dict)
 
 
-def build(fields: FieldMap | None, target: MessageType, scope: Scope, span: SourceSpan) -> FieldMapping:
-    """The mapping of a message of type `target`. `span` is blamed for what no entry can be."""
+def build(
+    fields: FieldMap | None, target: MessageType, scope: Scope, span: SourceSpan, whole: Typed | None = None
+) -> FieldMapping:
+    """The mapping of a message of type `target`. `span` is blamed for what no entry can be.
+
+    `auto` takes fields of `whole`, of the source message where that is None.
+    """
     builder = _Builder(scope, fields.span if fields else span)
     given = builder.sort(fields.entries if fields else (), target)
-    plan = builder.record(given, scope.whole_message(span) if fields and fields.auto else None, "")
+    automatic = (whole or scope.whole_message(span)) if fields and fields.auto else None
+    plan = builder.record(given, automatic, "")
     outcome = FieldMapping(plan, builder.rows, builder.findings)
     if target.fields and not builder.rows and not builder.findings:
         hint = "map its fields, or say `fields: auto`"
-        if fields and fields.auto:
-            hint = f"{scope.message} and {target} have no field name in common; map the fields by hand"
+        if automatic is not None:
+            hint = f"{automatic.kind} and {target} have no field name in common; map the fields by hand"
         outcome.findings.append(Diagnostic(builder.span, Code.NOTHING_MAPPED, f"nothing fills {target}", hint))
     return outcome
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from itertools import combinations
 
-from router.errors import Code, Diagnostic
-from router.table.model import Address, Destination, Endpoint, Listener, Route, RouteTable
+from router.errors import Code, Diagnostic, SourceSpan
+from router.table.model import Address, Endpoint, Listener, RouteTable
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
@@ -45,11 +46,12 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
     return None
 
 
-def loop_finding(table: RouteTable, route: Route, destination: Destination, endpoint: Endpoint) -> Diagnostic | None:
-    """A destination that sends a message back to where it came from, or to the router itself."""
-    span = destination.endpoint.span
-    if endpoint.name in {source.value for source in route.sources}:
-        message = f"'{endpoint.name}' would get its own '{route.case.value}' back"
+def loop_finding(
+    table: RouteTable, endpoint: Endpoint, span: SourceSpan, case: str, sources: AbstractSet[str]
+) -> Diagnostic | None:
+    """A destination at `span` to which payloads of `case` from `sources` are sent: back to one, or to the router."""
+    if endpoint.name in sources:
+        message = f"'{endpoint.name}' would get its own '{case}' back"
         return Diagnostic(span, Code.FORWARDING_LOOP, message, "remove it from the destinations or from the source")
     for listener in table.listeners.values():
         if _reaches(endpoint.address.value, listener):

@@ -1,14 +1,14 @@
-"""ROS topics of a table: names, QoS, and whether those who meet on one topic can hear each other."""
+"""ROS topics one by one: their names and their QoS. Who meets on one topic is for `meetings`."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 from router.compiler.program import QosPlan
 from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import NodeSettings, Route, RouteTable, Topic
+from router.table.model import NodeSettings, Topic
 
 DEFAULT_DEPTH = 10
 LONGEST_NAME = 247
@@ -82,67 +82,3 @@ def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
         span = given.durability or given.reliability or given.profile
         yield conflict(span.span if span else given.span, "late joiners get nothing from a best_effort publisher",
                        "transient_local goes with reliability: reliable")  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class _Use:
-    """One mention of a topic in the table."""
-
-    topic: Topic
-    case: str
-    publishes: bool
-    qos: QosPlan
-
-
-def meeting_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
-    """Topics that several routes name: one type, one publisher's QoS, and QoS that matches."""
-    uses: dict[str, list[_Use]] = {}
-    for route in routes:
-        for topic in route.topics:
-            if topic_name_finding(topic) is None:
-                use = _Use(topic, route.case.value, not route.is_outbound, qos_of(topic))
-                uses.setdefault(resolved(topic.topic.value, table.node), []).append(use)
-    for name, together in uses.items():
-        for use in together[1:]:
-            if finding := _disagreement(name, together[0], use):
-                yield finding
-
-
-def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
-    if use.topic.type.value != first.topic.type.value:
-        message = f"topic '{name}' has the type {first.topic.type.value} in route '{first.case}'"
-        hint = f"a topic has one type; see {first.topic.type.span}"
-        return Diagnostic(use.topic.type.span, Code.TOPIC_TYPE_CLASH, message, hint)
-    span = use.topic.qos.span if use.topic.qos else (use.topic.queue_depth or use.topic.topic).span
-    if use.publishes == first.publishes:
-        if use.qos == first.qos:
-            return None
-        message = f"topic '{name}' has another QoS in route '{first.case}'"
-        return Diagnostic(span, Code.QOS_CONFLICT, message, f"a topic has one; see {first.topic.span}")
-    publisher, subscriber = (use, first) if use.publishes else (first, use)
-    if reason := _unheard(publisher.qos, subscriber.qos):
-        message = (
-            f"route '{subscriber.case}' hears nothing that route '{publisher.case}' publishes on '{name}': {reason}"
-        )
-        return Diagnostic(span, Code.QOS_CONFLICT, message, "give both the same QoS")
-    return None
-
-
-def _unheard(offered: QosPlan, requested: QosPlan) -> str:
-    """Why DDS would not match the two, empty when it does."""
-    if offered.reliability == "best_effort" and requested.reliability == "reliable":
-        return "it wants reliable and gets best_effort"
-    if offered.durability == "volatile" and requested.durability == "transient_local":
-        return "it wants transient_local and gets volatile"
-    if _is_longer(offered.deadline, requested.deadline):
-        return "it wants a shorter deadline than is offered"
-    if _is_longer(offered.liveliness_lease_duration, requested.liveliness_lease_duration):
-        return "it wants a shorter liveliness lease than is offered"
-    if offered.liveliness == "automatic" and requested.liveliness == "manual_by_topic":
-        return "it wants liveliness manual_by_topic and gets automatic"
-    return ""
-
-
-def _is_longer(offered: int | None, requested: int | None) -> bool:
-    """None is for ever."""
-    return requested is not None and (offered is None or offered > requested)

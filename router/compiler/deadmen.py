@@ -1,0 +1,70 @@
+"""Checks deadmen: the payload that is sent when commands stop coming, and commands to boards that have none."""
+
+from __future__ import annotations
+
+from router.compiler.checked import CheckedDeadman
+from router.compiler.destinations import recipient
+from router.compiler.expressions import ParsedReads
+from router.compiler.lookup import Lookup
+from router.compiler.mapping import build
+from router.compiler.plan import Record
+from router.errors import Code
+from router.table.model import Deadman, EndpointKind, Route
+from router.types.model import MessageType
+from router.types.protobuf import PayloadCase
+
+NS_PER_SECOND = 1_000_000_000
+_NOTHING = MessageType("a deadman")
+"""What a deadman's payload is made of: there is no message that it could be filled from."""
+
+
+def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
+    """The deadman of a route, None where it has none or where the payload is none."""
+    deadman = route.deadman
+    if deadman is None:
+        _want_deadman(lookup, route)
+        return None
+    _want_commands(lookup, route, deadman)
+    case = lookup.case(deadman.case)
+    if case is None:
+        return None
+    for name in deadman.to:
+        recipient(lookup, case, name, deadman.to, sources=frozenset())
+    plan = _payload(lookup, deadman, case)
+    return CheckedDeadman(case, plan, tuple(name.value for name in deadman.to)) if plan else None
+
+
+def _want_deadman(lookup: Lookup, route: Route) -> None:
+    """Warns of the first board that gets commands which nothing stops."""
+    for destination in route.destinations:
+        name = destination.endpoint.value
+        endpoint = lookup.table.endpoints.get(name)
+        if route.no_deadman is None and endpoint is not None and endpoint.kind is EndpointKind.BOARD:
+            message = f"nothing stops '{name}' when '{route.case.value}' stops coming"
+            hint = (
+                f"say `deadman: {{timeout: 500ms, send: {{CASE: {{FIELD: VALUE}}}}, to: [{name}]}}`, "
+                "or `deadman: why it needs none`"
+            )
+            lookup.report(destination.endpoint.span, Code.NO_DEADMAN, message, hint)
+            return
+
+
+def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+    if not route.destinations:
+        message = f"'{route.case.value}' goes to no destination, so there are no commands that could stop coming"
+        lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "a deadman belongs to a route with destinations")
+        return
+    rates = [destination.max_rate for destination in route.destinations]
+    limited = [rate.value for rate in rates if rate is not None]
+    if len(limited) == len(rates) and deadman.timeout.value * max(limited) <= NS_PER_SECOND:
+        message = f"it would trip between commands that `max_rate` holds down to {max(limited):g} Hz"
+        lookup.report(deadman.timeout.span, Code.BAD_VALUE, message, "a longer timeout, or a higher max_rate")
+
+
+def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> Record | None:
+    """A payload of which nothing is filled is one: all zero."""
+    scope = lookup.scope(_NOTHING, ParsedReads())
+    mapping = build(deadman.fields, case.type, scope, deadman.case.span)
+    findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
+    lookup.findings += findings
+    return None if findings else mapping.plan

@@ -1,0 +1,73 @@
+"""Endpoints that a route sends to: which they are, whether they can take the payload, and the targets they become."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+
+from router.compiler.expressions import Reads, Typed
+from router.compiler.lookup import Lookup
+from router.compiler.network import loop_finding
+from router.compiler.plan import Record
+from router.compiler.target import Target
+from router.errors import Code
+from router.table.model import Destination, Endpoint, EndpointKind, Keep, Located, Priority, Route, Topic
+from router.types.boards import board_findings
+from router.types.protobuf import PayloadCase
+
+
+def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:
+    """Those of a route, each with its endpoint, None where there is none; what is wrong with them is reported."""
+    names = [destination.endpoint for destination in route.destinations]
+    sources = {source.value for source in route.sources}
+    return [(each, recipient(lookup, case, each.endpoint, names, sources)) for each in route.destinations]
+
+
+def recipient(
+    lookup: Lookup, case: PayloadCase, name: Located[str], among: Sequence[Located[str]], sources: AbstractSet[str]
+) -> Endpoint | None:
+    """The endpoint `name`, one `among` those that get payloads of `case` which come from `sources`."""
+    endpoint = lookup.endpoint(name)
+    if endpoint is None:
+        return None
+    if next(other for other in among if other.value == name.value) is not name:
+        lookup.report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
+    finding = loop_finding(lookup.table, endpoint, name.span, case.name, sources)
+    if finding and finding.message not in {earlier.message for earlier in lookup.findings}:
+        lookup.findings.append(finding)  # an endpoint that is the router itself is one mistake, not one per route
+    if endpoint.kind is EndpointKind.BOARD:
+        lookup.findings += board_findings(case, lookup.schema, lookup.board_limit, name.span)
+    return endpoint
+
+
+def target_to(
+    route: Route,
+    destination: Destination,
+    endpoint: Endpoint | None,
+    when: Typed | None,
+    reads: Reads | None = None,
+    plan: Record | None = None,
+) -> Target:
+    """The target that a destination becomes. Whatever goes to a board is a command where the route says nothing."""
+    to_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
+    return Target(
+        name=destination.endpoint.value,
+        span=destination.span,
+        is_topic=False,
+        reads=reads,
+        when=when,
+        max_rate=max_rate(destination),
+        keep=keep(destination),
+        priority=route.priority.value if route.priority else Priority.COMMAND if to_board else Priority.TELEMETRY,
+        has_budget=endpoint is not None and endpoint.budget is not None,
+        trim=endpoint is not None and endpoint.trim_trailing_zeros,
+        plan=plan,
+    )
+
+
+def max_rate(limited: Destination | Topic) -> float | None:
+    return limited.max_rate.value if limited.max_rate else None
+
+
+def keep(limited: Destination | Topic) -> Keep:
+    return limited.keep.value if limited.keep else Keep.FIRST

@@ -1,0 +1,108 @@
+"""What routes name, looked up among the table's endpoints, the payload cases and the types.
+
+Collects what is wrong with it. Knows neither which way a route goes nor what becomes of the values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from router.compiler.definitions import Definitions
+from router.compiler.expressions import Finding, Reads, Scope, Typed, check
+from router.compiler.kinds import BoolKind, Kind
+from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, nearest
+from router.table.model import Endpoint, Expression, Located, RouteTable, Topic
+from router.types.model import List, MessageType, Type
+from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
+
+
+@dataclass(slots=True)
+class Lookup:
+    """Looks up names for the routes of one table; `findings` fills up. `board_limit`: see `board_findings`."""
+
+    table: RouteTable
+    schema: ProtoSchema
+    envelope: Envelope
+    definitions: Definitions
+    board_limit: int
+    findings: list[Diagnostic] = field(default_factory=list)
+
+    def report(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
+        self.findings.append(Diagnostic(span, code, message, hint))
+
+    def case(self, name: Located[str]) -> PayloadCase | None:
+        found = self.envelope.cases.get(name.value)
+        if found is None:
+            message = f"{self.envelope.name} has no payload case '{name.value}'"
+            hint = did_you_mean(name.value, self.envelope.cases)
+            self.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
+        return found
+
+    def endpoint(self, name: Located[str], also: Iterable[str] = ()) -> Endpoint | None:
+        """`also` is what else could be meant. Where a declaration left out has a finding of its own, there is none."""
+        found = self.table.endpoints.get(name.value)
+        if found is None and f"endpoints/{name.value}" not in self.table.broken:
+            known = [*self.table.endpoints, *also]
+            used = [used for route in self.table.routes for used in route.endpoint_names]
+            meant = self.table.endpoints.get(nearest(name.value, known) or "")
+            if meant and meant.name not in used and used.count(name.value) > 1:  # its declaration is misspelt
+                message = f"no route names the endpoint '{meant.name}', several name '{name.value}'"
+                self.report(meant.span, Code.UNKNOWN_ENDPOINT, message, f"did you mean '{name.value}'?")
+            else:
+                hint = did_you_mean(name.value, known)
+                self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
+        return found
+
+    def ros_type(self, topic: Topic) -> MessageType | None:
+        name = topic.type.value
+        try:
+            found = self.definitions.interfaces.get(name)
+        except TableError as error:
+            self.findings += error.diagnostics
+            return None
+        if found is None:
+            hint = did_you_mean(name, self.definitions.interfaces.names())
+            self.report(topic.type.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name}'", hint)
+        return found
+
+    def scope(
+        self,
+        message: MessageType,
+        reads: Reads,
+        ros_type: MessageType | None = None,
+        names: Mapping[str, Typed] | None = None,
+    ) -> Scope:
+        """What expressions over `message` can see; the constants of `ros_type` and of what is nested in it as well."""
+        nested = tuple(nested_types(ros_type)) if ros_type else ()
+        return Scope(message, tuple(self.schema.enums.values()), nested, reads, names or {})
+
+    def value(self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str) -> Typed | None:
+        """An expression of one of `kinds`; `wanted` completes the sentence that says so."""
+        try:
+            typed = check(expression, scope)
+            if not isinstance(typed.kind, kinds):
+                raise Finding(typed.span, Code.TYPE_MISMATCH, f"{wanted}, not {typed.kind}")
+        except Finding as finding:
+            self.findings.append(finding.diagnostic)
+            return None
+        return typed
+
+    def when(self, expression: Expression | None, scope: Scope) -> Typed | None:
+        if expression is None:
+            return None
+        return self.value(expression, scope, (BoolKind,), "'when' takes a bool")
+
+
+def nested_types(declared: Type) -> Iterable[MessageType]:
+    """A ROS message type and all types in it, each once."""
+    found: dict[str, MessageType] = {}
+    waiting: list[Type] = [declared]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, List):
+            waiting.append(current.element)
+        elif isinstance(current, MessageType) and current.name not in found:
+            found[current.name] = current
+            waiting += [member.type for member in current.fields]
+    return found.values()

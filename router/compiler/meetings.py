@@ -1,0 +1,126 @@
+"""Routes that meet: at a source, which one of them may have, and on a topic, where they must understand each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+from router.compiler.program import QosPlan
+from router.compiler.topics import qos_of, resolved, topic_name_finding
+from router.errors import Code, Diagnostic, SourceSpan
+from router.table.model import ANY, Located, Route, RouteTable, Topic
+
+
+def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Routes of one payload case that take it from the same endpoint, or from the same topic."""
+    earlier: dict[str, dict[str, SourceSpan]] = {}
+    for route in table.routes:
+        taken = earlier.setdefault(route.case.value, {})
+        origins = _origins(route, table)
+        for key, origin in origins.items():
+            if (name := _taken(key, taken)) is not None:
+                message = f"another route takes '{route.case.value}' from '{name}'"
+                yield Diagnostic(origin.span, Code.SOURCE_CLASH, message, f"see {taken[name]}; let one have it")
+        taken.update((key, origin.span) for key, origin in origins.items())
+
+
+def _origins(route: Route, table: RouteTable) -> dict[str, Located[str]]:
+    """Where a route takes messages from: topics by their absolute names, which no endpoint has, or endpoints."""
+    if route.is_outbound:
+        return {resolved(topic.topic.value, table.node): topic.topic for topic in route.topics}
+    return {source.value: source for source in route.sources}
+
+
+def _taken(key: str, taken: Mapping[str, SourceSpan]) -> str | None:
+    """What of `taken` stands in the way. `any` overlaps with all endpoints."""
+    if key in taken:
+        return key
+    if key == ANY:
+        return next((name for name in taken if not name.startswith("/")), None)
+    return ANY if ANY in taken and not key.startswith("/") else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Use:
+    """One mention of a topic in the table."""
+
+    topic: Topic
+    route: Route
+    qos: QosPlan
+
+    @property
+    def publishes(self) -> bool:
+        return not self.route.is_outbound
+
+
+def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
+    """Topics that several routes name: one type, one QoS for each direction, QoS that matches, and no way back."""
+    for name, uses in _uses(table, routes).items():
+        firsts = [uses[0], *[use for use in uses if use.publishes != uses[0].publishes][:1]]
+        for use in uses[1:]:
+            found = (_disagreement(name, first, use) for first in firsts if first is not use)
+            if finding := next(filter(None, found), None):
+                yield finding
+        for publisher, subscriber in product(uses, uses):
+            if publisher.publishes and not subscriber.publishes:
+                yield from _echoes(name, publisher.route, subscriber.route)
+
+
+def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_Use]]:
+    """By absolute name."""
+    uses: dict[str, list[_Use]] = {}
+    for route in routes:
+        for topic in route.topics:
+            if topic_name_finding(topic) is None:
+                uses.setdefault(resolved(topic.topic.value, table.node), []).append(_Use(topic, route, qos_of(topic)))
+    return uses
+
+
+def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
+    """Endpoints that would get back through a topic what they sent themselves."""
+    sources = {source.value for source in publisher.sources}
+    for destination in subscriber.destinations:
+        sender = destination.endpoint
+        if sender.value in sources:
+            message = f"'{sender.value}' would get its own '{publisher.case.value}' back through the topic '{name}'"
+            hint = "remove it from the destinations, or give one of the routes another topic"
+            yield Diagnostic(sender.span, Code.FORWARDING_LOOP, message, hint)
+
+
+def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
+    if use.topic.type.value != first.topic.type.value:
+        message = f"topic '{name}' has the type {first.topic.type.value} in route '{first.route.name}'"
+        hint = f"a topic has one type; see {first.topic.type.span}"
+        return Diagnostic(use.topic.type.span, Code.TOPIC_TYPE_CLASH, message, hint)
+    span = use.topic.qos.span if use.topic.qos else (use.topic.queue_depth or use.topic.topic).span
+    if use.publishes == first.publishes:
+        if use.qos == first.qos:
+            return None
+        message = f"topic '{name}' has another QoS in route '{first.route.name}'"
+        return Diagnostic(span, Code.QOS_CONFLICT, message, f"a topic has one; see {first.topic.span}")
+    publisher, subscriber = (use, first) if use.publishes else (first, use)
+    if reason := _unheard(publisher.qos, subscriber.qos):
+        message = f"route '{subscriber.route.name}' hears nothing that route '{publisher.route.name}' publishes on"
+        return Diagnostic(span, Code.QOS_CONFLICT, f"{message} '{name}': {reason}", "give both the same QoS")
+    return None
+
+
+def _unheard(offered: QosPlan, requested: QosPlan) -> str:
+    """Why DDS would not match the two, empty when it does."""
+    if offered.reliability == "best_effort" and requested.reliability == "reliable":
+        return "it wants reliable and gets best_effort"
+    if offered.durability == "volatile" and requested.durability == "transient_local":
+        return "it wants transient_local and gets volatile"
+    if _is_longer(offered.deadline, requested.deadline):
+        return "it wants a shorter deadline than is offered"
+    if _is_longer(offered.liveliness_lease_duration, requested.liveliness_lease_duration):
+        return "it wants a shorter liveliness lease than is offered"
+    if offered.liveliness == "automatic" and requested.liveliness == "manual_by_topic":
+        return "it wants liveliness manual_by_topic and gets automatic"
+    return ""
+
+
+def _is_longer(offered: int | None, requested: int | None) -> bool:
+    """None is for ever."""
+    return requested is not None and (offered is None or offered > requested)
