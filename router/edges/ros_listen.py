@@ -12,7 +12,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
-from router.edges.ros_node import RCL_ERRORS, close_node, installed_class, open_node
+from router.edges.ros_node import RCL_ERRORS, close_node, open_node
+from router.edges.ros_types import installed_class
 from router.edges.ros_wait import RawSubscription, WaitSet
 from router.errors import StartError
 

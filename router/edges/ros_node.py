@@ -1,10 +1,8 @@
-"""A ROS node in a context of its own, and the installed classes of messages. Knows no table and no traffic."""
+"""A ROS node in a context of its own. Knows no topics."""
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
-from typing import Any
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
@@ -32,17 +30,3 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
 def close_node(node: Node) -> None:
     node.destroy_node()
     node.context.try_shutdown()
-
-
-def installed_class(name: str) -> Any:
-    """The Python class of `std_msgs/msg/String`. Raises StartError that says how to get it."""
-    package, _, short = name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), short)
-    except (ImportError, AttributeError) as error:
-        raise StartError(f"{name} is not installed ({error}); {remedy(name)}") from error
-
-
-def remedy(name: str) -> str:
-    """What to do when the installed type is missing or another one."""
-    return f"run 'make setup', or install the ROS package '{name.partition('/')[0]}'"

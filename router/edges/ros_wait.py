@@ -5,20 +5,23 @@ What the bytes mean, and which thread waits, is not known here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import HistoryPolicy, QoSProfile
 
 from router.edges.clock import wall_ns
 
+MOST_KEPT = 5000
+"""What a subscription without a depth holds: Fast DDS keeps no more samples unless it is told to."""
+
 
 class RawSubscription:
-    """A subscription whose messages are taken as CDR bytes, when its owner wants to."""
+    """A subscription whose messages are taken as CDR bytes, when its owner wants to. It holds up to `capacity`."""
 
     def __init__(
         self,
@@ -34,6 +37,7 @@ class RawSubscription:
         )
         self.handle = subscription.handle
         self.events: list[EventHandler] = subscription.event_handlers
+        self.capacity: int = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else MOST_KEPT
         self._message_class = message_class
 
     def take(self) -> tuple[bytes, int] | None:
@@ -75,11 +79,11 @@ class WaitSet:
         ready = self._set.get_ready_entities("subscription")
         return [subscription for handle, subscription in self._subscriptions if handle.pointer in ready]
 
-    def serve_events(self) -> None:
-        """Calls the callbacks of the events that had happened when `wait` returned."""
+    def happened(self) -> Iterator[tuple[EventHandler, Any]]:
+        """The events that had happened when `wait` returned, each with its status."""
         for event in self._events:
-            if event.is_ready(self._set) and (status := event.take_data()) is not None:
-                event.callback(status)
+            if event.is_ready(self._set):
+                yield event, event.take_data()
 
     def wake(self) -> None:
         """Ends the present wait, or the next one."""

@@ -1,24 +1,27 @@
 """A ROS publisher in a process of its own: `Publisher` starts it, and this file run as a script is it.
 
 It prints "matched" once a subscriber is there, publishes each line of its standard input (a message's bytes in hex),
-and ends with it.
+prints "acknowledged" at an empty line when subscribers have all of it, and ends with its standard input.
 """
 
 from __future__ import annotations
 
 import argparse
+import select
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import rclpy
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
 
-from router.edges.ros_node import installed_class
+from router.edges.ros_types import installed_class
 from tests.ros_child import RosProcess, own_stdout, spin_until_stdin_ends
 
 
@@ -36,6 +39,11 @@ class Publisher(RosProcess):
         assert self.process.stdin
         self.process.stdin.writelines(f"{cdr.hex()}\n" for cdr in messages)
         self.process.stdin.flush()
+
+    def publish_and_wait(self, messages: Iterable[bytes]) -> None:
+        """The subscribers have them all when this returns, in their queues at least."""
+        self.publish([*messages, b""])
+        assert self.line() == "acknowledged"
 
 
 def main() -> None:
@@ -57,6 +65,7 @@ def main() -> None:
 
     def on_matched(status: Any) -> None:
         if status.current_count_change > 0:
+            sleep(0.1)  # the subscriber learns of it later; what it misses until then takes DDS three seconds to repair
             print("matched", file=lines)
 
     publisher = node.create_publisher(
@@ -65,14 +74,15 @@ def main() -> None:
         qos,
         event_callbacks=PublisherEventCallbacks(matched=on_matched),
     )
-    told = [b""]
 
     def publish(line: str) -> None:
-        told[0] = bytes.fromhex(line)
-        publisher.publish(told[0])
+        if not line and publisher.wait_for_all_acked(Duration(seconds=20)):
+            print("acknowledged", file=lines)
+        if line:
+            publisher.publish(bytes.fromhex(line))
+        while arguments.flood and not select.select([sys.stdin], [], [], 0)[0]:
+            publisher.publish(bytes.fromhex(line))
 
-    if arguments.flood:
-        node.create_timer(0, lambda: publisher.publish(told[0]) if told[0] else None)
     spin_until_stdin_ends(node, publish)
 
 

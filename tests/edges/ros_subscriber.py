@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
 
-from router.edges.ros_node import installed_class
+from router.edges.ros_types import installed_class
 from tests.ros_child import RosProcess, own_stdout, spin_until_stdin_ends
 
 

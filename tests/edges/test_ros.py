@@ -1,4 +1,4 @@
-"""The ROS edge against real rclpy, with the subscriber in a process of its own."""
+"""Opening and publishing against real rclpy, with the subscriber in a process of its own."""
 
 from __future__ import annotations
 
@@ -9,28 +9,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from rclpy.serialization import serialize_message
-from std_msgs.msg import String
 from structlog.testing import capture_logs
 
 from router.compiler.program import QosPlan, TopicPlan
-from router.edges.ros import RosEdge
-from router.errors import SourceSpan, StartError
-from router.table.model import NodeSettings
+from router.errors import StartError
 from router.types.ros import definition, ros_interfaces
+from tests.edges.ros_opening import HELLO, RELIABLE, open_ros, string_topic
 from tests.edges.ros_subscriber import Subscriber, wait_until
-
-RELIABLE = QosPlan("reliable", "volatile", "keep_last", 10)
-SPAN = SourceSpan("routes/rover.yaml", 40, 16, 24)
-HELLO = bytes(serialize_message(String(data="hello, rover...")))  # 24 bytes: DDS pads to a multiple of four
-
-
-def string_topic(qos: QosPlan = RELIABLE, topic: str = "greeting") -> TopicPlan:
-    return TopicPlan(topic, "std_msgs/msg/String", qos, {"std_msgs/msg/String": (("data", "string"),)})
-
-
-def open_ros(*plans: TopicPlan, args: tuple[str, ...] = ()) -> RosEdge:
-    return RosEdge(NodeSettings("router_test", "/"), plans, {plan.topic: SPAN for plan in plans}, args)
 
 
 @pytest.fixture
@@ -62,12 +47,37 @@ def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..
 
 
 def test_a_subscriber_with_incompatible_qos_is_warned_about(subscribe: Callable[..., Subscriber]) -> None:
-    with capture_logs() as logged, closing(open_ros(string_topic(QosPlan("best_effort", "volatile", "keep_last", 5)))):
+    told: list[tuple[str, str, int]] = []
+    offered = string_topic(QosPlan("best_effort", "volatile", "keep_last", 5))
+    with capture_logs() as logged, closing(open_ros(offered, incompatible=lambda *peers: told.append(peers))):
         subscribe("greeting", "std_msgs/msg/String")
-        wait_until(lambda: bool(logged))
+        subscribe("greeting", "std_msgs/msg/String")
+        wait_until(lambda: ("greeting", "reliability", 2) in told)
     assert logged[0]["topic"] == "greeting"
-    assert logged[0]["policy"] == "RELIABILITY"
+    assert logged[0]["policy"] == "reliability"
     assert logged[0]["log_level"] == "warning"
+
+
+def test_a_fault_in_counting_an_event_is_told_and_costs_that_event_alone(subscribe: Callable[..., Subscriber]) -> None:
+    def incompatible(*_: object) -> None:
+        raise RuntimeError("no such series")
+
+    offered = string_topic(QosPlan("best_effort", "volatile", "keep_last", 5)), string_topic(topic="farewell")
+    with capture_logs() as logged, closing(open_ros(*offered, incompatible=incompatible)) as ros:
+        subscribe("greeting", "std_msgs/msg/String")
+        wait_until(lambda: len(logged) == 2)
+        subscribe("farewell", "std_msgs/msg/String")
+        wait_until(lambda: ros.wanted["farewell"][0])
+    assert [line["log_level"] for line in logged] == ["warning", "critical"]
+
+
+def test_ros_that_others_shut_down_is_told_of() -> None:
+    with capture_logs() as logged, closing(open_ros(string_topic())) as ros:
+        ros._node.context.shutdown()
+        wait_until(lambda: bool(logged))
+        with pytest.raises(ros.publish_errors):
+            ros.publish["greeting"](HELLO)
+    assert logged[0]["log_level"] == "critical"
 
 
 def test_ros_arguments_rename_topics(subscribe: Callable[..., Subscriber]) -> None:
@@ -81,8 +91,10 @@ def test_every_qos_that_a_table_can_name_opens() -> None:
     second = 1_000_000_000
     full = QosPlan("best_effort", "transient_local", "keep_all", 1, second, second, "manual_by_topic", second)
     defaults = QosPlan("system_default", "system_default", "system_default", 3)
-    with closing(open_ros(string_topic(full, "one"), string_topic(defaults, "two"))) as ros:
-        assert set(ros.publish) == {"one", "two"}
+    best = QosPlan("best_available", "best_available", "keep_last", 3)
+    plans = [string_topic(full, "one"), string_topic(defaults, "two"), string_topic(best, "three")]
+    with closing(open_ros(*plans, subscriptions=plans)) as ros:
+        assert set(ros.publish) == {"one", "two", "three"}
 
 
 def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
