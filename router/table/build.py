@@ -12,7 +12,7 @@ from typing import TypeVar, Union
 
 from router.errors import Code, Diagnostic, SourceSpan
 from router.table.address import BadAddressError, parse_address
-from router.table.build_routes import build_route, sound_part
+from router.table.build_routes import build_case, named
 from router.table.model import (
     Address,
     Endpoint,
@@ -26,8 +26,9 @@ from router.table.model import (
 )
 from router.table.nodes import Entry, MappingNode, is_sound
 from router.table.reading import UnsoundError, boolean, integer, mapping, optional_text, text, text_or
+from router.table.salvage import sound_part
 from router.table.source import Source
-from router.table.units import parse_size
+from router.table.units import parse_data_rate, parse_size
 
 T = TypeVar("T")
 
@@ -56,7 +57,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         metrics=builder.one(root, "metrics", _metrics),
         listeners=builder.each(root, "listen", _listener),
         endpoints=builder.each(root, "endpoints", _endpoint),
-        routes=tuple(builder.each(root, "routes", build_route, salvage=sound_part).values()),
+        routes=named(builder.each(root, "routes", build_case, salvage=sound_part).values()),
         routes_span=routes.key.span,
         broken=frozenset(builder.broken),
     )
@@ -157,6 +158,7 @@ def _listener(entry: Entry) -> Listener:
 def _endpoint(entry: Entry) -> Endpoint:
     settings = mapping(entry.value)
     address = _address(settings)
+    budget = optional_text(settings, "budget")
     first = int(address.value.host.partition(".")[0])
     if first == 0 or first >= 224:
         raise _bad_address(address.span, f"{address.value.host} is not the address of one machine")
@@ -167,6 +169,7 @@ def _endpoint(entry: Entry) -> Endpoint:
         kind=EndpointKind(text(settings, "kind").value),
         source_port=integer(settings, "source_port"),
         trim_trailing_zeros=boolean(settings, "trim_trailing_zeros"),
+        budget=Located(UnsoundError.guard(parse_data_rate, budget), budget.span) if budget else None,
     )
 
 

@@ -1,172 +1,101 @@
-"""Routes: nodes that have their shape to Route, Destination, Topic, Qos, FieldMap and Expression.
+"""Routes: nodes that have their shape to Route, Deadman and Collect, each route with a name of its own.
 
 Knows the schema's shape; which names exist is the compiler's business.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 
-from router.errors import SourceSpan
-from router.table.model import Destination, Expression, FieldEntry, FieldMap, Located, Qos, Route, Topic
-from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, is_sound
-from router.table.places import TextPlace
-from router.table.reading import UnsoundError, boolean, integer, items, located, mapping, optional_text, scalar, text
-from router.table.units import parse_duration, parse_rate
+from router.table.build_fields import constants, expression, fields, optional_expression
+from router.table.build_targets import destination, topic
+from router.table.model import Collect, Deadman, Located, Priority, Route
+from router.table.nodes import Entry, MappingNode, ScalarNode, SequenceNode
+from router.table.reading import duration, items, located, mapping, needed_duration, optional_text
 
-AUTO = "auto"
-
-_INDISPENSABLE = frozenset({"source", "ignore", "topic", "type", "endpoint"})
-"""Keys without which a route, a topic or a destination says nothing."""
-
-_SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"})
-"""Keys with which it says something, whatever else it lacks or has too much."""
+DEFAULT_REPEAT = 100_000_000
+"""How often a deadman sends, in ns, unless the table says it."""
 
 
-def sound_part(entry: Entry) -> Entry | None:
-    """A route without what has findings of its own, so that the rest is checked in the same run."""
-    value = None if entry.key.broken else _sound_part(entry.value)
-    return Entry(entry.key, value) if value else None
+def build_case(entry: Entry) -> tuple[Route, ...]:
+    """The routes of one payload case, all named after the case so far."""
+    written = entry.value.items if isinstance(entry.value, SequenceNode) else (entry.value,)
+    return tuple(_route(entry.key, mapping(node)) for node in written)
 
 
-def _sound_entry(entry: Entry) -> Entry | None:
-    """What stands under a key of a route: broken as a whole it may be a mapping where a list belongs."""
-    return None if entry.value.broken else sound_part(entry)
+def named(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
+    """The routes of all cases, with names that tell them apart in metrics and log.
+
+    A case's only route keeps the case's name; of several each is named after its first source.
+    """
+    cases = tuple(cases)
+    taken = {route.name for routes in cases for route in routes}
+    found: list[Route] = []
+    for routes in cases:
+        for route in routes:
+            name = route.name if len(routes) == 1 else _free(f"{route.name}_from_{route.sources[0].value}", taken)
+            taken.add(name)
+            found.append(replace(route, name=name))
+    return tuple(found)
 
 
-def _sound_part(node: Node) -> Node | None:
-    if isinstance(node, MappingNode):
-        if node.broken and not any(keys <= node.entries.keys() for keys in _SUFFICIENT):
-            return None
-        if any(key in _INDISPENSABLE and not is_sound(entry.value) for key, entry in node.entries.items()):
-            return None
-        parts = {key: entry if is_sound(entry.value) else _sound_entry(entry) for key, entry in node.entries.items()}
-        return replace(node, entries={key: part for key, part in parts.items() if part})
-    if node.broken:
-        return None
-    if isinstance(node, SequenceNode) and all(isinstance(item, MappingNode) for item in node.items):
-        return replace(node, items=tuple(part for item in node.items if (part := _sound_part(item))))
-    return node if is_sound(node) else None
+def _free(name: str, taken: set[str]) -> str:
+    """The name, or with the first of `_2`, `_3`, ... behind it with which it is not taken."""
+    free, number = name, 1
+    while free in taken:
+        number += 1
+        free = f"{name}_{number}"
+    return free
 
 
-def build_route(entry: Entry) -> Route:
-    settings = mapping(entry.value)
+def _route(case: ScalarNode, settings: MappingNode) -> Route:
     source = settings.get("source")
     names = source.items if isinstance(source, SequenceNode) else (source,) if source else ()
+    deadman = settings.entries.get("deadman")
+    collect = settings.entries.get("collect")
+    is_reason = deadman is not None and isinstance(deadman.value, ScalarNode)
     return Route(
-        name=entry.key.text,
-        case=Located(entry.key.text, entry.key.span),
+        name=case.text,
+        case=Located(case.text, case.span),
         sources=tuple(map(located, names)),
-        destinations=tuple(map(_destination, items(settings, "destinations"))),
-        topics=tuple(map(_topic, items(settings, "topics"))),
-        fields=_fields(settings),
+        destinations=tuple(map(destination, items(settings, "destinations"))),
+        topics=tuple(map(topic, items(settings, "topics"))),
+        fields=fields(settings),
         ignore=optional_text(settings, "ignore"),
+        ttl=duration(settings, "ttl"),
+        deadman=_deadman(deadman) if deadman and not is_reason else None,
+        no_deadman=located(deadman.value) if deadman and is_reason else None,
+        for_each=optional_expression(settings, "for_each"),
+        collect=_collect(collect) if collect else None,
+        priority=_priority(settings),
     )
 
 
-def _destination(node: Node) -> Destination:
-    if isinstance(node, ScalarNode):
-        return Destination(located(node), node.span)
-    settings = mapping(node)
-    return Destination(
-        endpoint=text(settings, "endpoint"),
-        span=_item_span(settings),
-        when=_when(settings),
-        max_rate=_max_rate(settings),
-        fields=_fields(settings),
-    )
-
-
-def _topic(node: Node) -> Topic:
-    settings = mapping(node)
-    return Topic(
-        topic=text(settings, "topic"),
-        type=text(settings, "type"),
-        span=_item_span(settings),
-        queue_depth=integer(settings, "queue_depth"),
-        qos=_qos(settings.entries.get("qos")),
-        when=_when(settings),
-        max_rate=_max_rate(settings),
-        fields=_fields(settings),
-    )
-
-
-def _item_span(settings: MappingNode) -> SourceSpan:
-    """A mapping in a list has no key of its own; its first key stands for it."""
-    return next(iter(settings.entries.values())).key.span
-
-
-def _qos(entry: Entry | None) -> Qos | None:
-    if entry is None:
-        return None
+def _deadman(entry: Entry) -> Deadman:
     settings = mapping(entry.value)
-    return Qos(
+    [payload] = mapping(settings.get("send")).entries.values()
+    return Deadman(
         span=entry.key.span,
-        profile=optional_text(settings, "profile"),
-        reliability=optional_text(settings, "reliability"),
-        durability=optional_text(settings, "durability"),
-        history=optional_text(settings, "history"),
-        depth=integer(settings, "depth"),
-        deadline=_duration(settings, "deadline"),
-        lifespan=_duration(settings, "lifespan"),
-        liveliness=optional_text(settings, "liveliness"),
-        liveliness_lease_duration=_duration(settings, "liveliness_lease_duration"),
+        timeout=needed_duration(settings, "timeout"),
+        case=located(payload.key),
+        fields=constants(payload),
+        to=tuple(map(located, items(settings, "to"))),
+        repeat=duration(settings, "repeat") or Located(DEFAULT_REPEAT, entry.key.span),
     )
 
 
-def _duration(settings: MappingNode, key: str) -> Located[int] | None:
-    written = optional_text(settings, key)
-    return Located(UnsoundError.guard(parse_duration, written), written.span) if written else None
+def _collect(entry: Entry) -> Collect:
+    settings = mapping(entry.value)
+    return Collect(
+        span=entry.key.span,
+        by=expression(settings.get("by")),
+        count=expression(settings.get("count")),
+        order=expression(settings.get("order")),
+        timeout=needed_duration(settings, "timeout"),
+    )
 
 
-def _max_rate(settings: MappingNode) -> Located[float] | None:
-    node = settings.get("max_rate")
-    if node is None:
-        return None
-    found = scalar(node)
-    if found.value is None or isinstance(found.value, bool):
-        raise TypeError(f"a rate, not {found.value!r}")
-    written: Located[str | float] = Located(found.value, found.span)
-    return Located(UnsoundError.guard(parse_rate, written), found.span)
-
-
-def _when(settings: MappingNode) -> Expression | None:
-    node = settings.get("when")
-    return _expression(node) if node else None
-
-
-def _fields(settings: MappingNode) -> FieldMap | None:
-    entry = settings.entries.get("fields")
-    if entry is None:
-        return None
-    if isinstance(entry.value, ScalarNode):
-        return FieldMap(entry.value.span, auto=True, entries=())
-    written = mapping(entry.value)
-    own = MappingNode(written.span, {key: member for key, member in written.entries.items() if key != AUTO})
-    return FieldMap(entry.key.span, auto=boolean(written, AUTO), entries=tuple(_entries(own, (), ())))
-
-
-def _entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[SourceSpan, ...]) -> Iterator[FieldEntry]:
-    for name, entry in fields.entries.items():
-        inner = (*path, *name.split("."))
-        inner_spans = (*spans, *_part_spans(entry.key))
-        if isinstance(entry.value, MappingNode):
-            yield from _entries(entry.value, inner, inner_spans)
-        else:
-            yield FieldEntry(inner, inner_spans, _expression(entry.value))
-
-
-def _part_spans(key: ScalarNode) -> Iterator[SourceSpan]:
-    """The places of the names between the dots of a key; the whole key where its text is not verbatim."""
-    start = 0
-    for part in key.text.split("."):
-        yield key.place.part(start, start + len(part))
-        start += len(part) + 1
-
-
-def _expression(node: Node) -> Expression:
-    if isinstance(node, SequenceNode):
-        return Expression("", TextPlace(node.span), tuple(map(_expression, node.items)))
-    found = scalar(node)
-    return Expression(found.text, found.place)
+def _priority(settings: MappingNode) -> Located[Priority] | None:
+    written = optional_text(settings, "priority")
+    return Located(Priority(written.value), written.span) if written else None

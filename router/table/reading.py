@@ -12,6 +12,7 @@ from typing import TypeVar
 from router.errors import Code, Diagnostic
 from router.table.model import Located
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.table.units import parse_duration
 
 V = TypeVar("V")
 R = TypeVar("R")
@@ -88,3 +89,14 @@ def boolean(settings: MappingNode, key: str) -> bool:
     """A truth value that is false unless it is given."""
     node = settings.get(key)
     return node is not None and scalar(node).value is True
+
+
+def duration(settings: MappingNode, key: str) -> Located[int] | None:
+    """An optional duration in ns."""
+    return needed_duration(settings, key) if settings.get(key) else None
+
+
+def needed_duration(settings: MappingNode, key: str) -> Located[int]:
+    """A duration in ns."""
+    written = text(settings, key)
+    return Located(UnsoundError.guard(parse_duration, written), written.span)

@@ -25,7 +25,8 @@ _TYPES = {
     "boolean": "true or false",
 }
 _LONGEST = 60
-_ROUTE_KEY_DEPTH = len(("routes", "case", "key"))  # the only keys that others of their mapping rule out
+_NAME_DEPTH = len(("endpoints", "name"))
+_NAME_FIELDS = ("fields", "send")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,8 @@ def finding(misfit: Misfit, tree: Node) -> Diagnostic:
     if keyword == "uniqueItems":
         return _repeated(misfit, tree)
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
+    if keyword == "maxProperties":
+        return Diagnostic(span, code, f"{name} {_expected(misfit)}, and no other beside it")
     near = nearest(str(misfit.value), misfit.limit) if keyword == "enum" else None
     hint = f"did you mean '{near}'?" if near else ""
     if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
@@ -110,16 +113,22 @@ def _expected(misfit: Misfit) -> str:
 
 def _bad_name(misfit: Misfit, span: SourceSpan) -> Diagnostic:
     name = f"'{_clipped(str(misfit.value))}'"
-    if len(misfit.path) == _ROUTE_KEY_DEPTH:
+    if not _is_chosen(misfit.path):
         return Diagnostic(span, Code.UNKNOWN_KEY, f"{name} {_expected(misfit)}")
     return Diagnostic(span, Code.BAD_VALUE, f"the name {name} {_expected(misfit)}")
+
+
+def _is_chosen(path: Path) -> bool:
+    """The key at the path is a name that a person gave, not one of the keys that others of their mapping rule out."""
+    return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in _NAME_FIELDS)
 
 
 def _missing_key(misfit: Misfit, tree: Node) -> Diagnostic:
     missing = misfit.message.split("'")[1]  # jsonschema has one error for each key and names it nowhere else
     key = key_at(tree, misfit.path)
     span = key.span if key else _first_line(node_at(tree, misfit.path))
-    hint = "or say 'ignore: why'" if missing == "source" else ""
+    is_whole_case = missing == "source" and len(misfit.path) == _NAME_DEPTH
+    hint = "or say 'ignore: why'" if is_whole_case else ""
     return Diagnostic(span, Code.MISSING_KEY, f"{subject(misfit.path)} lacks the key '{missing}'", hint)
 
 

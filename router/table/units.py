@@ -9,11 +9,12 @@ import math
 import re
 from collections.abc import Mapping
 
-_QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,9}))? ?([A-Za-z]+)")
+_QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,9}))? ?([A-Za-z]+(?:/s)?)")
 _NANOSECONDS = {
     "ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "min": 60 * 10**9, "h": 3600 * 10**9,
 }  # fmt: skip
 _BYTES = {"B": 1, "kB": 1000, "KiB": 1 << 10, "MB": 10**6, "MiB": 1 << 20}
+_BYTES_PER_SECOND = {f"{unit}/s": size for unit, size in _BYTES.items()}
 _HERTZ = re.compile(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?Hz")
 
 MAX_DURATION = (1 << 63) - 1
@@ -21,6 +22,9 @@ MAX_DURATION = (1 << 63) - 1
 
 MAX_SIZE = (1 << 30) - 1
 """The largest receive buffer that the kernel takes, which doubles what it is asked for."""
+
+MAX_DATA_RATE = 10**12
+"""More than any link carries; what is multiplied with nanoseconds stays a small integer."""
 
 
 def parse_duration(text: str) -> int:
@@ -31,6 +35,11 @@ def parse_duration(text: str) -> int:
 def parse_size(text: str) -> int:
     """`4MiB` or `64kB` as bytes."""
     return _exact(text, _BYTES, "bytes", MAX_SIZE)
+
+
+def parse_data_rate(text: str) -> int:
+    """`500kB/s` as bytes per second."""
+    return _exact(text, _BYTES_PER_SECOND, "bytes per second", MAX_DATA_RATE)
 
 
 def parse_rate(value: str | float) -> float:

@@ -95,7 +95,7 @@ def test_the_tables_of_the_repository_are_underlined_nowhere_but_for_what_they_i
         ("192.168.0.10:9000", "192.168.0.10:70000", "192.168.0.10:70000", "must be an IPv4 address and a port"),
         ("${DEPTH:-10}", "ten", ": ten", 'Incorrect type. Expected "integer"'),
         ("zero_trimmed", "zero_trimed", "zero_trimed", 'Valid values: "zero_trimmed", "exact"'),
-        ("500ms", "500 millis", "500 millis", "must be a duration with its unit"),
+        ("500ms", "500 millis", "500 millis", "must be a duration above zero with its unit"),
         ("    source: [sensor_board]\n", "", "imu_info", 'Missing property "source"'),
         ("ignore: nobody", "source: ros, ignore: nobody", "source: ros", "has no place beside 'ignore'"),
     ],
