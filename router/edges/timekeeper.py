@@ -61,16 +61,21 @@ class Timekeeper:
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends the thread. What is guarded can still be called, for last words, but nothing becomes due any more."""
+        """Ends the thread, and then the machines: those first that were added last and may hand on to earlier ones."""
         with self._lock:
             self._stopping = True
             self._sooner.notify()
-        self._thread.join()
+        if self._thread.ident is not None:  # it was started
+            self._thread.join()
+        with self._lock:
+            for machine in reversed(self._machines):
+                machine.end(self._clock_ns())
 
     def _run(self) -> None:
         with self._lock:
             while not self._stopping:
-                self._waits_until = min(map(self._serve, self._machines), default=_NEVER)
+                # The last that was added first: it may hand on to earlier ones.
+                self._waits_until = min(map(self._serve, reversed(self._machines)), default=_NEVER)
                 self._sooner.wait((self._waits_until - self._clock_ns()) / 1e9)
 
     def _serve(self, machine: Machine) -> int:

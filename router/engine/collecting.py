@@ -81,6 +81,11 @@ class Collector(Machine):
             self._closed.popitem(last=False)
         self._set_due()
 
+    def end(self, now: int) -> None:
+        while self._frames:
+            self._close_oldest(now)
+        self._set_due()
+
     def _open(self, now: int, key: Hashable, count: int) -> _Frame:
         if len(self._frames) == MOST_FRAMES:
             self._close_oldest(now)

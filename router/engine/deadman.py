@@ -84,7 +84,7 @@ class Deadman:
         self._send()
         self._changed(self._plan.route, True)
 
-    def end(self) -> None:
+    def end(self, now: int) -> None:
         """Orderly shutdown: sends a last time unless no command ever came. Then nothing is due any more."""
         if self.next_due is not None:
             self.next_due = None

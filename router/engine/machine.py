@@ -24,6 +24,9 @@ class Machine(Protocol):
     def due(self, now: int) -> None:
         """Does what is due at `now`, if anything is, and sets `next_due` to a time after `now`."""
 
+    def end(self, now: int) -> None:
+        """The last call: settles what the machine still holds, so that nothing is lost without being counted."""
+
 
 class Guard(Protocol):
     """Has `machine` served from now on, and returns `call`, one of its methods, as others may call it meanwhile."""

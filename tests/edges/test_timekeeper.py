@@ -26,6 +26,7 @@ class Bell:
         self.name = name
         self.error: Exception | None = None
         self.calls = 0
+        self.ended: list[str] = []
         self._rung = rung
         self._busy = threading.Lock()
 
@@ -44,6 +45,10 @@ class Bell:
         if self.error is not None:
             raise self.error
         self.next_due = None
+
+    def end(self, now: int) -> None:
+        self.next_due = None
+        self.ended.append(self.name)
 
 
 class Keeping:
@@ -99,6 +104,23 @@ def test_what_another_machine_is_handed_wakes_the_thread_too(keeping: Keeping) -
     assert keeping.heard() == "second"
 
 
+def test_what_a_machine_hands_on_when_it_is_due_is_seen_to(keeping: Keeping) -> None:
+    """It was added after the one that it hands on to, as whoever wires them up has it at hand by then."""
+    second = Bell(keeping.rung, "second")
+
+    class HandsOn(Bell):
+        def due(self, now: int) -> None:
+            super().due(now)
+            second.ring_at(now)
+
+    first = HandsOn(keeping.rung, "first")
+    first.next_due = monotonic_ns()
+    keeping.keeper.add(second)
+    keeping.keeper.add(first)
+    keeping.start()
+    assert [keeping.heard(), keeping.heard()] == ["first", "second"]
+
+
 def test_machines_are_served_in_the_order_of_their_times(keeping: Keeping) -> None:
     names = ["third", "first", "second"]
     now = monotonic_ns()
@@ -125,8 +147,8 @@ def test_a_failure_is_handed_over_and_the_other_machines_are_served(keeping: Kee
     broken, sound = Bell(keeping.rung, "broken"), Bell(keeping.rung, "sound")
     broken.error = LookupError("a bug")
     broken.next_due = sound.next_due = monotonic_ns()
-    keeping.keeper.add(broken)
     keeping.keeper.add(sound)
+    keeping.keeper.add(broken)
     keeping.start()
     assert [keeping.heard(), keeping.heard()] == ["broken", "sound"]
     assert keeping.failures.get(timeout=PATIENCE) is broken.error

@@ -135,6 +135,13 @@ def test_a_part_that_tells_another_count_opens_a_new_frame(frames: Frames) -> No
     assert frames.counted == {"messages_collected": 2, "incomplete": 1, "messages_published": 1}
 
 
+def test_at_the_end_what_is_open_is_incomplete(frames: Frames) -> None:
+    frames.offer(("a", 3, 0), ("a", 3, 1), ("b", 2, 0))
+    frames.collector.end(MS)
+    assert frames.counted == {"messages_collected": 1, "incomplete": 2}
+    assert frames.collector.next_due is None
+
+
 # ---- hostile numbers
 
 
@@ -167,11 +174,12 @@ def test_the_oldest_frame_makes_room_for_a_new_one(frames: Frames) -> None:
 
 
 def test_the_oldest_frame_makes_room_for_more_parts(frames: Frames) -> None:
-    half = MOST_PARTS // 2
-    frames.offer(*parts_of("a", half + 2)[:-1])
-    frames.offer(*parts_of("b", half + 1))
-    assert frames.complete == [parts_of("b", half + 1)]
+    frames.offer(*parts_of("a", MOST_PARTS)[1:], ("b", 3, 0))
+    assert "incomplete" not in frames.counted
+    frames.offer(("b", 3, 1))
     assert frames.counted["incomplete"] == 1
+    frames.offer(("b", 3, 2))
+    assert frames.complete == [parts_of("b", 3)]
 
 
 class Alive:

@@ -73,7 +73,7 @@ class Watched:
 def test_without_a_command_nothing_is_ever_due() -> None:
     watched = Watched()
     watched.due(10**12)
-    watched.deadman.end()
+    watched.deadman.end(0)
     assert (watched.deadman.next_due, watched.sent, watched.told) == (None, [], [])
 
 
@@ -157,7 +157,7 @@ def test_at_the_end_it_sends_once_more_and_then_nothing(now: int) -> None:
     watched.feed(0)
     watched.run(now)
     watched.sent.clear()
-    watched.deadman.end()
+    watched.deadman.end(0)
     watched.run(10**6)
     assert [endpoint for _, endpoint, _ in watched.sent] == ["driving_board", "arm_board"]
 

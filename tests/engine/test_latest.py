@@ -81,6 +81,18 @@ def test_it_is_not_disturbed_by_being_called_too_early() -> None:
     assert held.arrived == [(0, 0), (50 * MS, 1)]
 
 
+def test_at_the_end_what_is_held_goes_ahead_of_its_time_unless_it_is_too_old() -> None:
+    for expires, arrived in ((20 * MS, [(0, 0), (20 * MS, 1)]), (20 * MS - 1, [(0, 0)])):
+        held = Held(10)
+        held.offer(0, 0)
+        held.offer(10 * MS, 1, expires)
+        held.latest.end(20 * MS)
+        held.latest.end(20 * MS)
+        assert held.arrived == arrived
+        assert held.latest.next_due is None
+        assert held.destination.counted().get("stale", 0) == 2 - len(arrived)
+
+
 @given(st.integers(1, 100), st.floats(1, 20), st.integers(0, 8 * NS))
 def test_a_stream_above_the_rate_comes_down_to_it_in_every_second(hertz: int, factor: float, start: int) -> None:
     held = Held(hertz)

@@ -158,6 +158,17 @@ def test_with_a_small_budget_two_kilobytes_of_commands_go_ahead() -> None:
     assert link.bytes_sent == 2100
 
 
+def test_at_the_end_all_that_waits_and_is_fresh_goes_by_priority() -> None:
+    link = Link(10_000)
+    link.offer(BULK, 5000)
+    bulk, stale, telemetry = link.offer(BULK), link.offer(BULK, expires=0), link.offer(TELEMETRY)
+    link.now = MS
+    link.pacer.end(MS)
+    assert link.numbers == [0, telemetry, bulk]
+    assert link.fate(stale) == "stale"
+    assert link.pacer.next_due is None
+
+
 # ---- what is dropped
 
 
