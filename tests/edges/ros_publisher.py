@@ -40,9 +40,9 @@ class Publisher(RosProcess):
         self.process.stdin.writelines(f"{cdr.hex()}\n" for cdr in messages)
         self.process.stdin.flush()
 
-    def publish_and_wait(self, messages: Iterable[bytes]) -> None:
-        """The subscribers have them all when this returns, in their queues at least."""
-        self.publish([*messages, b""])
+    def await_receipt(self) -> None:
+        """Subscribers have all that was published when this returns, in their queues at least."""
+        self.publish([b""])
         assert self.line() == "acknowledged"
 
 

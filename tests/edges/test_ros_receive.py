@@ -105,7 +105,9 @@ def test_late_joining_gets_what_was_kept() -> None:
 
 def test_nothing_is_received_before_the_start_and_nothing_is_lost(publisher: Publish) -> None:
     with Receiver(string_topic()) as receiver:
-        publisher("greeting").publish_and_wait([HELLO])
+        peer = publisher("greeting")
+        peer.publish([HELLO])
+        peer.await_receipt()
         assert receiver.messages == []
         receiver.start()
         wait_until(lambda: receiver.of("greeting") == [HELLO])
@@ -113,8 +115,11 @@ def test_nothing_is_received_before_the_start_and_nothing_is_lost(publisher: Pub
 
 def test_a_long_queue_keeps_other_topics_waiting_for_one_turn_only(publisher: Publish) -> None:
     with Receiver(string_topic(DEEP, "many"), string_topic(RELIABLE, "few")) as receiver:
-        publisher("many").publish_and_wait([HELLO] * DEEP.depth)
-        publisher("few").publish_and_wait([HELLO])
+        many, few = publisher("many"), publisher("few")
+        many.publish([HELLO] * DEEP.depth)
+        few.publish([HELLO])
+        many.await_receipt()
+        few.await_receipt()
         receiver.start()
         wait_until(lambda: len(receiver.messages) == DEEP.depth + 1)
     assert receiver.messages.index(("few", HELLO)) <= TURN
@@ -133,9 +138,10 @@ def test_what_has_arrived_is_received_before_receiving_stops(publisher: Publish)
     with closing(open_ros(subscriptions=[string_topic(DEEP)])) as ros:
         ros.start({"greeting": receive}, raising)
         peer = publisher("greeting")
-        peer.publish_and_wait(burst[:1])
+        peer.publish(burst[:1])
         first.wait()
-        peer.publish_and_wait(burst[1:])
+        peer.publish(burst[1:])
+        peer.await_receipt()
         stopping = threading.Thread(target=ros.stop_receiving)
         stopping.start()
         go_on.set()
