@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import explained, positive
+from router.errors import TableError
 
 if TYPE_CHECKING:
     from router.tools.sim_view import SimView
@@ -19,14 +20,18 @@ if TYPE_CHECKING:
 TERMINAL_REFRESH = 0.5
 JSON_REFRESH = 0.5
 LINE_REFRESH = 5.0
-"""Seconds between two looks at the statistics, by who looks."""
+CHANGE_REFRESH = 0.1
+"""Seconds between two looks at the statistics, by who looks and what for."""
+
+CHANGES_SHOWN = 3
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "sim",
         help=VERBS["sim"],
-        description="Send plausible, moving values from every endpoint of a table and show what comes back to it. "
+        description="Send plausible, moving values from every endpoint of a table and show what each receives. "
+        "Boards obey commands, halt for a deadman, and stop when left alone for a second. "
         "The endpoints' addresses must be this machine's, as they are in routes/sim.yaml.",
     )
     default = Path("routes/sim.yaml")
@@ -36,18 +41,31 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--duration", type=positive, metavar="SECONDS", help="how long (default: until Ctrl-C)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="the same seed sends the same values")
     parser.add_argument("--rate-scale", type=positive, default=1.0, metavar="X", help="2 sends twice as often")
+    parser.add_argument(
+        "--silent",
+        action="append",
+        default=[],
+        metavar="NAME:FROM-TO",
+        help="an endpoint or payload case that says nothing from second FROM to second TO, again and again if you "
+        "like: --silent basestation:5-8 is a lost link; without TO for ever",
+    )
     parser.add_argument("--json", action="store_true", help="statistics as JSON lines, the last one final")
 
 
 @explained
 def run(args: argparse.Namespace) -> int:
+    from router.compiler import check_table
     from router.tools.sim_view import SimView
     from router.tools.simulator import Simulator
-    from router.tools.wire import read_table, wire_of_table
+    from router.tools.streams import parse_silence
+    from router.tools.wire import Wire
 
-    table = read_table(args.table)
-    wire = wire_of_table(table)
-    simulator = Simulator(wire, table, args.seed, args.rate_scale)
+    silences = [parse_silence(text) for text in args.silent]
+    checked = check_table(args.table)
+    if checked.program is None:
+        raise TableError(checked.diagnostics)
+    wire, program = Wire(checked.program.envelope), checked.program
+    simulator = Simulator(wire, program.table, args.seed, args.rate_scale, deadmen=program.deadmen, silences=silences)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: simulator.stop())
     view = SimView(wire, simulator.statistics)
@@ -67,12 +85,23 @@ def _show_json(simulator: Simulator, view: SimView, args: argparse.Namespace) ->
 
 
 def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
+    """A line now and then, and one for each change of a board."""
+    told, due = 0.0, LINE_REFRESH
+
     def write(seconds: float) -> None:
-        view.look(seconds)
-        print(view.line(), flush=True)
+        nonlocal told, due
+        for change in view.changes(since=told):
+            print(change, flush=True)
+        told = seconds
+        if seconds >= due:
+            due += LINE_REFRESH
+            view.look(seconds)
+            print(view.line(), flush=True)
 
     print(f"{simulator.summary}; Ctrl-C ends it", flush=True)
-    write(simulator.run(args.duration, LINE_REFRESH, write))
+    seconds = simulator.run(args.duration, CHANGE_REFRESH, write)
+    due = seconds
+    write(seconds)
 
 
 def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
@@ -86,10 +115,14 @@ def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace
 
         def draw(seconds: float) -> None:
             view.look(seconds)
-            title = f"{simulator.summary}; Ctrl-C ends it"
-            live.update(Group(Text(title, style="bold"), view.headline(), view.table(console.height - 3)), refresh=True)
+            title = Text(f"{simulator.summary}; Ctrl-C ends it", style="bold", no_wrap=True, overflow="ellipsis")
+            conditions = view.conditions()
+            changes = [Text(str(change), style="dim") for change in view.changes(since=0)[-CHANGES_SHOWN:]]
+            room = console.height - 2 - conditions.row_count - len(changes)
+            live.update(Group(title, view.headline(), conditions, view.table(room), *changes), refresh=True)
 
         seconds = simulator.run(args.duration, TERMINAL_REFRESH, draw)
     view.look(seconds)
     console.print(view.table(1000))
-    console.print(view.line())
+    console.print(view.conditions())
+    console.print(view.headline())

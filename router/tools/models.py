@@ -124,6 +124,11 @@ def _manual_drive(now: Moment, noise: Noise) -> Values:
     return {"forward_backward": round(60 + 30 * math.sin(now.t / 8)), "turn": round(40 * math.sin(now.t / 5))}
 
 
+def _manual_brake(now: Moment, noise: Noise) -> Values:
+    """Off while the operator drives: a brake at the driving board is a deadman's."""
+    return {"brake": False}
+
+
 MODELS: Mapping[str, Callable[[Moment, Noise], Values]] = {
     "SensorBoardIMUInfo": _imu,
     "SensorBoardGPSInfo": _gps,
@@ -133,6 +138,7 @@ MODELS: Mapping[str, Callable[[Moment, Noise], Values]] = {
     "SensorBoardDiagnostics": _sensor_board,
     "MotorInformation": _motor,
     "BasestationManualDrive": _manual_drive,
+    "BasestationManualBrake": _manual_brake,
 }
 """By protobuf message; the fields that a model does not give move as their types allow."""
 

@@ -6,12 +6,15 @@ Remembers the counts of the last looks, to tell rates.
 from __future__ import annotations
 
 from collections import defaultdict, deque
+from collections.abc import Iterator
 from typing import Any
 
 from google.protobuf.json_format import MessageToDict
 from rich.table import Table
 from rich.text import Text
 
+from router.tools.board import Change, State
+from router.tools.inbox import Arrivals
 from router.tools.show import compact, rate_text
 from router.tools.simulator import Statistics
 from router.tools.wire import Wire
@@ -21,10 +24,13 @@ DIGITS = 4
 RATE_WINDOW = 3.0
 """Seconds; over less, one message in two seconds is no rate but a flicker."""
 
-Counts = dict[tuple[str, str], int]
+Key = tuple[str, str]
+"""Endpoint and payload case."""
 
 PATIENCE = 2.0
 """Seconds without an answer after which a missing router is the likely reason."""
+
+_STYLES = {State.WAITING: "dim", State.OBEYING: "green", State.HALTED: "bold yellow", State.STOPPED: "bold red"}
 
 
 class SimView:
@@ -33,30 +39,42 @@ class SimView:
     def __init__(self, wire: Wire, statistics: Statistics) -> None:
         self._wire = wire
         self._statistics = statistics
-        self._looks: deque[tuple[float, Counts]] = deque([(0.0, {})])
-        self._rates: dict[tuple[str, str], float] = {}
+        self._looks: deque[tuple[float, dict[Key, int]]] = deque([(0.0, {})])
+        self._rates: dict[Key, float] = {}
 
     def look(self, seconds: float) -> None:
         """Compute the rates over the last RATE_WINDOW seconds, or since the last look; `seconds` since the start."""
-        counts = {key: arrivals.count for key, arrivals in self._statistics.received.items()}
+        counts = {key: arrivals.count for key, arrivals in self._arrivals()}
         while len(self._looks) > 1 and seconds - self._looks[1][0] >= RATE_WINDOW:
             self._looks.popleft()
         before_at, before = self._looks[0]
         self._rates = {key: (count - before.get(key, 0)) / (seconds - before_at) for key, count in counts.items()}
         self._looks.append((seconds, counts))
 
+    def _arrivals(self) -> Iterator[tuple[Key, Arrivals]]:
+        for endpoint, inbox in self._statistics.inboxes.items():
+            for case, arrivals in inbox.arrivals.items():
+                yield (endpoint, case), arrivals
+
+    @property
+    def _seconds(self) -> float:
+        return self._looks[-1][0]
+
+    def changes(self, since: float) -> list[Change]:
+        """How the boards' states have changed after `since`, seconds since the start."""
+        return [change for change in self._statistics.changes if change.at > since]
+
     def headline(self) -> str:
-        """What went out and what came back, in one line."""
+        """What went out and what was received, in one line."""
         statistics = self._statistics
         sent = sum(statistics.sent.values())
-        received = sum(arrivals.count for arrivals in statistics.received.values())
-        seconds = self._looks[-1][0]
-        line = f"{seconds:.0f} s: sent {sent}, came back {received}"
-        if not received and seconds > PATIENCE:
+        received = sum(arrivals.count for _, arrivals in self._arrivals())
+        line = f"{self._seconds:.0f} s: sent {sent}, received {received}"
+        if not received and self._seconds > PATIENCE:
             line += " (is the router running with this table?)"
         if statistics.unsent:
             line += f", refused by the kernel {statistics.unsent}"
-        if undecodable := sum(statistics.undecodable.values()):
+        if undecodable := sum(inbox.undecodable for inbox in statistics.inboxes.values()):
             line += f", undecodable {undecodable}"
         return line
 
@@ -68,7 +86,30 @@ class SimView:
             counts[endpoint] += count
             rates[endpoint] += self._rates[endpoint, case]
         parts = [f"{endpoint} {counts[endpoint]} ({rate_text(rates[endpoint])}/s)" for endpoint in sorted(counts)]
+        parts += [f"{endpoint} {told}" for endpoint, told, _ in self._conditions()]
         return self.headline() + (f"; {', '.join(parts)}" if parts else "")
+
+    def _conditions(self) -> Iterator[tuple[str, str, str]]:
+        """Endpoint, in which condition it is, and the style of that."""
+        for endpoint, inbox in self._statistics.inboxes.items():
+            if inbox.board is not None:
+                yield endpoint, inbox.board.told(self._seconds), _STYLES[inbox.board.state]
+            for case, frames in inbox.frames.items():
+                told = f"{case}: {frames.complete} frames complete, {frames.incomplete} incomplete"
+                if frames.astray:
+                    told += f", {frames.astray} objects of no possible frame"
+                yield endpoint, told, "yellow" if frames.incomplete or frames.astray else "green"
+            if inbox.undecodable:
+                yield endpoint, f"{inbox.undecodable} undecodable datagrams", "bold red"
+
+    def conditions(self) -> Table:
+        """What boards make of their commands, and the basestation of frames: one line each."""
+        table = Table(box=None, pad_edge=False, show_header=False, expand=True)
+        table.add_column(no_wrap=True)
+        table.add_column(no_wrap=True, ratio=1, overflow="ellipsis")
+        for endpoint, told, style in self._conditions():
+            table.add_row(Text(endpoint, style="cyan"), Text(told, style=style))
+        return table
 
     def table(self, height: int) -> Table:
         """One line for each endpoint and payload case, at most `height` with the header."""
@@ -77,34 +118,54 @@ class SimView:
         table.add_column("received", no_wrap=True)
         table.add_column("count", justify="right", no_wrap=True)
         table.add_column("/s", justify="right", no_wrap=True)
+        table.add_column("age", justify="right", no_wrap=True)
         table.add_column("last value", no_wrap=True, ratio=1, overflow="ellipsis")
-        rows = sorted(self._statistics.received.items())
+        rows = sorted(self._arrivals(), key=lambda row: row[0])
         shown = rows if len(rows) < height else rows[: max(height - 2, 0)]
         for (endpoint, case), arrivals in shown:
             rate = self._rates.get((endpoint, case), 0.0)
             last = Text(compact(arrivals.last, self._wire.case(case).type, digits=DIGITS), style="dim")
-            table.add_row(Text(endpoint, style="cyan"), case, str(arrivals.count), rate_text(rate), last)
+            age = f"{self._seconds - arrivals.at:.1f}"
+            table.add_row(Text(endpoint, style="cyan"), case, str(arrivals.count), rate_text(rate), age, last)
         if len(shown) < len(rows):
             table.add_row(Text(f"and {len(rows) - len(shown)} more", style="dim"))
         return table
 
     def as_json(self, seconds: float, final: bool) -> dict[str, Any]:
-        """All statistics; payloads in protobuf's JSON mapping with the names of the `.proto` files."""
+        """All statistics; payloads in protobuf's JSON mapping with the names of the `.proto` files.
+
+        Times and ages in seconds. `boards` are the states, `changes` how they came about, the newest last.
+        """
+        inboxes = self._statistics.inboxes
         received: dict[str, dict[str, Any]] = defaultdict(dict)
-        for (endpoint, case), arrivals in self._statistics.received.items():
+        for (endpoint, case), arrivals in self._arrivals():
             last = MessageToDict(arrivals.last, preserving_proto_field_name=True)
-            received[endpoint][case] = {"count": arrivals.count, "last": last}
+            age = round(seconds - arrivals.at, 3)
+            received[endpoint][case] = {"count": arrivals.count, "age": age, "last": last}
         return {
             "seconds": round(seconds, 3),
             "final": final,
             "sent": _nested(self._statistics.sent),
             "unsent": self._statistics.unsent,
             "received": received,
-            "undecodable": self._statistics.undecodable,
+            "undecodable": {name: inbox.undecodable for name, inbox in inboxes.items() if inbox.undecodable},
+            "boards": {name: inbox.board.state.value for name, inbox in inboxes.items() if inbox.board},
+            "frames": {
+                name: {
+                    case: {"complete": frames.complete, "incomplete": frames.incomplete, "astray": frames.astray}
+                    for case, frames in inbox.frames.items()
+                }
+                for name, inbox in inboxes.items()
+                if inbox.frames
+            },
+            "changes": [
+                {"at": round(change.at, 3), "board": change.board, "state": change.state.value, "text": change.text}
+                for change in self._statistics.changes
+            ],
         }
 
 
-def _nested(counts: dict[tuple[str, str], int]) -> dict[str, dict[str, int]]:
+def _nested(counts: dict[Key, int]) -> dict[str, dict[str, int]]:
     nested: dict[str, dict[str, int]] = defaultdict(dict)
     for (first, second), count in counts.items():
         nested[first][second] = count

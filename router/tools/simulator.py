@@ -1,99 +1,79 @@
 """All boards and the basestation of a route table on one machine, over real UDP.
 
-Each endpoint binds its own address, sends what the table names it as the source of, and counts what comes
-back. Who looks at that is not known here (see `sim_view`).
+Each endpoint binds its own address, sends what the table names it as the source of, and takes what it is sent.
+Who looks at that is not known here (see `sim_view`).
 """
 
 from __future__ import annotations
 
 import heapq
-import random
 import selectors
 import socket
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from google.protobuf.message import Message
-
-from router.errors import DecodeError, did_you_mean
-from router.table.model import ANY, Address, Endpoint, RouteTable
-from router.tools import UsageError
-from router.tools.models import moment, usual_rate
+from router.compiler.program import DeadmanPlan
+from router.table.model import Address, Endpoint, RouteTable
+from router.tools.board import Change, boards
+from router.tools.inbox import Inbox
+from router.tools.models import moment
 from router.tools.payload_model import PayloadModel
 from router.tools.places import LOOPBACK, open_udp, reachable
+from router.tools.streams import STRANGER, Silence, check_silences, streams
 from router.tools.wire import Wire
-from router.types.protobuf import PayloadCase
-
-STRANGER = "(anybody)"
-"""Who sends the payload cases that the table takes from any source."""
 
 LARGEST_DATAGRAM = 65_507
 DRAIN = 256
 """Datagrams taken from one socket before the others, and the sending, have their turn."""
 
 PATIENCE = 0.2
-"""Seconds after which `stop` is noticed at the latest."""
+"""Seconds after which `stop`, and that commands are missing, is noticed at the latest."""
 
 LATE = 1.0
 """Seconds behind schedule after which messages are left out rather than sent in a burst."""
 
-
-@dataclass(frozen=True, slots=True)
-class Stream:
-    """One payload case that one endpoint sends, at `rate` Hz, the first after `offset` seconds."""
-
-    endpoint: str
-    case: PayloadCase
-    rate: float
-    offset: float
-
-
-def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iterator[Stream]:
-    """What the table's UDP sources send, in the order of the table. Raises UsageError for an unknown name."""
-    for route in table.routes:
-        if route.is_outbound:
-            continue
-        case = wire.case(route.case.value)
-        rate = usual_rate(case.name) * rate_scale
-        for source in route.sources:
-            sender = STRANGER if source.value == ANY else source.value
-            if sender != STRANGER and sender not in table.endpoints:
-                hint = did_you_mean(sender, table.endpoints)
-                raise UsageError(f"{source.span}: there is no endpoint '{sender}'; {hint}")
-            offset = random.Random(f"{seed}/{case.name}/{sender}").uniform(0, 1 / rate)
-            yield Stream(sender, case, rate, offset)
-
-
-@dataclass(slots=True)
-class Arrivals:
-    """What one endpoint received of one payload case."""
-
-    last: Message
-    count: int = 0
+MOST_CHANGES = 100
+"""The newest changes of boards that are kept."""
 
 
 @dataclass(slots=True)
 class Statistics:
-    """Counts since the start, by endpoint and payload case.
+    """What happened since the start. `sent` is by endpoint and payload case, `inboxes` by endpoint.
 
-    `unsent` are datagrams that the kernel refused to take; `undecodable` ones are by endpoint.
+    `unsent` are datagrams that the kernel refused to take. `changes` are those of the boards, the newest last.
     """
 
     sent: dict[tuple[str, str], int] = field(default_factory=lambda: defaultdict(int))
     unsent: int = 0
-    received: dict[tuple[str, str], Arrivals] = field(default_factory=dict)
-    undecodable: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    inboxes: dict[str, Inbox] = field(default_factory=dict)
+    changes: deque[Change] = field(default_factory=lambda: deque(maxlen=MOST_CHANGES))
 
 
 class Simulator:
-    """Plays the endpoints of a table. Binds every address at once; raises UsageError when one cannot be had."""
+    """Plays the endpoints of a table. Binds every address at once; raises UsageError when one cannot be had.
 
-    def __init__(self, wire: Wire, table: RouteTable, seed: int, rate_scale: float = 1.0) -> None:
+    `deadmen` are those of the program that the table compiles to: a board knows what they send.
+    """
+
+    def __init__(
+        self,
+        wire: Wire,
+        table: RouteTable,
+        seed: int,
+        rate_scale: float = 1.0,
+        *,
+        deadmen: Sequence[DeadmanPlan] = (),
+        silences: Sequence[Silence] = (),
+    ) -> None:
         self.statistics = Statistics()
+        played = boards(wire, table, deadmen, self.statistics.changes.append)
+        self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
         self._streams = tuple(streams(wire, table, seed, rate_scale))
+        self._silences = silences
+        check_silences(silences, self._streams)
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed) for stream in self._streams]
         self._router = reachable(next(iter(table.listeners.values())).address.value)
         self._selector = selectors.DefaultSelector()
@@ -121,7 +101,7 @@ class Simulator:
         receiver = sender = self._open(address, endpoint.name)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
             sender = self._open(Address(address.host, endpoint.source_port.value), endpoint.name)
-        self._selector.register(receiver, selectors.EVENT_READ, (receiver, endpoint.name))
+        self._selector.register(receiver, selectors.EVENT_READ, (receiver, self.statistics.inboxes[endpoint.name]))
         self._senders[endpoint.name] = sender
 
     def _open(self, address: Address, owner: str) -> socket.socket:
@@ -158,8 +138,11 @@ class Simulator:
                 next_report = max(next_report + every, now)
             wake = min(now + PATIENCE, next_report, *(at for at, _ in due[:1]))
             for key, _ in self._selector.select(max(0.0, wake - (time.monotonic() - start))):
-                self._receive(*key.data)
+                receiver, inbox = key.data
+                self._receive(receiver, inbox, time.monotonic() - start)
             now = time.monotonic() - start
+            for inbox in self.statistics.inboxes.values():
+                inbox.look(now)
         return now
 
     def _next(self, at: float, rate: float, now: float) -> float:
@@ -169,6 +152,8 @@ class Simulator:
 
     def _send(self, index: int, at: float, epoch: float) -> None:
         stream = self._streams[index]
+        if any(silence.covers(stream, at) for silence in self._silences):
+            return
         message = stream.case.message_class()
         self._models[index].fill(message, moment(at, epoch))
         try:
@@ -178,18 +163,10 @@ class Simulator:
         else:
             self.statistics.sent[stream.endpoint, stream.case.name] += 1
 
-    def _receive(self, receiver: socket.socket, endpoint: str) -> None:
+    def _receive(self, receiver: socket.socket, inbox: Inbox, now: float) -> None:
         for _ in range(DRAIN):
             try:
                 data = receiver.recv(LARGEST_DATAGRAM)
             except BlockingIOError:
                 return
-            try:
-                decoded = self._wire.decode(data)
-            except DecodeError:
-                self.statistics.undecodable[endpoint] += 1
-            else:
-                key = endpoint, decoded.case.name
-                arrivals = self.statistics.received.setdefault(key, Arrivals(decoded.message))
-                arrivals.count += 1
-                arrivals.last = decoded.message
+            inbox.take(now, data)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 import threading
 from collections.abc import Callable
@@ -11,9 +12,11 @@ import pytest
 
 from router.table.model import RouteTable
 from router.tools import UsageError
+from router.tools.board import State
 from router.tools.places import LOOPBACK, open_udp, reachable
 from router.tools.sim_view import SimView
-from router.tools.simulator import Simulator, streams
+from router.tools.simulator import Simulator
+from router.tools.streams import Silence, streams
 from router.tools.wire import Wire, read_table
 
 FAST = 100.0
@@ -63,12 +66,13 @@ def test_what_comes_back_is_counted_by_endpoint_and_case(wire: Wire, table: Rout
     ):
         for data in (bytes.fromhex("0a021005"), bytes.fromhex("0a021006"), b"\xff"):
             peer.sendto(data, station)
-        statistics = simulator.statistics
-        simulate(simulator, lambda: bool(statistics.undecodable))
-        arrivals = statistics.received["station", "every_kind"]
-        assert (arrivals.count, list(statistics.received)) == (2, [("station", "every_kind")])
-        said = json.loads(json.dumps(SimView(wire, statistics).as_json(1.0, final=True)))
-        assert said["received"] == {"station": {"every_kind": {"count": 2, "last": {"i32": 6}}}}
+        inbox = simulator.statistics.inboxes["station"]
+        simulate(simulator, lambda: bool(inbox.undecodable))
+        assert {case: arrivals.count for case, arrivals in inbox.arrivals.items()} == {"every_kind": 2}
+        said = json.loads(json.dumps(SimView(wire, simulator.statistics).as_json(1.0, final=True)))
+        assert list(said["received"]) == ["station"]
+        every_kind = said["received"]["station"]["every_kind"]
+        assert (every_kind["count"], every_kind["last"]) == (2, {"i32": 6})
         assert said["undecodable"] == {"station": 1}
 
 
@@ -97,6 +101,30 @@ def test_rates_and_offsets_follow_from_seed_and_scale(wire: Wire, table: RouteTa
     assert first == again
     assert first != list(streams(wire, table, 6, 2.0))
     assert [stream.rate for stream in first] == [4.0, 4.0]
+
+
+def test_a_silent_endpoint_sends_nothing_and_others_go_on(wire: Wire, table: RouteTable) -> None:
+    silences = [Silence("station", 0.0, math.inf)]
+    with closing(Simulator(wire, table, seed=1, rate_scale=FAST, silences=silences)) as simulator:
+        simulate(simulator, lambda: simulator.statistics.sent["board", "every_kind"] > 5)
+        assert simulator.statistics.sent["station", "plain"] == 0
+
+
+def test_a_silence_of_nobody_is_named(wire: Wire, table: RouteTable) -> None:
+    with pytest.raises(UsageError, match=r"nothing is sent that 'statoin' could silence; did you mean 'station'\?"):
+        Simulator(wire, table, seed=1, silences=[Silence("statoin", 0.0, 1.0)])
+
+
+def test_a_board_tells_of_a_router_that_died(wire: Wire, table: RouteTable) -> None:
+    board = table.endpoints["board"].address.value
+    with (
+        closing(Simulator(wire, table, seed=1)) as simulator,
+        open_udp(reachable(board)._replace(port=0), "x") as router,
+    ):
+        router.sendto(bytes.fromhex("1200"), board)
+        changes = simulator.statistics.changes
+        simulate(simulator, lambda: len(changes) == 2)
+        assert [change.state for change in changes] == [State.OBEYING, State.STOPPED]
 
 
 def test_an_unknown_source_is_named(wire: Wire, table_path: Callable[..., Path]) -> None:

@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import pytest
+
+from router.compiler.program import DeadmanPlan
+from router.table.model import RouteTable
+from router.tools.board import Board, Change, State, Stop, boards
+from router.tools.wire import Decoded, Wire, payload
+
+
+def decoded(wire: Wire, case: str, *words: str) -> Decoded:
+    return Decoded(wire.case(case), payload(wire.case(case), words), 0)
+
+
+@pytest.fixture
+def changes() -> list[Change]:
+    return []
+
+
+@pytest.fixture
+def board(wire: Wire, changes: list[Change]) -> Board:
+    """Commands are `plain`; the deadman's `every_kind` with `i32` 1 holds for 0.3 s."""
+    stop = Stop("every_kind", payload(wire.case("every_kind"), ["i32=1"]), hold=0.3)
+    return Board("board", {"plain"}, [stop], changes.append)
+
+
+def test_a_board_without_commands_waits_for_ever(board: Board, changes: list[Change]) -> None:
+    board.look(1000.0)
+    assert (board.told(1000.0), changes) == ("no commands yet", [])
+
+
+def test_a_board_obeys_as_long_as_commands_come(wire: Wire, board: Board) -> None:
+    for tenth in range(0, 50, 9):
+        board.take(tenth / 10, decoded(wire, "plain"))
+        board.look(tenth / 10)
+    assert board.told(5.0) == "obeys commands"
+
+
+def test_a_board_left_alone_for_a_second_stops(wire: Wire, board: Board, changes: list[Change]) -> None:
+    board.take(2.0, decoded(wire, "plain"))
+    board.look(2.99)
+    assert board.state is State.OBEYING
+    board.look(3.0)
+    assert board.told(3.2) == "no commands for 1.2 s: stopped"
+    board.take(4.5, decoded(wire, "plain"))
+    assert [str(change) for change in changes] == [
+        "2.0 s: board obeys commands",
+        "3.0 s: board no commands for 1.0 s: stopped",
+        "4.5 s: board obeys commands again, after 1.5 s",
+    ]
+
+
+def test_a_deadman_halts_until_it_lets_go_and_a_command_comes(wire: Wire, board: Board) -> None:
+    stop, command = decoded(wire, "every_kind", "i32=1"), decoded(wire, "plain")
+    board.take(1.0, stop)
+    board.take(1.1, command)
+    assert board.told(1.2) == "halted by a deadman for 0.2 s: every_kind i32=1"
+    board.take(1.25, stop)
+    board.take(1.5, command)
+    assert board.told(1.9).startswith("halted by a deadman for 0.9 s")
+    board.take(2.1, command)
+    assert board.told(2.2) == "obeys commands"
+
+
+def test_a_deadman_that_dies_as_well_is_noticed(wire: Wire, board: Board) -> None:
+    board.take(1.0, decoded(wire, "every_kind", "i32=1"))
+    board.look(2.0)
+    assert board.state is State.STOPPED
+
+
+def test_what_is_neither_command_nor_stop_keeps_no_board_going(wire: Wire, board: Board) -> None:
+    board.take(1.0, decoded(wire, "plain"))
+    board.take(1.9, decoded(wire, "every_kind", "i32=2"))
+    board.look(2.0)
+    assert board.state is State.STOPPED
+
+
+def test_only_boards_that_are_told_something_play_one(wire: Wire, table: RouteTable) -> None:
+    assert list(boards(wire, table, [], print)) == ["board"]
+
+
+def test_a_board_knows_what_the_deadmen_send_it(wire: Wire, table: RouteTable, changes: list[Change]) -> None:
+    datagram = wire.encode(wire.case("every_kind"), payload(wire.case("every_kind"), ["i32=1"]))
+    plan = DeadmanPlan("plain", timeout=500_000_000, repeat=100_000_000, datagrams=(("board", datagram),))
+    board = boards(wire, table, [plan], changes.append)["board"]
+    board.take(0.0, decoded(wire, "every_kind", "i32=1"))
+    board.take(0.31, decoded(wire, "plain"))
+    assert [change.state for change in changes] == [State.HALTED, State.OBEYING]
