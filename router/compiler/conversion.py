@@ -10,11 +10,14 @@ import ast
 from router.compiler import scalars
 from router.compiler.expressions import Finding, Scope, Typed
 from router.compiler.implementations import NS_PER_SECOND
-from router.compiler.kinds import BytesKind, Kind, ListKind, MessageKind, TimeKind, kind_of
+from router.compiler.kinds import OCTET, BytesKind, Kind, ListKind, MessageKind, TimeKind, kind_of
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.syntax import load
 from router.errors import Code, SourceSpan
-from router.types.model import Field, Int, List, MessageType, Type
+from router.types.model import Field, List, MessageType, Type
+
+_TIMES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
+"""Messages that a time fills: whole seconds, and nanoseconds that are never negative."""
 
 
 def convert(value: Typed, target: Type, scope: Scope) -> Plan:
@@ -42,7 +45,7 @@ def unset(member: Field, span: SourceSpan) -> Unset:
 
 
 def _to_message(value: Typed, target: MessageType, scope: Scope) -> Plan:
-    if isinstance(value.kind, TimeKind) and target.name == "builtin_interfaces/msg/Time":
+    if isinstance(value.kind, TimeKind) and target.name in _TIMES:
         return _to_time(value, target)
     if isinstance(value.kind, MessageKind):
         return _to_same_named(value, value.kind.type, target, scope)
@@ -91,7 +94,7 @@ def _to_list(value: Typed, target: List, scope: Scope) -> Plan:
 def _elements(kind: Kind) -> tuple[Kind | None, int | None]:
     """The kind and number of a list's elements, each None where there is none or it is not known."""
     if isinstance(kind, BytesKind):
-        return kind_of(Int(8, signed=False)), None
+        return kind_of(OCTET), None
     return (kind.element, kind.length) if isinstance(kind, ListKind) else (None, None)
 
 

@@ -6,9 +6,12 @@ Called with plain Python values; knows neither kinds nor syntax. A value without
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sized
+from typing import TypeVar
 
 from router.errors import MappingError, NonFiniteError
+
+Values = TypeVar("Values", bound=Sized)
 
 NS_PER_SECOND = 1_000_000_000
 NS_PER_MILLISECOND = 1_000_000
@@ -91,3 +94,11 @@ def fit_wide_text(x: str, bound: int) -> str:
     if length <= bound:
         return x
     raise MappingError(f"{length} characters are more than {bound}")
+
+
+def fit_length(values: Values, least: int, most: int) -> Values:
+    """Passes a list of `least` to `most` elements."""
+    if least <= len(values) <= most:
+        return values
+    wanted = str(most) if least == most else f"at most {most}"
+    raise MappingError(f"{len(values)} elements where {wanted} fit")

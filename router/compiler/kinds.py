@@ -17,6 +17,9 @@ TIME_TYPES = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/D
 INT32 = Int(32, signed=True)
 """What an enum can be."""
 
+OCTET = Int(8, signed=False)
+"""What an element of bytes can be."""
+
 
 @dataclass(frozen=True, slots=True)
 class BoolKind:

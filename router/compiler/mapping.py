@@ -13,6 +13,7 @@ from typing import Union
 from router.compiler.conversion import convert, same_named, unset
 from router.compiler.expressions import Finding, Scope, Typed, check
 from router.compiler.plan import Plan, Record
+from router.compiler.presence import presence_findings
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.types.model import Field, MessageType, Type
@@ -63,6 +64,8 @@ def build(
         if automatic is not None:
             hint = f"{automatic.kind} and {target} have no field name in common; map the fields by hand"
         outcome.findings.append(Diagnostic(builder.span, Code.NOTHING_MAPPED, f"nothing fills {target}", hint))
+    if not outcome.findings:
+        outcome.findings += presence_findings(plan)
     return outcome
 
 

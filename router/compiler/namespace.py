@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from router.compiler.cdr.steps import HEADER
 from router.compiler.cdr.writers import put_length, put_numbers, put_text, put_wide_text, want_length
 from router.compiler.functions import FUNCTIONS
-from router.compiler.implementations import fit, fit_text, fit_wide_text
+from router.compiler.implementations import fit, fit_length, fit_text, fit_wide_text
 
 NAMESPACE: Mapping[str, object] = {
     **{name: function.implementation for name, function in FUNCTIONS.items()},
     "fit": fit,
+    "fit_length": fit_length,
     "fit_text": fit_text,
     "fit_wide_text": fit_wide_text,
     "HEADER": HEADER,

@@ -13,16 +13,19 @@ from router.compiler.expressions import Finding, Typed
 from router.compiler.implementations import FLOAT32_END, clamp
 from router.compiler.kinds import (
     INT32,
+    OCTET,
     BoolKind,
     BytesKind,
     EnumKind,
     FloatKind,
     IntKind,
+    Kind,
+    ListKind,
     StringKind,
     TimeKind,
 )
 from router.compiler.syntax import call, load, placed
-from router.errors import Code
+from router.errors import Code, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
 
 EXACT_INTEGER_BITS = {32: 24, 64: 53}
@@ -154,14 +157,42 @@ def _to_enum(value: Typed, target: Enum) -> ast.expr:
             return value.node
         case IntKind(bounds=bounds):
             return _fit(value, INT32, bounds)
+        case StringKind() if isinstance(value.constant, str):
+            return placed(ast.Constant(_number_of(value, value.constant, target)), value.span)
+        case StringKind():
+            return value.node  # protobuf takes names for numbers, and refuses those that it does not know
         case _:
             raise mismatch(value, target, f"name one of its values: {target.name}.{target.values[0][0]}")
 
 
+def _number_of(value: Typed, name: str, target: Enum) -> int:
+    numbers = dict(target.values)
+    if name not in numbers:
+        hint = did_you_mean(name, numbers)
+        raise Finding(value.span, Code.UNKNOWN_ENUM_VALUE, f"'{target}' has no value '{name}'", hint)
+    return numbers[name]
+
+
 def _to_bytes(value: Typed, target: Bytes) -> ast.expr:
-    if not isinstance(value.kind, BytesKind):
-        raise mismatch(value, target)
-    return value.node if target.bound is None else _limited("fit_text", value, target.bound)
+    match value.kind:
+        case BytesKind():
+            made = value
+        case ListKind(element, length) if element is None or _is_octet(element):
+            if target.bound is not None and length is not None and length > target.bound:
+                raise Finding(value.span, Code.OUT_OF_RANGE, f"{length} bytes do not fit {target}")
+            made = Typed.at(value.span, BytesKind(), call("bytes", value.node))
+        case ListKind():
+            raise mismatch(value, target, f"bytes are integers {OCTET.low}..{OCTET.high}")
+        case _:
+            raise mismatch(value, target)
+    return made.node if target.bound is None else _limited("fit_text", made, target.bound)
+
+
+def _is_octet(kind: Kind) -> bool:
+    """Whether an element of this kind can be a byte; one of which only the value tells is checked at run time."""
+    if not isinstance(kind, IntKind):
+        return False
+    return kind.bounds is None or OCTET.low <= kind.bounds[0] <= kind.bounds[1] <= OCTET.high
 
 
 def _limited(function: str, value: Typed, *limits: int) -> ast.expr:

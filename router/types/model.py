@@ -99,14 +99,18 @@ class Field:
     """One member of a message.
 
     `number` is the protobuf field number (0 for ROS). `has_presence` says that "not set" differs from
-    the default. `default` is a ROS field's declared default, None where the type's zero is meant.
-    `comment` is the documentation beside it, as one line.
+    the default, `is_required` that there is no message without it (proto2, and both parts of a map entry).
+    `oneof` is the protobuf oneof that it is a member of; an optional field may have one of its own.
+    `default` is a ROS field's declared default, None where the type's zero is meant. `comment` is the
+    documentation beside it, as one line.
     """
 
     name: str
     type: Type
     number: int = 0
     has_presence: bool = False
+    is_required: bool = False
+    oneof: str | None = None
     default: object = None
     comment: str = ""
 

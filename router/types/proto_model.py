@@ -12,7 +12,7 @@ from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescript
 from google.protobuf.descriptor_pool import DescriptorPool
 
 from router.types.board_options import BoardOptions
-from router.types.descriptors import enum_of, message_of
+from router.types.descriptors import container, enum_of, message_of
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.proto_source import ProtoSources
 
@@ -55,6 +55,8 @@ def build_types(
                 type=_type(field, options_of(field), messages, enums),
                 number=field.number,
                 has_presence=field.has_presence,
+                is_required=field.is_required or container(field).GetOptions().map_entry,
+                oneof=field.containing_oneof.name if field.containing_oneof else None,
                 comment=sources.comment(f"{message.full_name}.{field.name}"),
             )
             for field in message.fields

@@ -13,18 +13,23 @@ from router.compiler.expressions.typed import Finding, Typed
 from router.compiler.functions import HAS
 from router.errors import Code, SourceSpan
 from router.table.model import Expression
-from router.types.model import Type
+from router.types.model import List, Type
 
 DEEPEST = 60
 """How deep an expression may nest: what handles syntax trees, ours and Python's own, does so recursively."""
 
 
 def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Typed:
-    """Raises Finding. `expected` is the field to be filled, which gives clamp() and wrap() their bounds."""
+    """Raises Finding. `expected` is the field to be filled: clamp() and wrap() take bounds of it, bare names values."""
     if expression.items is not None:
-        return literals.list_of([check(item, scope) for item in expression.items], expression.span)
+        items = [check(item, scope, _element(expected)) for item in expression.items]
+        return literals.list_of(items, expression.span)
     text = Parsed(expression)
     return _Checker(text, scope).check(text.tree, expected)
+
+
+def _element(expected: Type | None) -> Type | None:
+    return expected.element if isinstance(expected, List) else None
 
 
 @dataclass(slots=True)
@@ -51,7 +56,7 @@ class _Checker:
             case ast.Constant():
                 return literals.constant(node.value, span)
             case ast.List():
-                return literals.list_of([self.check(item) for item in node.elts], span)
+                return literals.list_of([self.check(item, _element(expected)) for item in node.elts], span)
             case ast.Name():
                 return names.named(node.id, span, self.scope, expected)
             case ast.Attribute() if path := names.constant_path(node, self.scope):
