@@ -1,0 +1,190 @@
+"""The code that builds a payload of its plan with the protobuf classes, and puts the envelope around its bytes.
+
+Fields are set one by one: that takes less time than constructors, and what protobuf refuses is blamed on the line
+of the table that it comes from. Expects a plan without findings.
+"""
+
+from __future__ import annotations
+
+import ast
+import keyword
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from router.compiler.namespace import NAMESPACE
+from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
+from router.compiler.source import Source
+from router.compiler.syntax import attribute, call, load, placed
+from router.errors import MappingError
+from router.types.model import Field, Float, MessageType
+from router.types.protobuf import PayloadCase, ProtoSchema
+
+_ONE_BYTE = 128
+"""Lengths below this are varints of one byte."""
+
+
+def write_envelope(out: Source, plan: Record, case: PayloadCase, schema: ProtoSchema, name: str) -> str:
+    """Appends the code that builds a payload. Returns the expression that is the bytes of the envelope with it.
+
+    `name` goes into the names of what the code calls; payloads of one function have different ones.
+    """
+    methods = case.message_class  # called on the class: a field may have the name of a method
+    make = out.constant(f"payload_{name}", case.message_class)
+    serialize = out.constant(f"serialize_{name}", methods.SerializeToString)
+    present = out.constant(f"present_{name}", methods.SetInParent)
+    clear = out.constant(f"clear_{name}", methods.Clear)
+    envelope = out.constant(f"envelope_{name}", _envelope(case.number))
+    out.line(f"payload = {make}()", plan.span)
+    _Writer(out, schema, present, clear).fill("payload", plan)
+    return f"{envelope}({serialize}(payload))"
+
+
+def constant_envelope(plan: Record, case: PayloadCase, schema: ProtoSchema) -> bytes:
+    """The envelope of a plan whose expressions have no message to look at.
+
+    Raises MappingError or ValueError when it cannot be built.
+    """
+    out = Source()
+    with out.block("def build():", plan.span):
+        out.line(f"return {write_envelope(out, plan, case, schema, case.name)}", plan.span)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile(plan.span.file), namespace)  # noqa: S102 - code that we made of a checked plan
+    try:
+        made: bytes = namespace["build"]()
+    except (ArithmeticError, LookupError) as error:
+        raise MappingError(str(error)) from error
+    return made
+
+
+def _envelope(number: int) -> Callable[[bytes], bytes]:
+    """What puts tag and length of the payload case with this field number in front of a payload's bytes."""
+    tag = _varint(number << 3 | 2)
+    heads = tuple(tag + _varint(size) for size in range(_ONE_BYTE))
+
+    def envelope(payload: bytes) -> bytes:
+        size = len(payload)
+        return (heads[size] if size < _ONE_BYTE else tag + _varint(size)) + payload
+
+    return envelope
+
+
+def _varint(value: int) -> bytes:
+    encoded = bytearray()
+    while value >= _ONE_BYTE:
+        encoded.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*encoded, value])
+
+
+@dataclass(slots=True)
+class _Writer:
+    """Writes the statements that fill a message.
+
+    `present` and `clear` are what the code calls for these methods. A submessage's variable is its holder's name
+    and its own, so that it is used for nothing else while it is filled. `computed` are variables that may hold more
+    than was read from a field.
+    """
+
+    out: Source
+    schema: ProtoSchema
+    present: str
+    clear: str
+    computed: set[str] = field(default_factory=lambda: {"item"})
+
+    def fill(self, holder: str, plan: Record) -> None:
+        for member, made in plan.members:
+            where = ast.unparse(attribute(load(holder), member.name))
+            inner = f"{holder}_{member.name}"
+            match made:
+                case Leaf():
+                    self._set(holder, member, made)
+                case Record():
+                    self.out.line(f"{inner} = {where}", made.span)
+                    self.out.line(f"{self.present}({inner})", made.span)
+                    self.fill(inner, made)
+                case Items():
+                    for element in made.items:
+                        self._add(where, inner, element)
+                case Each():
+                    self._add_each(where, inner, made)
+                case Unset():
+                    pass
+
+    def _set(self, holder: str, member: Field, leaf: Leaf) -> None:
+        if keyword.iskeyword(member.name) or member.name == "__debug__":
+            self.out.line(f"setattr({holder}, {member.name!r}, {self._value(leaf)})", leaf.span)
+        else:
+            self.out.line(f"{holder}.{member.name} = {self._value(leaf)}", leaf.span)
+
+    # repeated fields and maps
+
+    def _add(self, where: str, inner: str, element: Plan) -> None:
+        """One element. `where` is the repeated field, `inner` a variable for an element that is a message."""
+        match element:
+            case Leaf():
+                self.out.line(f"{where}.append({self._value(element)})", element.span)
+            case Record() if self._is_map_entry(element.type):
+                self._put(where, inner, element)
+            case Record():
+                self.out.line(f"{inner} = {where}.add()", element.span)
+                self.fill(inner, element)
+
+    def _add_each(self, where: str, inner: str, each: Each) -> None:
+        values = self._values(each)
+        if not _is_read(each.values, self.computed):
+            self.computed.add(each.variable)
+        if not isinstance(each.element, Leaf):
+            with self.out.block(f"for {each.variable} in {values}:", each.span):
+                self._add(where, inner, each.element)
+            return
+        value = self._value(each.element)
+        if not (isinstance(each.element.node, ast.Name) and self._is_fit(each.element)):
+            values = f"[{value} for {each.variable} in {values}]"
+        self.out.line(f"{where}.extend({values})", each.span)
+
+    def _put(self, where: str, inner: str, entry: Record) -> None:
+        """One entry of a map; of two with one key the later one stays."""
+        plans = {member.name: made for member, made in entry.members}
+        key, value = plans["key"], plans["value"]
+        assert isinstance(key, Leaf)  # noqa: S101 - both parts are required
+        place = f"{where}[{self._value(key)}]"
+        if isinstance(value, Leaf):
+            self.out.line(f"{place} = {self._value(value)}", entry.span)
+        elif isinstance(value, Record):
+            self.out.line(f"{inner} = {place}", entry.span)
+            self.out.line(f"{self.clear}({inner})", entry.span)
+            self.fill(inner, value)
+
+    def _is_map_entry(self, declared: MessageType) -> bool:
+        return self.schema.descriptor(declared.name).GetOptions().map_entry
+
+    # values
+
+    def _value(self, leaf: Leaf) -> str:
+        node = leaf.node if self._is_fit(leaf) else placed(call("float32", leaf.node), leaf.span)
+        return self.out.expression(node)
+
+    def _is_fit(self, leaf: Leaf) -> bool:
+        """protobuf refuses all that a field cannot hold, but makes an infinity of what is too large for a float32."""
+        return leaf.type != Float(32) or _is_read(leaf.node, self.computed)
+
+    def _values(self, each: Each) -> str:
+        length, bound = each.type.length, each.type.bound
+        if length is None and bound is None:
+            return self.out.expression(each.values)
+        limits = (0, bound) if length is None else (length, length)
+        return self.out.expression(placed(call("fit_length", each.values, *map(ast.Constant, limits)), each.span))
+
+
+def _is_read(node: ast.expr, computed: set[str]) -> bool:
+    """Whether this is what a field holds, or was checked: where a float32 is wanted, no other than one can come."""
+    match node:
+        case ast.Constant() | ast.Attribute() | ast.Call(func=ast.Name("float32")):
+            return True
+        case ast.Name(name):
+            return name not in computed
+        case ast.Subscript(value=values):
+            return _is_read(values, computed)
+        case _:
+            return False
