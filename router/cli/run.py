@@ -1,4 +1,7 @@
-"""`router run [TABLE] [--ros-args ...]`: compile the table, open everything, route until a signal says stop."""
+"""`router run [TABLE] [--ros-args ...]`: compile the table, open everything, route until a signal says stop.
+
+The table is TABLE, or what the ROS parameter `routes_path` says.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,13 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import yaml
 
-from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table
 from router.edges.log import LEVELS as LOG_LEVELS
@@ -21,12 +24,15 @@ from router.errors import StartError
 from router.runtime import Router, tune_interpreter
 
 _DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM.
-Exit code: {OK} stopped, {BAD_TABLE} the table has errors, or what it names cannot be opened."""
+Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table has errors or what it names cannot be opened."""
 
 _EPILOG = """\
-A ROS parameter is a variable of the table in lower case, and wins over the environment:
-  router run routes/legacy.yaml --ros-args -p listen_port:=5001 -p dst_ip:=127.0.0.1
+The ROS parameter routes_path chooses the table in place of TABLE. Any other is a variable of the table in lower case,
+and wins over the environment:
+  router run --ros-args -p routes_path:=routes/legacy.yaml -p listen_port:=5001 -p dst_ip:=127.0.0.1
 """
+
+_ROUTES_PATH = "routes_path"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -37,9 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "table", type=Path, nargs="?", default=DEFAULT_TABLE, metavar="TABLE", help="route table (default: %(default)s)"
-    )
+    parser.add_argument("table", type=Path, nargs="?", metavar="TABLE", help=f"route table (default: {DEFAULT_TABLE})")
     parser.add_argument(
         "--log-level", choices=LOG_LEVELS, default="info", help="least that is logged (default: %(default)s)"
     )
@@ -50,7 +54,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
-    checked = check_table(args.table, {**os.environ, **table_variables(args.ros_args)})
+    parameters = ros_parameters(args.ros_args)
+    named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE is
+    if args.table and named and args.table.resolve() != Path(named).resolve():
+        print(f"router run: TABLE is {args.table}, {_ROUTES_PATH} is {named}; name one table", file=sys.stderr)
+        return BAD_USAGE
+    table = args.table or Path(named or DEFAULT_TABLE)
+    checked = check_table(table, {**os.environ, **table_variables(parameters)})
     print_findings(checked.diagnostics, sys.stderr)
     if checked.program is None:
         return BAD_TABLE
@@ -66,19 +76,24 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def table_variables(ros_args: Sequence[str]) -> dict[str, str]:
-    """`["-p", "listen_port:=5001"]` -> `{"LISTEN_PORT": "5001"}`; so too `--params-file`, which `ros2 launch` passes.
+def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:
+    """`["-p", "listen_port:=5001"]` -> `{"listen_port": "5001"}`; so too `--params-file`, which `ros2 launch` passes.
 
     The last one wins, as in ROS. Which node a parameter is meant for is left out. Raises StartError.
     """
-    variables: dict[str, str] = {}
+    parameters: dict[str, str] = {}
     for option, word in pairwise(ros_args):
         name, assigned, value = word.partition(":=")
         if option in ("-p", "--param") and assigned:
-            variables[name.rpartition(":")[2].upper()] = value.strip("'\"")
+            parameters[name.rpartition(":")[2]] = value.strip("'\"")
         elif option == "--params-file":
-            variables.update((name.upper(), str(value)) for name, value in _parameters(_read_yaml(Path(word))))
-    return variables
+            parameters.update((name, str(value)) for name, value in _parameters(_read_yaml(Path(word))))
+    return parameters
+
+
+def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
+    """The variables that ROS parameters give values to: `listen_port` is `${LISTEN_PORT}`."""
+    return {name.upper(): value for name, value in parameters.items() if name != _ROUTES_PATH}
 
 
 def _read_yaml(path: Path) -> object:
