@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from router.compiler.checked import CheckedDeadman
 from router.compiler.destinations import recipient
 from router.compiler.expressions import ParsedReads
+from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
+from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
-from router.errors import Code
+from router.errors import Code, MappingError
 from router.table.model import Deadman, EndpointKind, Route
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
-NS_PER_SECOND = 1_000_000_000
 _NOTHING = MessageType("a deadman")
 """What a deadman's payload is made of: there is no message that it could be filled from."""
 
@@ -29,7 +32,7 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
     if case is None:
         return None
     for name in deadman.to:
-        recipient(lookup, case, name, deadman.to, sources=frozenset())
+        recipient(lookup, case, name, sources=frozenset())
     plan = _payload(lookup, deadman, case)
     return CheckedDeadman(case, plan, tuple(name.value for name in deadman.to)) if plan else None
 
@@ -63,8 +66,15 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 
 def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> Record | None:
     """A payload of which nothing is filled is one: all zero."""
-    scope = lookup.scope(_NOTHING, ParsedReads())
+    scope = replace(lookup.scope(_NOTHING, ParsedReads()), given=())
     mapping = build(deadman.fields, case.type, scope, deadman.case.span)
     findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
     lookup.findings += findings
-    return None if findings else mapping.plan
+    if findings:
+        return None
+    try:
+        constant_envelope(mapping.plan, case, lookup.schema)
+    except (MappingError, ValueError) as error:
+        lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
+        return None
+    return mapping.plan

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 
 from router.compiler.expressions import Reads, Typed
@@ -18,20 +17,21 @@ from router.types.protobuf import PayloadCase
 
 def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:
     """Those of a route, each with its endpoint, None where there is none; what is wrong with them is reported."""
-    names = [destination.endpoint for destination in route.destinations]
     sources = {source.value for source in route.sources}
-    return [(each, recipient(lookup, case, each.endpoint, names, sources)) for each in route.destinations]
+    seen: set[str] = set()
+    for destination in route.destinations:
+        name = destination.endpoint
+        if name.value in seen:
+            lookup.report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
+        seen.add(name.value)
+    return [(each, recipient(lookup, case, each.endpoint, sources)) for each in route.destinations]
 
 
-def recipient(
-    lookup: Lookup, case: PayloadCase, name: Located[str], among: Sequence[Located[str]], sources: AbstractSet[str]
-) -> Endpoint | None:
-    """The endpoint `name`, one `among` those that get payloads of `case` which come from `sources`."""
+def recipient(lookup: Lookup, case: PayloadCase, name: Located[str], sources: AbstractSet[str]) -> Endpoint | None:
+    """The endpoint `name`, which gets payloads of `case` that come from `sources`; None where there is none."""
     endpoint = lookup.endpoint(name)
     if endpoint is None:
         return None
-    if next(other for other in among if other.value == name.value) is not name:
-        lookup.report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
     finding = loop_finding(lookup.table, endpoint, name.span, case.name, sources)
     if finding and finding.message not in {earlier.message for earlier in lookup.findings}:
         lookup.findings.append(finding)  # an endpoint that is the router itself is one mistake, not one per route

@@ -16,6 +16,8 @@ from router.table.model import Endpoint, Expression, Located, RouteTable, Topic
 from router.types.model import List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
+NO_NAMES: Mapping[str, Typed] = {}
+
 
 @dataclass(slots=True)
 class Lookup:
@@ -71,18 +73,20 @@ class Lookup:
         message: MessageType,
         reads: Reads,
         ros_type: MessageType | None = None,
-        names: Mapping[str, Typed] | None = None,
+        names: Mapping[str, Typed] = NO_NAMES,
     ) -> Scope:
         """What expressions over `message` can see; the constants of `ros_type` and of what is nested in it as well."""
         nested = tuple(nested_types(ros_type)) if ros_type else ()
-        return Scope(message, tuple(self.schema.enums.values()), nested, reads, names or {})
+        return Scope(message, tuple(self.schema.enums.values()), nested, reads, names)
 
-    def value(self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str) -> Typed | None:
-        """An expression of one of `kinds`; `wanted` completes the sentence that says so."""
+    def value(
+        self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str, hint: str = ""
+    ) -> Typed | None:
+        """An expression of one of `kinds`; `wanted` says so where it is of none."""
         try:
             typed = check(expression, scope)
             if not isinstance(typed.kind, kinds):
-                raise Finding(typed.span, Code.TYPE_MISMATCH, f"{wanted}, not {typed.kind}")
+                raise Finding(typed.span, Code.TYPE_MISMATCH, f"{wanted}, not {typed.kind}", hint)
         except Finding as finding:
             self.findings.append(finding.diagnostic)
             return None
@@ -91,7 +95,8 @@ class Lookup:
     def when(self, expression: Expression | None, scope: Scope) -> Typed | None:
         if expression is None:
             return None
-        return self.value(expression, scope, (BoolKind,), "'when' takes a bool")
+        hint = "compare something, as in fix_quality != GPSFixQuality.NO_FIX"
+        return self.value(expression, scope, (BoolKind,), "'when' takes a bool", hint)
 
 
 def nested_types(declared: Type) -> Iterable[MessageType]:

@@ -22,7 +22,7 @@ HEADER = "std_msgs/msg/Header"
 
 
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
-    name = route.case.value
+    name = route.name
     if not route.topics:
         message = f"'{name}' comes from ROS, but from no topic"
         lookup.report(route.case.span, Code.NO_TARGET, message, "name it under 'topics'")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from router.compiler.expressions.literals import constant
 from router.compiler.expressions.parsing import Parsed, dotted
-from router.compiler.expressions.scope import MESSAGE, RECEIVED_AT, SOURCE, Scope
+from router.compiler.expressions.scope import MESSAGE, SOURCE, Scope
 from router.compiler.expressions.typed import Finding, Typed
 from router.compiler.functions import FUNCTIONS, HAS
 from router.compiler.kinds import BoolKind, EnumKind, MessageKind, StringKind, TimeKind
@@ -22,29 +22,34 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> T
         return scope.variable(text, span)
     if member := scope.message.field(text):
         return scope.read((), member, span)
-    if text == MESSAGE:
-        return scope.whole_message(span)
-    if text == SOURCE:
-        return Typed.at(span, StringKind(), load(SOURCE))
-    if text == RECEIVED_AT:
-        return Typed.at(span, TimeKind(), load(RECEIVED_AT))
+    if text in scope.given:
+        return _given(text, span, scope)
     if text in ("true", "false"):  # as YAML spells them
         return constant(text == "true", span)
+    values = dict(expected.values) if isinstance(expected, Enum) else {}
+    if isinstance(expected, Enum) and text in values:
+        return Typed.at(span, EnumKind(expected), ast.Constant(values[text]))
     if text in FUNCTIONS or text == HAS:
         raise Finding(span, Code.WRONG_ARGUMENTS, f"'{text}' is a function", f"call it: {text}(...)")
     if scope.holders(text):
         raise Finding(span, Code.TYPE_MISMATCH, f"'{text}' is an enum, not a value", f"name one: {text}.VALUE")
-    known = [*scope.field_names(), MESSAGE, SOURCE, RECEIVED_AT]
-    hint = did_you_mean(text, known)
+    known = [*scope.field_names(), *scope.given, *values]
+    hint = did_you_mean(text, known) or "only constants can stand here"
     if isinstance(expected, String) and not nearest(text, known):
         hint = f"text has quotes of its own: \"'{text}'\""
     raise Finding(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
 
 
+def _given(text: str, span: SourceSpan, scope: Scope) -> Typed:
+    if text == MESSAGE:
+        return scope.whole_message(span)
+    return Typed.at(span, StringKind() if text == SOURCE else TimeKind(), load(text))
+
+
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
     """The parts of `a.b.C` when it is to be looked up among enums and ROS types: no field or variable is `a`."""
     path = dotted(node)
-    if path is None or path[0] in (MESSAGE, SOURCE, RECEIVED_AT, *scope.field_names()):
+    if path is None or path[0] in (*scope.given, *scope.field_names()):
         return None
     return path
 

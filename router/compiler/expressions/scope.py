@@ -26,7 +26,8 @@ class Scope:
     """What names mean in the expressions of one target.
 
     `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
-    variables beside the message's fields; they win over fields of the same name.
+    variables beside the message's fields; they win over fields of the same name. `given` is what can be named of
+    MESSAGE, SOURCE and RECEIVED_AT: nothing where no message is.
     """
 
     message: MessageType
@@ -34,6 +35,7 @@ class Scope:
     ros_types: Collection[MessageType]
     reads: Reads
     names: Mapping[str, Typed] = field(default_factory=dict)
+    given: Collection[str] = (MESSAGE, SOURCE, RECEIVED_AT)
 
     def field_names(self) -> list[str]:
         """All that a name which stands alone can mean of the message and beside it."""
