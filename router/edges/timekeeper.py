@@ -18,8 +18,8 @@ class Timekeeper:
     Who else uses a machine does it through `guard`. What is called under the lock must be short and must
     not wait: another thread may be waiting for the lock to receive a message.
 
-    `clock_ns` is a monotonic clock in ns. What a machine raises when it is due goes to `failed`; the others
-    are served all the same, and it is not tried again before 100 ms have passed.
+    `clock_ns` is a monotonic clock in ns. What a machine raises when it is due or ended goes to `failed`; the
+    others are served all the same, and it is not tried again before 100 ms have passed.
     """
 
     def __init__(self, name: str, clock_ns: Callable[[], int], failed: Callable[[Exception], None]) -> None:
@@ -69,7 +69,10 @@ class Timekeeper:
             self._thread.join()
         with self._lock:
             for machine in reversed(self._machines):
-                machine.end(self._clock_ns())
+                try:
+                    machine.end(self._clock_ns())
+                except Exception as error:  # noqa: BLE001 nor may it keep another deadman from its last word
+                    self._failed(error)
 
     def _run(self) -> None:
         with self._lock:

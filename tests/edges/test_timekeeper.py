@@ -26,7 +26,6 @@ class Bell:
         self.name = name
         self.error: Exception | None = None
         self.calls = 0
-        self.ended: list[str] = []
         self._rung = rung
         self._busy = threading.Lock()
 
@@ -48,7 +47,9 @@ class Bell:
 
     def end(self, now: int) -> None:
         self.next_due = None
-        self.ended.append(self.name)
+        self._rung.put(f"{self.name} ends")
+        if self.error is not None:
+            raise self.error
 
 
 class Keeping:
@@ -161,7 +162,8 @@ def test_a_machine_that_failed_is_tried_again_but_not_all_the_time(keeping: Keep
     keeping.keeper.add(broken)
     keeping.start()
     for _ in range(3):
-        assert keeping.failures.get(timeout=PATIENCE) is broken.error
+        assert isinstance(keeping.failures.get(timeout=PATIENCE), LookupError)
+    broken.error = None
     keeping.keeper.stop()
     assert 3 + keeping.failures.qsize() <= 1 + (monotonic_ns() - begun) / (100 * MS)
 
@@ -205,5 +207,19 @@ def test_stopping_does_not_wait_for_what_is_due_later(keeping: Keeping, due: int
     if due is not None:
         ring_at(monotonic_ns() + due)
     keeping.keeper.stop()
-    ring_at(monotonic_ns())  # last words are possible, and nothing comes of them
-    assert keeping.rung.empty()
+    ring_at(monotonic_ns())  # can still be called, and nothing comes of it
+    assert (keeping.heard(), keeping.rung.empty()) == ("bell ends", True)
+
+
+@pytest.mark.parametrize("is_started", [False, True])
+def test_stopping_ends_all_machines_whatever_one_of_them_raises(keeping: Keeping, is_started: bool) -> None:
+    """The last that was added comes first: it may hand on to earlier ones."""
+    for name in ("pacer", "broken", "latest"):
+        bell = Bell(keeping.rung, name)
+        bell.error = LookupError("a bug") if name == "broken" else None
+        keeping.keeper.add(bell)
+    if is_started:
+        keeping.keeper.start()
+    keeping.keeper.stop()
+    assert [keeping.heard() for _ in range(3)] == ["latest ends", "broken ends", "pacer ends"]
+    assert isinstance(keeping.failures.get_nowait(), LookupError)
