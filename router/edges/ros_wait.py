@@ -55,7 +55,8 @@ class WaitSet:
     def __init__(
         self, node: Node, subscriptions: Sequence[RawSubscription] = (), events: Sequence[EventHandler] = ()
     ) -> None:
-        self._subscriptions = [(subscription.handle, subscription) for subscription in subscriptions]
+        self._handles = [subscription.handle for subscription in subscriptions]
+        self._by_pointer = {subscription.handle.pointer: subscription for subscription in subscriptions}
         self._events = events
         self._guard = GuardCondition(None, None, node.context)
         self._set = rclpy_implementation.WaitSet(len(subscriptions), 1, 0, 0, 0, len(events), node.context.handle)
@@ -68,7 +69,7 @@ class WaitSet:
         waiting = self._set
         waiting.clear_entities()  # waiting takes out what is not ready
         waiting.add_guard_condition(self._guard.handle)
-        for handle, _ in self._subscriptions:
+        for handle in self._handles:
             waiting.add_subscription(handle)
         for event in self._events:
             event.add_to_wait_set(waiting)
@@ -76,8 +77,7 @@ class WaitSet:
 
     def ready_subscriptions(self) -> list[RawSubscription]:
         """Those that had a message when `wait` returned."""
-        ready = self._set.get_ready_entities("subscription")
-        return [subscription for handle, subscription in self._subscriptions if handle.pointer in ready]
+        return [self._by_pointer[pointer] for pointer in self._set.get_ready_entities("subscription")]
 
     def happened(self) -> Iterator[tuple[EventHandler, Any]]:
         """The events that had happened when `wait` returned, each with its status."""
