@@ -1,8 +1,8 @@
 """The oracle: a plain, slow answer to what a table makes of one message, for tests and for `router test`.
 
 Of the compiler it shares the functions and the type model, and must not know expressions, scalars, conversion,
-mapping, cdr or source: what both agree on is right for two reasons. Expects a table that the compiler
-has accepted. `reference_cdr` makes bytes of what comes out here.
+mapping, cdr, payload or source: what both agree on is right for two reasons. Expects a table that the compiler
+has accepted. `reference_cdr` and `reference_protobuf` make messages of what comes out here.
 """
 
 from __future__ import annotations
@@ -17,12 +17,42 @@ from router.errors import MappingError
 from router.table.model import Expression, FieldMap
 from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
 
-Value = Union[bool, int, float, str, "list[Value]", "dict[str, Value]"]
-"""What fills a field of a ROS message; a message is a dictionary of all its fields in their order."""
+Value = Union[bool, int, float, str, bytes, "list[Value]", "dict[str, Value]"]
+"""What fills a field; a message is a dictionary of its fields, in their order."""
 
 
 def fill(fields: FieldMap | None, target: MessageType, context: Context) -> dict[str, Value]:
-    """The ROS message that `fields` makes of a message. Raises MappingError where a field has no value."""
+    """The ROS message that `fields` makes of a message, with all its fields.
+
+    Raises MappingError where a field has no value.
+    """
+    return _completed(target, fill_given(fields, target, context))
+
+
+def _completed(message: MessageType, values: Mapping[str, Value]) -> dict[str, Value]:
+    """With the fields that nobody fills: ROS messages have them all."""
+    return {
+        field.name: _complete(field.type, values[field.name])
+        if field.name in values
+        else initial(field.type, field.default)
+        for field in message.fields
+    }
+
+
+def _complete(declared: Type, value: Any) -> Any:
+    match declared:
+        case MessageType():
+            return _completed(declared, value)
+        case List():
+            return [_complete(declared.element, element) for element in value]
+        case String(wide=False) if "\0" in value:
+            raise MappingError("a ROS string cannot hold a NUL")
+        case _:
+            return value
+
+
+def fill_given(fields: FieldMap | None, target: MessageType, context: Context) -> dict[str, Value]:
+    """The same without the fields that nothing fills."""
     tree: dict[str, Any] = {}
     for entry in fields.entries if fields else ():
         holder = reduce(lambda inner, name: inner.setdefault(name, {}), entry.path[:-1], tree)
@@ -42,8 +72,6 @@ def _filled(target: MessageType, tree: Mapping[str, Any], auto: View | None, con
             made[field.name] = _filled(field.type, given, same_named if isinstance(same_named, View) else None, context)
         elif same_named is not None:
             made[field.name] = converted(same_named, field.type)
-        else:
-            made[field.name] = initial(field.type, field.default)
     return made
 
 
@@ -68,7 +96,7 @@ def initial(declared: Type, default: object = None) -> Value:
             return 0
 
 
-def converted(value: Any, target: Type) -> Value:  # noqa: C901 - a case a type
+def converted(value: Any, target: Type) -> Value:  # noqa: C901, PLR0912 - a case a type
     """The value as a field of the target's type holds it. Raises MappingError when it does not fit."""
     match target:
         case MessageType():
@@ -92,8 +120,12 @@ def converted(value: Any, target: Type) -> Value:  # noqa: C901 - a case a type
             return _to_float(value, target)
         case String():
             return _to_text(value, target)
-        case Enum() | Bytes():
-            raise TypeError(f"ROS has no type {target}")
+        case Enum():
+            return _to_enum(value, target)
+        case Bytes():
+            if target.bound is not None and len(value) > target.bound:
+                raise MappingError(f"{len(value)} bytes do not fit {target}")
+            return bytes(value)
 
 
 def _most_elements(target: List) -> int:
@@ -102,7 +134,7 @@ def _most_elements(target: List) -> int:
 
 
 def _to_message(value: Any, target: MessageType) -> dict[str, Value]:
-    if isinstance(value, Nanoseconds) and target.name == "builtin_interfaces/msg/Time":
+    if isinstance(value, Nanoseconds) and target.name in ("builtin_interfaces/msg/Time", "google.protobuf.Timestamp"):
         sec, nanosec = target.fields
         return {sec.name: converted(value // NS, sec.type), nanosec.name: converted(value % NS, nanosec.type)}
     if not isinstance(value, View):
@@ -110,9 +142,8 @@ def _to_message(value: Any, target: MessageType) -> dict[str, Value]:
         return {only.name: converted(value, only.type)}
     return {
         field.name: converted(value.read(field.name), field.type)
-        if value.type.field(field.name)
-        else initial(field.type, field.default)
         for field in target.fields
+        if value.type.field(field.name)
     }
 
 
@@ -128,6 +159,15 @@ def _to_text(value: str, target: String) -> str:
     size = len(value.encode("utf-16-le")) // 2 if target.wide else len(value.encode())
     if target.bound is not None and size > target.bound:
         raise MappingError(f"a text of {size} does not fit {target}")
-    if not target.wide and "\0" in value:
-        raise MappingError("a ROS string cannot hold a NUL")
     return value
+
+
+def _to_enum(value: int | str, target: Enum) -> int:
+    """A number as it is, a name as what it stands for."""
+    numbers = dict(target.values)
+    if isinstance(value, str) and value not in numbers:
+        raise MappingError(f"{target} has no value '{value}'")
+    number = numbers[value] if isinstance(value, str) else int(value)
+    if not -(1 << 31) <= number < 1 << 31:
+        raise MappingError(f"{number} does not fit {target}")
+    return number

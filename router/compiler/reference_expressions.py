@@ -75,12 +75,16 @@ def evaluate(expression: Expression, context: Context, expected: Type | None = N
     Raises MappingError where the value has no result.
     """
     if expression.items is not None:
-        return [evaluate(item, context) for item in expression.items]
+        return [evaluate(item, context, _element(expected)) for item in expression.items]
     syntax = ast.parse(expression.text.replace("\n", " ").strip(), mode="eval").body
     try:
         return _Evaluator(context).visit(syntax, expected)
     except (ArithmeticError, ValueError, LookupError) as error:
         raise MappingError(str(error)) from error
+
+
+def _element(expected: Type | None) -> Type | None:
+    return expected.element if isinstance(expected, List) else None
 
 
 _BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
@@ -105,9 +109,9 @@ class _Evaluator:
             case ast.Constant():
                 return node.value
             case ast.List():
-                return [self.visit(item) for item in node.elts]
+                return [self.visit(item, _element(expected)) for item in node.elts]
             case ast.Name():
-                return self._name(node.id)
+                return self._name(node.id, expected)
             case ast.Attribute():
                 return self._attribute(node)
             case ast.Subscript():
@@ -131,7 +135,7 @@ class _Evaluator:
             case _:
                 raise TypeError(f"{type(node).__name__} is not part of the language")
 
-    def _name(self, name: str) -> object:
+    def _name(self, name: str, expected: Type | None) -> object:
         view = self.context.view
         if view.type.field(name):
             return view.read(name)
@@ -142,6 +146,8 @@ class _Evaluator:
             "true": True,
             "false": False,
         }
+        if name not in named and isinstance(expected, Enum):
+            return EnumNumber(dict(expected.values)[name])
         return named[name]
 
     def _attribute(self, node: ast.Attribute) -> object:
