@@ -22,6 +22,7 @@ from pathlib import Path
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM, Engine, Report
+from router.engine.binding import Outlets, unguarded
 from tests.engine.ledger import Ledger
 
 ROOT = Path(__file__).parent.parent
@@ -171,18 +172,25 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
         if noise.random() < 0.01:
             raise PublishError
 
-    engine = Engine(
-        program,
-        counts,
-        {plan.endpoint: send for plan in program.senders},
-        {plan.topic: publish for plan in program.publishers},
-        {plan.topic: [True] for plan in program.publishers},
-        _forget,
-        time.monotonic_ns,
-        time.time_ns,
-        (PublishError,),
+    outlets = Outlets(
+        counts=counts,
+        send={plan.endpoint: send for plan in program.senders},
+        publish={plan.topic: publish for plan in program.publishers},
+        wanted={plan.topic: [True] for plan in program.publishers},
+        report=_forget,
+        clock_ns=time.monotonic_ns,
+        wall_ns=time.time_ns,
+        pacing=unguarded(counts),
+        collecting=unguarded(counts),
+        publish_errors=(PublishError,),
+        feed={plan.route: _forget_command for plan in program.deadmen},
     )
-    return engine.receiver(program.listeners[0].name)
+    listener = program.listeners[0].name
+    return Engine(program, outlets, {listener: time.time_ns}).receiver(listener)
+
+
+def _forget_command(_: int) -> None:
+    """No time passes here in which a deadman could trip."""
 
 
 def _forget(report: Report) -> None:

@@ -4,23 +4,40 @@ from __future__ import annotations
 
 import gc
 import sys
-import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
 from router.edges.background import background_threads
 from router.edges.clock import monotonic_ns, wall_ns
-from router.edges.log import SUMMARY_INTERVAL_NS, FloodLog, logger
+from router.edges.log import logger
 from router.edges.metrics import BooksCollector, MetricsServer
 from router.edges.receiver import ReceiveThread
+from router.edges.reports import Reporter
+from router.edges.timekeeper import Timekeeper
 from router.edges.udp import Listener, Sender
-from router.engine import MAX_DATAGRAM, Engine, Report
+from router.engine import MAX_DATAGRAM, Engine, OutboundEngine
+from router.engine.binding import Guarded, Outlets
+from router.engine.deadman import Deadman
+from router.engine.pacing import Pacer
 from router.errors import StartError
 from router.table.model import Address
+
+if TYPE_CHECKING:
+    from router.edges.ros import RosEdge
+
+_TOTALS = (
+    "datagrams_received",
+    "datagrams_rejected",
+    "messages_received",
+    "datagrams_sent",
+    "messages_published",
+    "messages_dropped",
+)
 
 
 class Router:
@@ -31,28 +48,27 @@ class Router:
 
     def __init__(self, program: Program, ros_args: Sequence[str] = ()) -> None:
         self.program = program
-        self.counts = program.books.fresh_counts()
         self.listeners: dict[str, Listener] = {}
         self.metrics_address: Address | None = None
+        self._counts: list[list[int]] = []  # one for each thread that counts
         self._ros_args = ros_args
-        self._floods = FloodLog()
-        self._stopped = threading.Event()
         self._open_edges = ExitStack()
 
     def __enter__(self) -> Router:
         with ExitStack() as opening:
             with background_threads():
-                engine = self._open(opening)
-            self._start_receiving(engine, opening)
+                start = self._open(opening)
+            start()
             self._open_edges = opening.pop_all()
-        table = self.program.table
+        program = self.program
         logger.info(
             "router started",
-            table=str(table.path),
+            table=str(program.table.path),
             listening={name: str(listener.address) for name, listener in self.listeners.items()},
-            routes=len(self.program.inbound),
-            destinations=len(self.program.senders),
-            topics=len(self.program.publishers),
+            routes=sum(not route.ignore for route in program.table.routes),
+            destinations=len(program.senders),
+            published=len(program.publishers),
+            subscribed=len(program.subscriptions),
             metrics=str(self.metrics_address) if self.metrics_address else None,
         )
         return self
@@ -64,55 +80,133 @@ class Router:
         self._open_edges.close()
         logger.info("router stopped", **self.totals())
 
+    def total(self, metric: str) -> int:
+        """What was counted under a counter's name since the start, over all its labels."""
+        slots = [slot for series, slot in self.program.books.series() if series.metric == metric]
+        return sum(counts[slot] for counts in self._counts for slot in slots)
+
     def totals(self) -> dict[str, int]:
         """What happened since the start, over all listeners, routes and targets."""
-        totals = dict.fromkeys(
-            ("datagrams_received", "datagrams_rejected", "datagrams_sent", "messages_published", "messages_dropped"), 0
-        )
-        for series, slot in self.program.books.series():
-            if series.metric in totals:
-                totals[series.metric] += self.counts[slot]
+        totals = {metric: self.total(metric) for metric in _TOTALS}
         return totals | {"kernel_drops": sum(listener.kernel_drops() for listener in self.listeners.values())}
 
-    def _open(self, opening: ExitStack) -> Engine:
-        """Everything but receiving. `opening` closes in the opposite order."""
-        program, table = self.program, self.program.table
-        opening.callback(self._floods.flush, final=True)
-        for plan in program.listeners:
-            listener = Listener(plan, table.listeners[plan.name].address.span)
+    def _open(self, opening: ExitStack) -> Callable[[], None]:
+        """Opens everything, and returns what starts receiving. `opening` closes in the opposite order.
+
+        Receiving ends first, then open frames, then what waits to be sent; a deadman has the last word.
+        """
+        program = self.program
+        reporter = Reporter()
+        opening.callback(reporter.close)
+        self._open_listeners(opening)
+        send = self._open_senders(opening)
+        ros = self._open_ros(opening)
+        keepers = [Timekeeper(name, monotonic_ns, reporter.failed) for name in ("deadman", "pacing", "collect")]
+        for keeper in keepers:
+            opening.callback(keeper.stop)
+        deadman, pacing, collecting = keepers
+        outlets = Outlets(
+            counts=self._fresh_counts(),
+            send=send,
+            publish=ros.publish if ros else {},
+            wanted=ros.wanted if ros else {},
+            report=reporter.report,
+            clock_ns=monotonic_ns,
+            wall_ns=wall_ns,
+            pacing=Guarded(self._fresh_counts(), pacing.guard),
+            collecting=Guarded(self._fresh_counts(), collecting.guard),
+            publish_errors=ros.publish_errors if ros else (),
+            feed=self._deadmen(deadman, send, reporter),
+            pacers=self._pacers(pacing, send),
+        )
+        inbound = Engine(program, outlets, {name: listener.arrived_at for name, listener in self.listeners.items()})
+        outbound = OutboundEngine(program, replace(outlets, counts=self._fresh_counts()))
+        receive = {name: inbound.receiver(name) for name in self.listeners}
+        receiving = ReceiveThread(list(self.listeners.values()), receive, MAX_DATAGRAM, reporter.failed)
+        take = {plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions}
+        self._open_metrics(opening)
+
+        def start() -> None:
+            for keeper in keepers:
+                keeper.start()
+            if ros is not None:
+                opening.callback(ros.stop_receiving)
+                ros.start(take, reporter.failed)
+            receiving.start()
+            opening.callback(receiving.stop)
+
+        return start
+
+    def _fresh_counts(self) -> list[int]:
+        """For one more thread."""
+        self._counts.append(self.program.books.fresh_counts())
+        return self._counts[-1]
+
+    def _open_listeners(self, opening: ExitStack) -> None:
+        for plan in self.program.listeners:
+            listener = Listener(plan, self.program.table.listeners[plan.name].address.span)
             opening.callback(listener.close)
             self.listeners[plan.name] = listener
+
+    def _open_senders(self, opening: ExitStack) -> dict[str, Callable[[bytes], int]]:
         send = {}
-        for destination in program.senders:
-            sender = Sender(destination, table.endpoints[destination.endpoint].address.span)
+        for plan in self.program.senders:
+            sender = Sender(plan, self.program.table.endpoints[plan.endpoint].address.span)
             opening.callback(sender.close)
-            send[destination.endpoint] = sender.send
-        bind = partial(Engine, program, self.counts, send, report=self._report, clock_ns=monotonic_ns, wall_ns=wall_ns)
-        if program.publishers:
-            try:  # here, because a table without topics runs where there is no ROS
-                from router.edges.ros import PUBLISH_ERRORS, RosEdge
-            except ImportError as error:
-                remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
-                raise StartError(f"{table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
+            send[plan.endpoint] = sender.send
+        return send
 
-            spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
-            ros = RosEdge(table.node, program.publishers, spans, self._ros_args)
-            opening.callback(ros.close)
-            engine = bind(ros.publish, ros.wanted, publish_errors=PUBLISH_ERRORS)
-        else:
-            engine = bind({}, {})
-        self._open_metrics(opening)
-        teller = threading.Thread(target=self._tell_of_floods, name="log")
-        teller.start()
-        opening.callback(teller.join)
-        opening.callback(self._stopped.set)
-        return engine
+    def _open_ros(self, opening: ExitStack) -> RosEdge | None:
+        """None where the table has no topics: such a table runs where there is no ROS."""
+        program, table = self.program, self.program.table
+        if not program.publishers and not program.subscriptions:
+            return None
+        try:
+            from router.edges.ros import RosEdge
+        except ImportError as error:
+            remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
+            raise StartError(f"{table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
+        routes: dict[str, list[str]] = {}
+        for route in table.routes:
+            for topic in route.topics:
+                routes.setdefault(topic.topic.value, []).append(route.name)
 
-    def _start_receiving(self, engine: Engine, opening: ExitStack) -> None:
-        receive = {name: engine.receiver(name) for name in self.listeners}
-        receiving = ReceiveThread(list(self.listeners.values()), receive, MAX_DATAGRAM, self._receive_failed)
-        receiving.start()
-        opening.callback(receiving.stop)
+        counts = self._fresh_counts()
+
+        def incompatible(topic: str, policy: str, peers: int) -> None:
+            for route in routes[topic]:
+                counts[program.books.slot("qos_incompatible", route, topic, policy)] = peers
+
+        spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
+        ros = RosEdge(
+            table.node,
+            program.publishers,
+            program.subscriptions,
+            spans,
+            self._ros_args,
+            incompatible,
+        )
+        opening.callback(ros.close)
+        return ros
+
+    def _deadmen(
+        self, keeper: Timekeeper, send: Mapping[str, Callable[[bytes], int]], reporter: Reporter
+    ) -> dict[str, Callable[[int], None]]:
+        """What the routes tell of their commands, by route."""
+        books, counts = self.program.books, self._fresh_counts()
+        deadmen = {
+            plan.route: Deadman(plan, books, counts, send, reporter.report, reporter.deadman_changed)
+            for plan in self.program.deadmen
+        }
+        return {route: keeper.guard(deadman, deadman.feed) for route, deadman in deadmen.items()}
+
+    def _pacers(self, keeper: Timekeeper, send: Mapping[str, Callable[[bytes], int]]) -> dict[str, Pacer]:
+        pacers = {
+            plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in self.program.senders if plan.budget
+        }
+        for pacer in pacers.values():
+            keeper.add(pacer)
+        return pacers
 
     def _open_metrics(self, opening: ExitStack) -> None:
         program, settings = self.program, self.program.table.metrics
@@ -124,48 +218,11 @@ class Router:
             "protos_sha256": program.protos_sha256,
         }
         kernel_drops = {name: listener.kernel_drops for name, listener in self.listeners.items()}
-        collector = BooksCollector(program.books, [self.counts], kernel_drops, build)
-        server = MetricsServer(settings.value, settings.span, collector)
+        server = MetricsServer(
+            settings.value, settings.span, BooksCollector(program.books, self._counts, kernel_drops, build)
+        )
         opening.callback(server.close)
         self.metrics_address = server.address
-
-    def _tell_of_floods(self) -> None:
-        while not self._stopped.wait(SUMMARY_INTERVAL_NS / 1e9):
-            self._floods.flush()
-
-    def _report(self, report: Report) -> None:
-        """The engine counted a loss; this says so in the log."""
-        if report.kind == "reject":
-            key = (report.place, report.reason)
-            self._floods.note(
-                key,
-                logger.warning,
-                "datagram rejected",
-                listener=report.place,
-                reason=report.reason,
-                detail=report.detail,
-            )
-            return
-        # A traceback through generated code shows the line of the route table; others would show only the router.
-        traceback = report.error if report.reason in ("mapping_error", "non_finite") else None
-        self._floods.note(
-            (report.place, report.target, report.reason),
-            logger.warning,
-            "message dropped",
-            traceback,
-            route=report.place,
-            target=report.target,
-            reason=report.reason,
-            error=str(report.error),
-        )
-
-    def _receive_failed(self, error: Exception) -> None:
-        self._floods.note(
-            ("bug", type(error)),
-            logger.critical,
-            "a fault in the router itself lost a datagram; please report it",
-            error,
-        )
 
 
 def _version() -> str:

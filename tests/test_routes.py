@@ -16,6 +16,7 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import Engine
 from router.table.model import Route, RouteTable
+from tests.engine.plain import plain_outlets
 
 ROUTES = Path(__file__).parent.parent / "routes"
 Publish = Callable[..., dict[str, bytes]]
@@ -132,16 +133,14 @@ def published(rover: Program) -> Publish:
         sent: dict[str, bytes] = {}
         reports: list[object] = []
         topics = [plan.topic for plan in rover.publishers]
-        engine = Engine(
-            rover,
-            rover.books.fresh_counts(),
+        outlets = plain_outlets(
+            rover.books,
             send={sender.endpoint: len for sender in rover.senders},
             publish={topic: partial(sent.__setitem__, topic) for topic in topics},
-            wanted={topic: [True] for topic in topics},
             report=reports.append,
-            clock_ns=lambda: 0,
-            wall_ns=lambda: WALL_NS,
+            wall_ns=WALL_NS,
         )
+        engine = Engine(rover, outlets, {"rover": lambda: WALL_NS})
         envelope = rover.envelope.message_class(**{case: values})
         engine.receiver("rover")(envelope.SerializeToString(), ("192.168.0.30", 8))
         assert reports == []

@@ -17,12 +17,12 @@ from router.compiler import Checked, check_table
 from router.compiler.books import Books
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
-from router.compiler.link import compile_handler
+from router.compiler.link import compile_handlers
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.topics import qos_of
 from router.errors import did_you_mean
-from router.table.model import ANY, ROS, Route, RouteTable
+from router.table.model import ANY, ROS, Destination, Route, RouteTable, Topic
 from router.types.sizes import framed_size
 
 _WIDEST_CELL = 48
@@ -42,29 +42,29 @@ def run(args: argparse.Namespace) -> int:
     print_findings(checked.diagnostics, sys.stderr)
     if checked.has_errors or checked.table is None:
         return BAD_TABLE
-    routes = {route.case.name: route for route in checked.routes}
+    routes: dict[str, list[CheckedRoute]] = {}
+    for route in checked.routes:
+        routes.setdefault(route.case.name, []).append(route)
     for name in args.cases:
         if name not in routes:
             print(f"router explain: {args.table} has no route '{name}'; {did_you_mean(name, routes)}", file=sys.stderr)
             return BAD_USAGE
-    for name in args.cases or routes:
-        for line in _explained(routes[name], checked.table, checked):
+    for route in (route for name in args.cases or routes for route in routes[name]):
+        for line in _explained(route, checked):
             print(line)
-        if not args.no_code and _is_served(routes[name]):
-            _print_code(compile_handler(routes[name], checked.table, Books()).source)
+        if not args.no_code and not route.route.ignore:
+            assert checked.schema is not None  # noqa: S101 - a table without errors has one
+            for handler in compile_handlers(route, checked.table, checked.schema, Books()):
+                _print_code(handler.source)
         print()
     return OK
 
 
-def _is_served(checked: CheckedRoute) -> bool:
-    return not checked.route.ignore and not checked.route.is_outbound
-
-
-def _explained(checked: CheckedRoute, table: RouteTable, everything: Checked) -> Iterator[str]:
-    route, case = checked.route, checked.case
-    envelope = everything.envelope
-    assert envelope is not None  # noqa: S101 - a table without errors has one
-    yield f"{case.name}: {case.type.name}, field {case.number} of {envelope.name}  ({route.case.span})"
+def _explained(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
+    route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
+    assert table is not None  # noqa: S101 - a table without errors is one
+    assert envelope is not None  # noqa: S101 - and has one
+    yield f"{route.name}: {case.type.name}, field {case.number} of {envelope.name}  ({route.case.span})"
     if case.max_size is not None:
         datagram = framed_size(case.number, case.max_size)
         yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
@@ -72,12 +72,41 @@ def _explained(checked: CheckedRoute, table: RouteTable, everything: Checked) ->
         yield f"  ignored: {route.ignore.value}"
         return
     yield f"  source: {', '.join(_source(source.value, table) for source in route.sources)}"
+    yield from _settings(checked)
     for served in checked.targets:
         yield ""
-        yield from _target(served, route, table)
-    if route.is_outbound:
+        yield from _topic(served) if served.topic else _destination(served, checked.route, table, "unchanged")
+    for feed in checked.feeds:
         yield ""
-        yield "  checked only: this version carries no messages from ROS to UDP"
+        yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
+        yield _qos(feed.topic)
+        if feed.topic.when is not None:
+            yield f"    when {feed.topic.when.text}"
+        for served in feed.targets:
+            yield ""
+            yield from _destination(served, route, table, f"from topic {feed.topic.topic.value}")
+
+
+def _settings(checked: CheckedRoute) -> Iterator[str]:
+    """What holds for the whole route."""
+    route, deadman = checked.route, checked.deadman
+    if route.ttl is not None:
+        yield f"  dropped when older than {_milliseconds(route.ttl.value)}"
+    if route.for_each is not None:
+        yield f"  one datagram for each of {route.for_each.text}"
+    if route.collect is not None:
+        collect = route.collect
+        yield (
+            f"  frames by {collect.by.text}, of {collect.count.text} datagrams in the order of {collect.order.text}, "
+            f"complete within {_milliseconds(collect.timeout.value)}"
+        )
+    if route.deadman is not None and deadman is not None:
+        yield (
+            f"  deadman: {deadman.case.name} to {', '.join(deadman.to)} when no command came for "
+            f"{_milliseconds(route.deadman.timeout.value)}, again every {_milliseconds(route.deadman.repeat.value)}"
+        )
+    if route.no_deadman is not None:
+        yield f"  no deadman: {route.no_deadman.value}"
 
 
 def _source(name: str, table: RouteTable) -> str:
@@ -88,30 +117,44 @@ def _source(name: str, table: RouteTable) -> str:
     return f"{name} ({endpoint.address.value.host}{port})"
 
 
-def _target(served: CheckedTarget, route: Route, table: RouteTable) -> Iterator[str]:
+def _milliseconds(ns: int) -> str:
+    return f"{ns / 1e6:g} ms"
+
+
+def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:
+    target = served.target
+    endpoint = table.endpoints[target.name]
+    trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
+    yield f"  destination {target.name} ({endpoint.address.value}): {how}{trimmed}  ({target.span})"
+    if endpoint.budget is not None:
+        yield f"    {target.priority.value} within a budget of {endpoint.budget.value} bytes/s"
+    named = next(each for each in route.destinations if each.endpoint.value == target.name)
+    yield from _served(served, named)
+
+
+def _topic(served: CheckedTarget) -> Iterator[str]:
     target, topic = served.target, served.topic
-    if topic is None or route.is_outbound:
-        endpoint = table.endpoints[target.name]
-        how = f"from topic {topic.topic.value} ({topic.type.value})" if topic else "unchanged"
-        trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
-        yield f"  destination {target.name} ({endpoint.address.value}): {how}{trimmed}  ({target.span})"
-    else:
-        qos = {name: value for name, value in asdict(qos_of(topic)).items() if value is not None}
-        yield f"  topic {target.name}: {topic.type.value}  ({target.span})"
-        yield f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"
-        if target.plan is not None:
-            size, exact = message_size(target.plan)
-            yield (
-                f"    CDR: {size} bytes"
-                if exact
-                else f"    CDR: {size} bytes and the contents of strings and sequences"
-            )
-    destination = next((each for each in route.destinations if each.endpoint.value == target.name), None)
-    for named in (destination, topic):
-        if named is not None and named.when is not None:
-            yield f"    when {named.when.text}"
+    assert topic is not None  # noqa: S101 - the caller's choice
+    yield f"  topic {target.name}: {topic.type.value}  ({target.span})"
+    yield _qos(topic)
+    if target.plan is not None:
+        size, exact = message_size(target.plan)
+        yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
+    yield from _served(served, topic)
+
+
+def _qos(topic: Topic) -> str:
+    qos = {name: value for name, value in asdict(qos_of(topic)).items() if value is not None}
+    return f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"
+
+
+def _served(served: CheckedTarget, named: Destination | Topic) -> Iterator[str]:
+    """What a target is served with, and when."""
+    target = served.target
+    if named.when is not None:
+        yield f"    when {named.when.text}"
     if target.max_rate is not None:
-        yield f"    at most {target.max_rate:g} Hz"
+        yield f"    at most {target.max_rate:g} Hz, keeping the {target.keep.value}"
     yield from _mapping(served.rows)
     if target.plan is not None and (unset := list(_unset(target.plan, ""))):
         yield f"    left at their defaults: {', '.join(unset)}"

@@ -1,66 +1,114 @@
 """From a checked route to the Python function that serves it, about one screen long.
 
-The function takes a parsed message and calls what the engine binds for each target NAME: `send_NAME` or
-`publish_NAME` and `wanted_NAME`, `limit_NAME` for a `max_rate`, and `lost_NAME` for whatever fails.
-It counts in a flat list. `router explain` prints it.
+The function takes a message and calls what the engine binds for each target NAME: `send_NAME` or `publish_NAME`
+and `wanted_NAME`, or `deliver_NAME` where that may be later; `limit_NAME` for a `max_rate`, and `lost_NAME` for
+whatever fails. It counts in a flat list. `router explain` prints it.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 from router.compiler.books import DROP_REASONS, Books
 from router.compiler.cdr import write_message
-from router.compiler.expressions import Locals
-from router.compiler.plan import Record
+from router.compiler.checked import CheckedCollect, CheckedFeed
+from router.compiler.expressions import Typed
+from router.compiler.payload import write_envelope
 from router.compiler.program import TargetPlan
 from router.compiler.source import Source, namespace_name
-from router.compiler.syntax import attribute, load, placed
 from router.compiler.target import Target
 from router.errors import SourceSpan
+from router.table.model import Keep, Route
+from router.types.protobuf import PayloadCase, ProtoSchema
 
-PARAMETERS = ("m", "datagram", "received_at", "now", "source")
+NamedTarget = tuple[str, Target]
+"""A target with its part of the Python names."""
 
 
 class HandlerSource:
-    """Generates `def route_CASE(m, datagram, received_at, now, source)` for one route."""
+    """Generates `def route_NAME(MESSAGE, received_at, now, source)` for one route.
 
-    def __init__(self, case: str, books: Books, span: SourceSpan) -> None:
+    MESSAGE is `m, datagram` of a route from UDP, `cdr` of one from ROS. With a `ttl` there is one more argument:
+    `born`, the arrival by the monotonic clock (ns).
+    """
+
+    def __init__(self, route: Route, case: PayloadCase, schema: ProtoSchema, books: Books) -> None:
+        self.route = route
         self.case = case
-        self.function = f"route_{case}"  # a case may be called as a keyword, or as a function of the language
+        self.schema = schema
         self.books = books
-        self.span = span
+        self.span = route.case.span
+        self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
         self.plans: list[TargetPlan] = []
 
-    def generate(self, targets: Sequence[Target]) -> None:
-        """Destinations first: forwarding waits for no mapping."""
-        with self.out.block(f"def {self.function}({', '.join(PARAMETERS)}):", self.span):
-            for target in targets:
-                self._target(target)
+    def inbound(self, targets: Sequence[Target], collect: CheckedCollect | None) -> None:
+        """Destinations first: forwarding waits for no mapping. Topics get whole frames where there is a `collect`."""
+        named = [(self._plan(target), target) for target in targets]
+        with self._function("m", "datagram"):
+            self._expires()
+            if collect is None:
+                self._targets(named)
+            else:
+                self._targets([(name, target) for name, target in named if not target.is_topic])
+                topics = [(name, target) for name, target in named if target.is_topic]
+                self._collect(collect, topics)
+                self._targets(topics)
             if not targets:
                 self.out.line("pass", self.span)
 
-    def _target(self, target: Target) -> None:
-        self._open_books(target)
-        name = self._unique(namespace_name(target.name))
-        self.plans.append(TargetPlan(name, target.name, target.plan is not None, target.max_rate))
-        plan = target.plan
-        self.out.line(f"# {'topic' if plan else 'destination'} {target.name}", target.span)
-        if plan is None:
-            self._guarded(target, name, lambda: self._send(target, name))
-            return
-        with self.out.block(f"if wanted_{name}[0]:", target.span):
-            self._guarded(target, name, lambda: self._publish(target, name, plan))
-        with self.out.block("else:", target.span):
-            self._count("messages_filtered", target)
+    def outbound(self, feed: CheckedFeed) -> None:
+        """The message is read once for all destinations. With `for_each` each element is a message of its own."""
+        received, span = self.books.slot("messages_received", self.route.name, feed.topic.topic.value), feed.topic.span
+        named = [(self._plan(served.target), served.target) for served in feed.targets]
+        with self._function("cdr"):
+            with self.out.block("try:", span):
+                feed.reads.write(self.out, span)
+                if feed.for_each is not None:
+                    self.out.line(f"elements = {self.out.expression(feed.for_each.node)}", feed.for_each.span)
+            with self._all_lost(named, span):
+                self.out.line(f"counts[{received}] += 1  # messages_received", span)
+            if feed.stamp is not None:
+                self._born(feed.stamp)
+            self._expires()
+            if feed.for_each is None:
+                self.out.line(f"counts[{received}] += 1  # messages_received", span)
+                self._targets(named, feed.when)
+                return
+            self.out.line("count = len(elements)", feed.for_each.span)
+            self.out.line(f"counts[{received}] += count  # messages_received", span)
+            with self.out.block("for index, item in enumerate(elements):", feed.for_each.span):
+                self._targets(named, feed.when)
 
-    def _open_books(self, target: Target) -> None:
-        """Every series exists from the start."""
+    @contextmanager
+    def _function(self, *message: str) -> Iterator[None]:
+        parameters = (*message, "received_at", "now", "source", *(["born"] if self.route.ttl else []))
+        with self.out.block(f"def {self.function}({', '.join(parameters)}):", self.span):
+            yield
+
+    def _plan(self, target: Target) -> str:
+        """The target's name in the code. Every series exists from the start."""
         for reason in DROP_REASONS:
-            self.books.slot("messages_dropped", self.case, target.name, reason)
-        self.books.slot("messages_filtered", self.case, target.name)
+            self.books.slot("messages_dropped", self.route.name, target.name, reason)
+        self.books.slot("messages_filtered", self.route.name, target.name)
+        delivered = ("messages_published",) if target.is_topic else ("datagrams_sent", "sent_bytes")
+        for metric in delivered:
+            self.books.slot(metric, self.route.name, target.name)
+        name = self._unique(namespace_name(target.name))
+        self.plans.append(
+            TargetPlan(
+                name,
+                target.name,
+                target.is_topic,
+                target.max_rate,
+                target.keep,
+                target.priority,
+                target.is_deferred,
+            )
+        )
+        return name
 
     def _unique(self, base: str) -> str:
         """`a/b` and `a_b` are different topics but would be one Python name."""
@@ -68,46 +116,128 @@ class HandlerSource:
         candidates = (f"{base}_{number}" if number > 1 else base for number in itertools.count(1))
         return next(name for name in candidates if name not in taken)
 
-    def _count(self, metric: str, target: Target, *reason: str) -> None:
-        slot = self.books.slot(metric, self.case, target.name, *reason)
-        self.out.line(f"counts[{slot}] += 1  # {' '.join((metric, *reason))}", target.span)
+    # the age of the message
 
-    def _guarded(self, target: Target, name: str, serve: Callable[[], None]) -> None:
+    def _born(self, stamp: Typed) -> None:
+        """The age counts from the stamp where the message has one, else from its arrival."""
+        value = self.out.expression(stamp.node)
+        with self.out.block(f"if {value}:", stamp.span):
+            self.out.line(f"born = min(born, monotonic({value}, received_at, now))", stamp.span)
+
+    def _expires(self) -> None:
+        if self.route.ttl:
+            self.out.line(f"expires = born + {self.route.ttl.value}", self.route.ttl.span)
+
+    # frames
+
+    def _collect(self, collect: CheckedCollect, topics: Sequence[NamedTarget]) -> None:
+        """What follows is for whole frames: `items`, of which `m` is the first."""
+        span = collect.span
+        for _, target in topics:
+            self.books.slot("messages_collected", self.route.name, target.name)
+        self.out.line("# collect", span)
+        with self.out.block("try:", span):
+            collect.reads.write(self.out, span)
+            by, count, order = (self.out.expression(typed.node) for typed in (collect.by, collect.count, collect.order))
+            self.out.line(f"items = collect(now, (source, {by}), {count}, {order}, m)", span)
+        with self._all_lost(topics, span):
+            pass
+        with self.out.block("if items is None:", span):
+            self.out.line("return", span)
+        self.out.line("m, count = items[0], len(items)", span)
+
+    # targets
+
+    def _targets(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:
+        """`when` holds for all of them, beside what each has."""
+        for name, target in targets:
+            self.out.line(f"# {'topic' if target.is_topic else 'destination'} {target.name}", target.span)
+            conditions = [condition for condition in (when, target.when) if condition is not None]
+            if not target.is_topic:
+                self._guarded(name, target, conditions, self._deliver if target.is_deferred else self._send)
+                continue
+            with self.out.block(f"if wanted_{name}[0]:", target.span):
+                self._guarded(name, target, conditions, self._deliver if target.is_deferred else self._publish)
+            with self.out.block("else:", target.span):
+                self._count("messages_filtered", target)
+
+    def _guarded(
+        self, name: str, target: Target, conditions: Sequence[Typed], serve: Callable[[str, Target], None]
+    ) -> None:
         """What fails for one target is counted there and leaves the others alone."""
         with self.out.block("try:", target.span):
-            bind_locals(self.out, target.locals, target.span)
-            self._limited(target, name, serve)
+            if target.reads is not None:
+                target.reads.write(self.out, target.span)
+            self._conditional(name, target, conditions, serve)
         with self.out.block("except FAILURES as error:", target.span):
             self.out.line(f"lost_{name}(error)", target.span)
 
-    def _limited(self, target: Target, name: str, serve: Callable[[], None]) -> None:
-        """Serves the target if its `when` is true and its `max_rate` is not used up."""
-        if target.when is None and target.max_rate is None:
-            serve()
-            return
-        if target.when is not None:
-            with self.out.block(f"if not {self.out.expression(target.when.node)}:", target.when.span):
+    def _conditional(
+        self, name: str, target: Target, conditions: Sequence[Typed], serve: Callable[[str, Target], None]
+    ) -> None:
+        """Serves the target if each `when` is true, the message is fresh, and its `max_rate` is not used up."""
+        word = "if"
+        for condition in conditions:
+            with self.out.block(f"{word} not {self.out.expression(condition.node)}:", condition.span):
                 self._count("messages_filtered", target)
-        if target.max_rate is not None:
-            word = "if" if target.when is None else "elif"
+            word = "elif"
+        if self.route.ttl:
+            with self.out.block(f"{word} clock_ns() > expires:", self.route.ttl.span):
+                self._count("messages_dropped", target, "stale")
+            word = "elif"
+        if target.max_rate is not None and target.keep is Keep.FIRST:
             with self.out.block(f"{word} not limit_{name}(now):", target.span):
                 self._count("messages_dropped", target, "rate_limited")
+            word = "elif"
+        if word == "if":
+            serve(name, target)
+            return
         with self.out.block("else:", target.span):
-            serve()
+            serve(name, target)
 
-    def _send(self, target: Target, name: str) -> None:
-        datagram = "datagram.rstrip(ZERO)" if target.trim else "datagram"
-        slot = self.books.slot("sent_bytes", self.case, target.name)
-        self.out.line(f"counts[{slot}] += send_{name}({datagram})  # sent_bytes", target.span)
+    @contextmanager
+    def _all_lost(self, targets: Sequence[NamedTarget], span: SourceSpan) -> Iterator[None]:
+        """Ends a `try:` without which no target can be served. Lines appended inside come before the losses."""
+        with self.out.block("except FAILURES as error:", span):
+            yield
+            for name, _ in targets:
+                self.out.line(f"lost_{name}(error)", span)
+            self.out.line("return", span)
+
+    def _count(self, metric: str, target: Target, *reason: str) -> None:
+        slot = self.books.slot(metric, self.route.name, target.name, *reason)
+        self.out.line(f"counts[{slot}] += 1  # {' '.join((metric, *reason))}", target.span)
+
+    def _data(self, name: str, target: Target) -> str:
+        """Appends what makes the bytes for a target, and returns the expression that is them."""
+        if target.plan is None:
+            data = "datagram"
+        elif target.is_topic:
+            return write_message(self.out, target.plan, name)
+        else:
+            data = write_envelope(self.out, target.plan, self.case, self.schema, name)
+        return f"{data}.rstrip(ZERO)" if target.trim else data
+
+    def _send(self, name: str, target: Target) -> None:
+        data = self._data(name, target)
+        self._feed(target)
+        slot = self.books.slot("sent_bytes", self.route.name, target.name)
+        self.out.line(f"counts[{slot}] += send_{name}({data})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
 
-    def _publish(self, target: Target, name: str, plan: Record) -> None:
-        self.out.line(f"publish_{name}({write_message(self.out, plan, name)})", target.span)
+    def _publish(self, name: str, target: Target) -> None:
+        self.out.line(f"publish_{name}({self._data(name, target)})", target.span)
         self._count("messages_published", target)
 
+    def _deliver(self, name: str, target: Target) -> None:
+        """Sent or published now or later, and counted there."""
+        data = self._data(name, target)
+        if not target.is_topic:
+            self._feed(target)
+        expires = "expires" if self.route.ttl else "None"
+        self.out.line(f"deliver_{name}(now, {data}, {expires})", target.span)
 
-def bind_locals(out: Source, variables: Locals, span: SourceSpan) -> None:
-    """Appends an assignment for each submessage that expressions look into."""
-    for path, local in variables.bound.items():
-        made = placed(attribute(load(variables.name(path[:-1])), path[-1]), span)
-        out.line(f"{local} = {out.expression(made)}", span)
+    def _feed(self, target: Target) -> None:
+        """Before the command is sent, so that nothing which the deadman sends can follow it."""
+        if self.route.deadman is not None:
+            self.out.line("feed(now)", target.span)

@@ -5,13 +5,17 @@ Expects a table without errors: nothing here is checked, and nothing is found.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
-from router.compiler.books import REJECT_REASONS, UNKNOWN_CASE, Books
+from router.compiler.books import QOS_POLICIES, REJECT_REASONS, UNKNOWN_CASE, Books
+from router.compiler.checked import CheckedRoute
 from router.compiler.handlers import HandlerSource
+from router.compiler.lookup import nested_types
 from router.compiler.namespace import NAMESPACE
+from router.compiler.payload import constant_envelope
 from router.compiler.program import (
     STRANGER,
+    DeadmanPlan,
     Handler,
     ListenerPlan,
     Program,
@@ -19,9 +23,8 @@ from router.compiler.program import (
     TopicPlan,
     source_label,
 )
-from router.compiler.routes import CheckedRoute, nested_types
 from router.compiler.topics import qos_of
-from router.table.model import ANY, RouteTable
+from router.table.model import ANY, RouteTable, Topic
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
 from router.types.ros import definition
@@ -30,8 +33,19 @@ from router.types.ros import definition
 def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Sequence[CheckedRoute]) -> Program:
     books = Books()
     _open_books(books, table, envelope)
-    inbound = [checked for checked in routes if not checked.route.ignore and not checked.route.is_outbound]
-    destinations = {to.endpoint.value for checked in inbound for to in checked.route.destinations}
+    served = [checked for checked in routes if not checked.route.ignore]
+    inbound: dict[int, tuple[Handler, ...]] = {}
+    outbound: dict[str, tuple[Handler, ...]] = {}
+    for checked in served:
+        for handler in compile_handlers(checked, table, schema, books):
+            if handler.topic is None:
+                number = handler.case.number
+                inbound[number] = (*inbound.get(number, ()), handler)
+            else:
+                outbound[handler.topic] = (*outbound.get(handler.topic, ()), handler)
+    deadmen = tuple(_deadman(checked, table, schema, books) for checked in served if checked.deadman)
+    destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
+    destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     return Program(
         table=table,
         envelope=envelope,
@@ -41,26 +55,27 @@ def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Seq
             for one in table.listeners.values()
         ),
         senders=tuple(
-            SenderPlan(one.name, one.address.value) for one in table.endpoints.values() if one.name in destinations
+            SenderPlan(one.name, one.address.value, one.budget.value if one.budget else None)
+            for one in table.endpoints.values()
+            if one.name in destinations
         ),
-        publishers=_publishers(inbound),
-        subscriptions=(),
-        inbound={checked.case.number: (compile_handler(checked, table, books),) for checked in inbound},
-        outbound={},
-        deadmen=(),
+        publishers=_topics((used.topic, used.type) for checked in served for used in checked.targets),
+        subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.feeds),
+        inbound=inbound,
+        outbound=outbound,
+        deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos_sha256=schema.sha256,
     )
 
 
-def _publishers(routes: Sequence[CheckedRoute]) -> tuple[TopicPlan, ...]:
-    """One for each topic, however many routes publish on it: the check has seen to it that they agree."""
+def _topics(used: Iterable[tuple[Topic | None, MessageType | None]]) -> tuple[TopicPlan, ...]:
+    """One for each topic, however many routes name it: the check has seen to it that they agree."""
     plans: dict[str, TopicPlan] = {}
-    for checked in routes:
-        for served in checked.targets:
-            if served.topic and served.type:
-                name, qos = served.topic.topic.value, qos_of(served.topic)
-                plans.setdefault(name, TopicPlan(name, served.type.name, qos, _definitions(served.type)))
+    for topic, declared in used:
+        if topic and declared:
+            name = topic.topic.value
+            plans.setdefault(name, TopicPlan(name, declared.name, qos_of(topic), _definitions(declared)))
     return tuple(plans.values())
 
 
@@ -80,31 +95,70 @@ def _open_books(books: Books, table: RouteTable, envelope: Envelope) -> None:
         books.slot("endpoint_last_seen_timestamp_seconds", endpoint)
 
 
-def compile_handler(checked: CheckedRoute, table: RouteTable, books: Books) -> Handler:
-    """Generates and compiles the function of one inbound route, and opens its series in the books."""
+def compile_handlers(checked: CheckedRoute, table: RouteTable, schema: ProtoSchema, books: Books) -> Iterator[Handler]:
+    """Generates and compiles the functions of one route, and opens its series in the books.
+
+    A route from UDP has one, a route from ROS one for each of its topics.
+    """
     route, case = checked.route, checked.case
-    generator = HandlerSource(case.name, books, route.case.span)
-    generator.generate([served.target for served in checked.targets])
-    sources: list[str | None] = [source.value for source in route.sources]
-    if ANY in sources:
-        sources = [*table.endpoints, STRANGER]
-    for source in sources:
-        books.slot("messages_received", case.name, source_label(source))
-    books.slot("route_seconds", case.name)
-    books.slot("route_last_message_timestamp_seconds", case.name)
+    books.slot("route_seconds", route.name)
+    books.slot("route_last_message_timestamp_seconds", route.name)
+    for topic in route.topics:
+        for policy in QOS_POLICIES:
+            books.slot("qos_incompatible", route.name, topic.topic.value, policy)
+    if not route.is_outbound:
+        generator = HandlerSource(route, case, schema, books)
+        generator.inbound([served.target for served in checked.targets], checked.collect)
+        sources: list[str | None] = [source.value for source in route.sources]
+        if ANY in sources:
+            sources = [*table.endpoints, STRANGER]
+        for source in sources:
+            books.slot("messages_received", route.name, source_label(source))
+        spans = [served.target.span for served in checked.targets if served.topic]
+        yield _handler(generator, checked, (spans or [route.case.span])[0].file, frozenset(sources), None)
+    for feed in checked.feeds:
+        generator = HandlerSource(route, case, schema, books)
+        generator.outbound(feed)
+        yield _handler(generator, checked, feed.topic.span.file, frozenset(), feed.topic.topic.value)
+
+
+def _handler(
+    generator: HandlerSource, checked: CheckedRoute, file: str, sources: frozenset[str | None], topic: str | None
+) -> Handler:
+    """`file` is blamed in tracebacks: Python code has one, even of a route that is put together from several tables."""
+    route = checked.route
     return Handler(
         route=route.name,
-        case=case,
+        case=checked.case,
         function=generator.function,
         source=generator.out.text(),
-        code=generator.out.compile(_blamed_file(checked)),
+        code=generator.out.compile(file),
         constants={**NAMESPACE, **generator.out.constants},
         targets=tuple(generator.plans),
-        sources=frozenset(sources),
+        sources=sources,
+        topic=topic,
+        ttl=route.ttl.value if route.ttl else None,
+        collect_timeout=route.collect.timeout.value if route.collect else None,
+        has_deadman=route.deadman is not None,
     )
 
 
-def _blamed_file(checked: CheckedRoute) -> str:
-    """Python code has one file name; of a route that is put together from several tables, the topics' wins."""
-    spans = [served.target.span for served in checked.targets if served.topic]
-    return (spans[0] if spans else checked.route.case.span).file
+def _deadman(checked: CheckedRoute, table: RouteTable, schema: ProtoSchema, books: Books) -> DeadmanPlan:
+    route, deadman = checked.route, checked.deadman
+    assert route.deadman is not None  # noqa: S101 - the caller's choice
+    assert deadman is not None  # noqa: S101
+    datagram = constant_envelope(deadman.plan, deadman.case, schema)
+    for metric in ("deadman_active", "deadman_trips"):
+        books.slot(metric, route.name)
+    for endpoint in deadman.to:
+        for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
+            books.slot(metric, route.name, endpoint)
+    return DeadmanPlan(
+        route=route.name,
+        timeout=route.deadman.timeout.value,
+        repeat=route.deadman.repeat.value,
+        datagrams=tuple(
+            (name, datagram.rstrip(b"\0") if table.endpoints[name].trim_trailing_zeros else datagram)
+            for name in deadman.to
+        ),
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from router.compiler.expressions import Locals, Typed
+from router.compiler.expressions import Reads, Typed
 from router.compiler.plan import Record
 from router.errors import SourceSpan
 from router.table.model import Keep, Priority
@@ -12,12 +12,15 @@ from router.table.model import Keep, Priority
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A destination or a topic. `name` is its label in the books. Without a `plan` the datagram is forwarded."""
+    """A destination or a topic. `name` is its label in the books. Without a `plan` the datagram is forwarded.
+
+    `reads` makes the variables of its expressions; None where they are made once for all targets of the route.
+    """
 
     name: str
     span: SourceSpan
     is_topic: bool
-    locals: Locals
+    reads: Reads | None
     when: Typed | None = None
     max_rate: float | None = None
     keep: Keep = Keep.FIRST
@@ -25,3 +28,8 @@ class Target:
     has_budget: bool = False
     trim: bool = False
     plan: Record | None = None
+
+    @property
+    def is_deferred(self) -> bool:
+        """Whether it may be served later, and by another thread."""
+        return self.has_budget or self.keep is Keep.LATEST

@@ -1,48 +1,134 @@
-"""Turns a handler's code into a function: its namespace gets counters, senders, publishers and limits."""
+"""Turns a handler's code into a function: its namespace gets counters, senders, publishers, limits and machines."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
-from router.compiler.books import Books
-from router.compiler.program import Handler
+from router.compiler.books import DROP_REASONS, Books
+from router.compiler.program import Handler, TargetPlan
+from router.engine.collecting import Collector
+from router.engine.delivery import Deliver, immediately
+from router.engine.freshness import Freshness
+from router.engine.latest import Latest
 from router.engine.limiter import RateLimit
-from router.engine.outcome import MAPPING_FAILURES, Outcome, Report
+from router.engine.machine import Guard
+from router.engine.outcome import MAPPING_FAILURES, Outcome, Report, reason_of
+from router.engine.pacing import Pacer
+from router.table.model import Keep
 
-Handle = Callable[[object, bytes, int, int, str], None]
-"""Takes the parsed message, the datagram, its arrival by wall clock and by monotonic clock (ns), the sender's name."""
+Handle = Callable[..., None]
+"""A generated function; compiler.handlers says what it takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guarded:
+    """What serves machines: `guard` makes their calls safe, and `counts` are touched under it only."""
+
+    counts: list[int]
+    guard: Guard
+
+
+def unguarded(counts: list[int]) -> Guarded:
+    """For one thread that serves its machines itself."""
+    return Guarded(counts, lambda _, call: call)
 
 
 @dataclass(frozen=True, slots=True)
 class Outlets:
-    """What an engine hands to its handlers; see Engine for what each does."""
+    """What an engine hands to its handlers.
+
+    `send` takes a datagram, by endpoint name, and may raise OSError. `publish` takes CDR bytes, by topic,
+    and may raise `publish_errors`. `wanted` says by topic whether anybody listens, in a list of one that
+    its owner keeps up to date. `report` hears of every loss; it is called only for those. `counts` belong to the
+    thread that calls the handlers. `feed` tells a route's deadman of a command that is about to be sent. `pacers` are
+    those of the endpoints with a budget, served by `pacing`; `collecting` serves frames. Clocks in ns.
+    """
 
     counts: list[int]
     send: Mapping[str, Callable[[bytes], int]]
     publish: Mapping[str, Callable[[bytes], None]]
     wanted: Mapping[str, list[bool]]
     report: Callable[[Report], None]
-    publish_errors: tuple[type[Exception], ...]
+    clock_ns: Callable[[], int]
+    wall_ns: Callable[[], int]
+    pacing: Guarded
+    collecting: Guarded
+    publish_errors: tuple[type[Exception], ...] = ()
+    feed: Mapping[str, Callable[[int], None]] = field(default_factory=dict)
+    pacers: Mapping[str, Pacer] = field(default_factory=dict)
 
 
-def bind(handler: Handler, books: Books, outlets: Outlets) -> Handle:
-    namespace: dict[str, object] = {
+def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness) -> Handle:
+    namespace: dict[str, Any] = {
         **handler.constants,
         "counts": outlets.counts,
         "FAILURES": (*MAPPING_FAILURES, OSError, *outlets.publish_errors),
+        "clock_ns": outlets.clock_ns,
+        "monotonic": freshness.born,
     }
+    if handler.has_deadman:
+        namespace["feed"] = outlets.feed[handler.route]
+    if handler.collect_timeout is not None:
+        namespace["collect"] = _collect(handler, handler.collect_timeout, books, outlets)
     for target in handler.targets:
-        if target.is_topic:
-            namespace[f"publish_{target.name}"] = outlets.publish[target.target]
-            namespace[f"wanted_{target.name}"] = outlets.wanted[target.target]
-        else:
-            namespace[f"send_{target.name}"] = outlets.send[target.target]
-        if target.max_rate is not None:
-            namespace[f"limit_{target.name}"] = RateLimit(target.max_rate).may_pass
-        namespace[f"lost_{target.name}"] = Outcome(
-            books, outlets.counts, handler.case.name, target, outlets.report
-        ).failed
+        namespace |= _bound(target, handler.route, books, outlets)
     exec(handler.code, namespace)  # noqa: S102 - code that our compiler made of a checked table
-    handle: Handle = namespace[handler.function]  # type: ignore[assignment]
+    handle: Handle = namespace[handler.function]
     return handle
+
+
+def _bound(target: TargetPlan, route: str, books: Books, outlets: Outlets) -> dict[str, Any]:
+    name = target.name
+    bound: dict[str, Any] = {f"lost_{name}": _lost(route, target, books, outlets)}
+    if target.is_topic:
+        bound[f"wanted_{name}"] = outlets.wanted[target.target]
+    if target.is_deferred:
+        outcome = Outcome(books, outlets.pacing.counts, route, target, outlets.report)
+        bound[f"deliver_{name}"] = _deliver(target, outcome, outlets)
+    elif target.is_topic:
+        bound[f"publish_{name}"] = outlets.publish[target.target]
+    else:
+        bound[f"send_{name}"] = outlets.send[target.target]
+    if target.max_rate is not None and target.keep is Keep.FIRST:
+        bound[f"limit_{name}"] = RateLimit(target.max_rate).may_pass
+    return bound
+
+
+def _lost(route: str, target: TargetPlan, books: Books, outlets: Outlets) -> Callable[[Exception], None]:
+    slots = {reason: books.slot("messages_dropped", route, target.target, reason) for reason in DROP_REASONS}
+    counts, report = outlets.counts, outlets.report
+
+    def lost(error: Exception) -> None:
+        reason = reason_of(error, target.is_topic)
+        counts[slots[reason]] += 1
+        report(Report("drop", route, target.target, reason, error))
+
+    return lost
+
+
+def _collect(handler: Handler, timeout: int, books: Books, outlets: Outlets) -> Callable[..., list[object] | None]:
+    counts = outlets.collecting.counts
+    outcomes = [
+        Outcome(books, counts, handler.route, target, outlets.report) for target in handler.targets if target.is_topic
+    ]
+    collector = Collector(timeout, outcomes)
+    return outlets.collecting.guard(collector, collector.offer)
+
+
+def _deliver(target: TargetPlan, outcome: Outcome, outlets: Outlets) -> Deliver:
+    """Through what holds the target's messages back, to where they go and are counted."""
+    guard, pacer = outlets.pacing.guard, None if target.is_topic else outlets.pacers.get(target.target)
+    if pacer is not None:
+        deliver = pacer.queue(target.priority, outcome)
+    else:
+        hand_over: Callable[[bytes], object] = (
+            outlets.publish[target.target] if target.is_topic else outlets.send[target.target]
+        )
+        deliver = immediately(hand_over, outcome, (OSError, *outlets.publish_errors))
+    if target.keep is Keep.LATEST and target.max_rate is not None:
+        latest = Latest(target.max_rate, deliver, outcome)
+        return guard(latest, latest.offer)
+    assert pacer is not None  # noqa: S101 - the other reason to defer
+    return guard(pacer, deliver)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from google.protobuf.message import DecodeError as ProtobufError
@@ -15,6 +15,7 @@ from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
 from router.engine.binding import Handle, Outlets, bind
 from router.engine.framing import LEN, restored
+from router.engine.freshness import Freshness
 from router.engine.outcome import Report
 from router.engine.payloadless import why_no_payload
 from router.table.model import Framing
@@ -28,24 +29,24 @@ _SUM = HISTOGRAM_SLOTS - 1
 
 
 @dataclass(frozen=True, slots=True)
-class _Sender:
-    """How one sender of a route is counted, and called in expressions."""
+class _Route:
+    """A route as one of its senders has it: the slots in which it counts, and what expressions call the sender."""
 
-    slot: int
+    received: int
     name: str
+    handle: Handle
+    last_message: int
+    seconds: int
 
 
 @dataclass(frozen=True, slots=True)
-class _Route:
-    """What dispatch needs of a route. `senders` is by whatever `Engine._key` makes of an address."""
+class _Case:
+    """What dispatch needs of a payload case. `routes` is by IP address, or by (IP address, port)."""
 
-    case: str
+    name: str
     parse: Callable[[bytes], Message]
-    handle: Handle
-    senders: Mapping[object, _Sender]
-    stranger: _Sender | None
-    last_message: int
-    seconds: int
+    routes: Mapping[object, _Route]
+    stranger: _Route | None
 
 
 class _Rejected(Exception):
@@ -55,54 +56,60 @@ class _Rejected(Exception):
 
 
 class Engine:
-    """A program bound to the outside world.
+    """A program's routes from UDP, bound to the outside world.
 
-    `send` takes a datagram, by endpoint name, and may raise OSError. `publish` takes CDR bytes, by topic,
-    and may raise `publish_errors`. `wanted` says by topic whether anybody listens, in a list of one that
-    its owner keeps up to date. `report` hears of every loss; it is called only for those. Clocks in ns.
+    `arrived_at` tells by listener when the kernel got the datagram that was last received (wall clock, ns).
     """
 
-    def __init__(
-        self,
-        program: Program,
-        counts: list[int],
-        send: Mapping[str, Callable[[bytes], int]],
-        publish: Mapping[str, Callable[[bytes], None]],
-        wanted: Mapping[str, list[bool]],
-        report: Callable[[Report], None],
-        clock_ns: Callable[[], int],
-        wall_ns: Callable[[], int],
-        publish_errors: tuple[type[Exception], ...] = (),
-    ) -> None:
+    def __init__(self, program: Program, outlets: Outlets, arrived_at: Mapping[str, Callable[[], int]]) -> None:
         self._program = program
-        self._counts = counts
-        self._report = report
-        self._clock_ns = clock_ns
-        self._wall_ns = wall_ns
+        self._outlets = outlets
+        self._counts = outlets.counts
+        self._arrived_at = arrived_at
+        self._freshness = Freshness()
         self._case_numbers = frozenset(case.number for case in program.envelope.cases.values())
         self._by_host, self._by_address = recognisers(program.table.endpoints)
-        outlets = Outlets(counts, send, publish, wanted, report, publish_errors)
-        self._routes = {
-            number: self._route(handler, bind(handler, program.books, outlets))
-            for number, [handler] in program.inbound.items()
+        self._handles = {
+            handler.route: bind(handler, program.books, outlets, self._freshness)
+            for handlers in program.inbound.values()
+            for handler in handlers
         }
 
-    def _route(self, handler: Handler, handle: Handle) -> _Route:
-        books, case = self._program.books, handler.case.name
-        senders = {
-            source: _Sender(books.slot("messages_received", case, source_label(source)), source_label(source))
-            for source in handler.sources
+    def _cases(self, listener: str) -> dict[int, _Case]:
+        """What a listener's datagrams are given to, by field number."""
+        return {number: self._case(handlers, listener) for number, handlers in self._program.inbound.items()}
+
+    def _case(self, handlers: Sequence[Handler], listener: str) -> _Case:
+        by_source = {
+            source: self._route(handler, source, listener) for handler in handlers for source in handler.sources
         }
         addresses: list[tuple[object, str]] = [*self._by_host.items(), *self._by_address.items()]
-        return _Route(
-            case=case,
-            parse=handler.case.message_class.FromString,
-            handle=handle,
-            senders={key: senders[name] for key, name in addresses if name in senders},
-            stranger=senders.get(STRANGER),
-            last_message=books.slot("route_last_message_timestamp_seconds", case),
-            seconds=books.slot("route_seconds", case),
+        return _Case(
+            name=handlers[0].case.name,
+            parse=handlers[0].case.message_class.FromString,
+            routes={key: by_source[name] for key, name in addresses if name in by_source},
+            stranger=by_source.get(STRANGER),
         )
+
+    def _route(self, handler: Handler, source: str | None, listener: str) -> _Route:
+        books, label = self._program.books, source_label(source)
+        handle = self._handles[handler.route]
+        return _Route(
+            received=books.slot("messages_received", handler.route, label),
+            name=label,
+            handle=handle if handler.ttl is None else self._aged(handle, self._arrived_at[listener]),
+            last_message=books.slot("route_last_message_timestamp_seconds", handler.route),
+            seconds=books.slot("route_seconds", handler.route),
+        )
+
+    def _aged(self, handle: Handle, arrived_at: Callable[[], int]) -> Handle:
+        """Of a route with a `ttl`: the time that a datagram waited in the socket counts as well."""
+        born = self._freshness.born
+
+        def aged(message: Message, data: bytes, received_at: int, now: int, source: str) -> None:
+            handle(message, data, received_at, now, source, born(arrived_at(), received_at, now))
+
+        return aged
 
     def receiver(self, listener: str) -> Receive:
         """The function that takes the datagrams of one listener. It never raises for what was received.
@@ -111,13 +118,14 @@ class Engine:
         complete, of a routed case, from its endpoint) goes straight through.
         """
         books, counts = self._program.books, self._counts
-        # By tag, of those whose tag is two bytes at most.
-        routes = {number << 3 | LEN: route for number, route in self._routes.items() if number < 2048}
-        clock_ns, wall_ns, bounds = self._clock_ns, self._wall_ns, HISTOGRAM_BOUNDS_NS
+        cases = self._cases(listener)
+        # Of those whose tag is two bytes at most.
+        by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
+        clock_ns, wall_ns, bounds = self._outlets.clock_ns, self._outlets.wall_ns, HISTOGRAM_BOUNDS_NS
         received, received_bytes = books.slot("datagrams_received", listener), books.slot("received_bytes", listener)
         seen = self._seen_slots()
         by_address = self._by_address
-        settle, reject = self._settler(listener), self._rejecter(listener)
+        settle, reject = self._settler(listener, cases), self._rejecter(listener)
 
         def receive(data: bytes, peer: Peer) -> None:
             now = clock_ns()
@@ -135,22 +143,22 @@ class Engine:
                 length, start = data[start], start + 1
                 if length > 0x7F:
                     length, start = length & 0x7F | data[start] << 7, start + 1
-                route = routes[tag]
+                case = by_tag[tag]
                 if start + length != size or size > MAX_DATAGRAM:
                     raise LookupError
-                message = route.parse(data[start:])
+                message = case.parse(data[start:])
             except (LookupError, ProtobufError):  # not the usual datagram
                 try:
-                    route, message = settle(data)
+                    case, message = settle(data)
                 except _Rejected as rejected:
                     reject(rejected.reason, peer, str(rejected))
                     return
-            sender = route.senders.get(sender_key, route.stranger)
-            if sender is None:
-                reject("source_mismatch", peer, route.case)
+            route = case.routes.get(sender_key, case.stranger)
+            if route is None:
+                reject("source_mismatch", peer, case.name)
                 return
-            counts[sender.slot] += 1
-            route.handle(message, data, received_at, now, sender.name)
+            counts[route.received] += 1
+            route.handle(message, data, received_at, now, route.name)
             counts[route.last_message] = received_at
             elapsed = clock_ns() - now
             counts[route.seconds + bisect_left(bounds, elapsed)] += 1
@@ -163,14 +171,14 @@ class Engine:
         metric = "endpoint_last_seen_timestamp_seconds"
         return {key: self._program.books.slot(metric, name) for key, name in addresses}
 
-    def _settler(self, listener: str) -> Callable[[bytes], tuple[_Route, Message]]:
+    def _settler(self, listener: str, cases: Mapping[int, _Case]) -> Callable[[bytes], tuple[_Case, Message]]:
         """The unusual datagram: repaired if the listener's framing says so, then read by the protobuf library."""
         plan = next(plan for plan in self._program.listeners if plan.name == listener)
         repairs = plan.framing is Framing.ZERO_TRIMMED
         padded = self._program.books.slot("datagrams_padded", listener)
         counts, parse = self._counts, self._program.envelope.message_class.FromString
 
-        def settle(data: bytes) -> tuple[_Route, Message]:
+        def settle(data: bytes) -> tuple[_Case, Message]:
             if len(data) > MAX_DATAGRAM:
                 raise _Rejected("truncated", f"{len(data)} bytes")
             if not data:
@@ -182,33 +190,33 @@ class Engine:
                 raise _Rejected("malformed", str(error)) from error
             if len(whole) != len(data):
                 counts[padded] += 1
-            return self._find(envelope)
+            return self._find(envelope, cases)
 
         return settle
 
-    def _find(self, message: Message) -> tuple[_Route, Message]:
-        """The route and the payload of a parsed envelope, whatever else is in it. Raises _Rejected."""
+    def _find(self, message: Message, cases: Mapping[int, _Case]) -> tuple[_Case, Message]:
+        """The payload case and the payload of a parsed envelope, whatever else is in it. Raises _Rejected."""
         envelope = self._program.envelope
-        case = message.WhichOneof(envelope.oneof)
-        if case is None:
+        name = message.WhichOneof(envelope.oneof)
+        if name is None:
             reason, detail = why_no_payload(message, self._case_numbers)
             if reason == "unknown_case":
                 self._count_unhandled(UNKNOWN_CASE)
             raise _Rejected(reason, detail)
-        number = envelope.cases[case].number
-        route = self._routes.get(number)
-        if route is not None:
-            return route, getattr(message, case)
+        number = envelope.cases[name].number
+        case = cases.get(number)
+        if case is not None:
+            return case, getattr(message, name)
         if number in self._program.ignored:
-            raise _Rejected("ignored", case)
-        self._count_unhandled(case)
-        raise _Rejected("unhandled", case)
+            raise _Rejected("ignored", name)
+        self._count_unhandled(name)
+        raise _Rejected("unhandled", name)
 
     def _count_unhandled(self, case: str) -> None:
         self._counts[self._program.books.slot("unhandled", case)] += 1
 
     def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
-        books, counts, report = self._program.books, self._counts, self._report
+        books, counts, report = self._program.books, self._counts, self._outlets.report
         slots = {reason: books.slot("datagrams_rejected", listener, reason) for reason in REJECT_REASONS}
 
         def reject(reason: str, peer: Peer, what: str) -> None:

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router.compiler.cdr import write_message
-from router.compiler.expressions import Locals, Scope, Typed, check
-from router.compiler.handlers import bind_locals
+from router.compiler.expressions import ParsedReads, Scope, Typed, check
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.program import Handler, Program
@@ -16,12 +15,14 @@ from router.compiler.reference import fill
 from router.compiler.reference_cdr import cdr
 from router.compiler.reference_expressions import Context, View
 from router.compiler.source import Source
-from router.engine.binding import Outlets, bind
+from router.engine.binding import bind
+from router.engine.freshness import Freshness
 from router.engine.outcome import MAPPING_FAILURES, Report
 from router.errors import Diagnostic, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.places import TextPlace
 from router.types.model import Enum, MessageType, Type
+from tests.engine.plain import plain_outlets
 
 SPAN = SourceSpan("table.yaml", 7, 3, 9)
 RECEIVED_AT = 1_700_000_000_123_456_789
@@ -48,7 +49,7 @@ AUTO = field_map(True)
 
 
 def scope_of(message: MessageType, enums: Collection[Enum] = (), ros_types: Collection[MessageType] = ()) -> Scope:
-    return Scope(message, enums, ros_types, Locals())
+    return Scope(message, enums, ros_types, ParsedReads())
 
 
 def context_of(
@@ -62,7 +63,7 @@ def compiled(text: str, scope: Scope, expected: Type | None = None) -> tuple[Typ
     typed = check(written(text), scope, expected)
     out = Source()
     with out.block("def evaluate(m, source, received_at):", SPAN):
-        bind_locals(out, scope.locals, SPAN)
+        scope.reads.write(out, SPAN)
         out.line(f"return {out.expression(typed.node)}", SPAN)
     namespace: dict[str, Any] = dict(NAMESPACE)
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
@@ -75,7 +76,7 @@ def serializer(fields: FieldMap, target: MessageType, scope: Scope) -> Callable[
     assert mapping.findings == []
     out = Source()
     with out.block("def serialize(m, source, received_at):", SPAN):
-        bind_locals(out, scope.locals, SPAN)
+        scope.reads.write(out, SPAN)
         out.line(f"return {write_message(out, mapping.plan, 'it')}", SPAN)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
@@ -116,14 +117,13 @@ class Published:
         self._handle = bind(
             self.handler,
             self.program.books,
-            Outlets(
-                counts=self.program.books.fresh_counts(),
+            plain_outlets(
+                self.program.books,
                 send={name: self._sender(name) for name in endpoints},
                 publish={topic: self._publisher(topic) for topic in topics},
-                wanted={topic: [True] for topic in topics},
                 report=self.reports.append,
-                publish_errors=(),
             ),
+            Freshness(),
         )
 
     def _sender(self, endpoint: str) -> Callable[[bytes], int]:

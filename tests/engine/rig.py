@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
+from typing import ParamSpec, TypeVar
 
 from router.assets import asset
 from router.compiler import check_table
 from router.compiler.definitions import Definitions
 from router.compiler.program import Program
-from router.engine import Engine, Report
-from router.engine.binding import Outlets
+from router.engine import Engine, OutboundEngine, Report
+from router.engine.binding import Guarded, Outlets
+from router.engine.deadman import Deadman
+from router.engine.machine import Machine
+from router.engine.pacing import Pacer
 from tests.engine.ledger import Ledger
 
 HEAD = """version: 1
@@ -38,6 +42,8 @@ RIGHT_TOOL = ("192.168.0.60", 8002)
 STRANGER = ("192.168.0.99", 1234)
 
 Outlet = Callable[[bytes], None]
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 @cache
@@ -59,6 +65,7 @@ class Rig:
 
     `failures` makes an outlet raise, by endpoint or topic. `now` is the monotonic clock in ns, the wall
     clock is `WALL` ahead of it; every call of an outlet takes `work_ns`. `unwanted` topics have no subscriber.
+    `changes` has what deadmen said. One thread does everything here, so one list has all counts.
     """
 
     WALL = 1_700_000_000_000_000_000
@@ -74,29 +81,63 @@ class Rig:
         self.reports: list[Report] = []
         self.failures: dict[str, Exception] = {}
         self.wanted = {plan.topic: [plan.topic not in unwanted] for plan in made.publishers}
+        self.machines: list[Machine] = []
+        guarded = Guarded(self.counts, self._guard)
+        send = {plan.endpoint: self._sender(plan.endpoint) for plan in made.senders}
+        pacers = {plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in made.senders if plan.budget}
+        deadmen = {
+            plan.route: Deadman(plan, made.books, self.counts, send, self.reports.append, self._changed)
+            for plan in made.deadmen
+        }
+        self.machines += [*pacers.values(), *deadmen.values()]
         self.outlets = Outlets(
-            self.counts,
-            {plan.endpoint: self._sender(plan.endpoint) for plan in made.senders},
-            {plan.topic: self._outlet(plan.topic, self.published) for plan in made.publishers},
-            self.wanted,
-            self.reports.append,
-            (PublishError,),
+            counts=self.counts,
+            send=send,
+            publish={plan.topic: self._outlet(plan.topic, self.published) for plan in made.publishers},
+            wanted=self.wanted,
+            report=self.reports.append,
+            clock_ns=lambda: self.now,
+            wall_ns=lambda: self.WALL + self.now,
+            pacing=guarded,
+            collecting=guarded,
+            publish_errors=(PublishError,),
+            feed={route: deadman.feed for route, deadman in deadmen.items()},
+            pacers=pacers,
         )
-        engine = Engine(
-            made,
-            self.counts,
-            self.outlets.send,
-            self.outlets.publish,
-            self.wanted,
-            self.reports.append,
-            lambda: self.now,
-            lambda: self.WALL + self.now,
-            self.outlets.publish_errors,
-        )
+        self.arrived_before = 0
+        arrived_at = {plan.name: lambda: self.WALL + self.now - self.arrived_before for plan in made.listeners}
+        engine = Engine(made, self.outlets, arrived_at)
         self.receivers = {plan.name: engine.receiver(plan.name) for plan in made.listeners}
+        outbound = OutboundEngine(made, self.outlets)
+        self.takers = {plan.topic: outbound.taker(plan.topic) for plan in made.subscriptions}
+        self.changes: list[tuple[str, bool]] = []
 
     def receive(self, data: bytes, peer: tuple[str, int] = SENSOR_BOARD, listener: str = "trimmed") -> None:
         self.receivers[listener](data, peer)
+
+    def take(self, topic: str, cdr: bytes) -> None:
+        """A ROS message, which the middleware got `arrived_before` ns ago."""
+        self.takers[topic](cdr, self.WALL + self.now - self.arrived_before)
+
+    def pass_time(self, ns: int) -> None:
+        """Moves the clocks, and serves machines when they are due."""
+        until = self.now + ns
+        while (next_due := self._next_due()) is not None and next_due <= until:
+            self.now = max(self.now, next_due)
+            for machine in self.machines:
+                machine.due(self.now)
+        self.now = until
+
+    def _next_due(self) -> int | None:
+        return min((machine.next_due for machine in self.machines if machine.next_due is not None), default=None)
+
+    def _guard(self, machine: Machine, call: Callable[P, R]) -> Callable[P, R]:
+        if machine not in self.machines:
+            self.machines.append(machine)
+        return call
+
+    def _changed(self, route: str, active: bool) -> None:
+        self.changes.append((route, active))
 
     def count(self, metric: str, *labels: str, part: int = 0) -> int:
         return self.counts[self.program.books.slot(metric, *labels) + part]

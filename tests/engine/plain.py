@@ -1,0 +1,34 @@
+"""Outlets without threads: for an engine whose machines nobody serves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from router.compiler.books import Books
+from router.engine import Report
+from router.engine.binding import Outlets, unguarded
+
+
+def plain_outlets(
+    books: Books,
+    send: Mapping[str, Callable[[bytes], int]],
+    publish: Mapping[str, Callable[[bytes], None]],
+    report: Callable[[Report], None],
+    wall_ns: int = 0,
+    counts: list[int] | None = None,
+    publish_errors: tuple[type[Exception], ...] = (),
+) -> Outlets:
+    """Everybody listens on every topic, and the clocks stand still."""
+    counts = books.fresh_counts() if counts is None else counts
+    return Outlets(
+        counts=counts,
+        send=send,
+        publish=publish,
+        wanted={topic: [True] for topic in publish},
+        report=report,
+        clock_ns=lambda: 0,
+        wall_ns=lambda: wall_ns,
+        pacing=unguarded(counts),
+        collecting=unguarded(counts),
+        publish_errors=publish_errors,
+    )
