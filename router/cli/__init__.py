@@ -29,7 +29,7 @@ VERBS = {
     "validate": "say what is wrong with route tables",
     "explain": "show what a route does, field by field, and the code that does it",
     "send": "send envelopes with payloads of your choice",
-    "tap": "decode the envelopes that arrive on a port",
+    "tap": "show what arrives on a UDP port or a ROS topic",
     "sim": "play the boards and the basestation",
     "schema": "keep the field numbers of the wire types",
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from google.protobuf.message import Message
@@ -18,10 +18,14 @@ def words(message: Message, kind: MessageType, digits: int | None = None) -> Ite
         yield from _field_words(message, field, "", digits)
 
 
-def compact(message: Message, kind: MessageType, width: int | None = None, digits: int | None = None) -> str:
-    """The words as one line of at most `width` characters, `(all default)` when there are none."""
-    line = " ".join(map(_printable, words(message, kind, digits))) or "(all default)"
-    return line if width is None or len(line) <= width else line[: max(width - 1, 0)] + "…"
+def compact(message: Message, kind: MessageType, digits: int | None = None) -> str:
+    """The words as one line."""
+    return one_line(words(message, kind, digits))
+
+
+def one_line(words: Iterable[str]) -> str:
+    """`(all default)` when there are none."""
+    return " ".join(map(_printable, words)) or "(all default)"
 
 
 def _printable(word: str) -> str:

@@ -1,6 +1,6 @@
-"""What arrives on a UDP port, datagram by datagram, taken apart for a person or a program.
+"""What arrives on a UDP port or a ROS topic, one by one, taken apart for a person or a program.
 
-Knows no command line; `places` opens the socket.
+Knows no command line; `places` opens the socket, `edges.ros_listen` the subscription.
 """
 
 from __future__ import annotations
@@ -10,14 +10,22 @@ import json
 import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from google.protobuf.json_format import MessageToDict
 
 from router.errors import DecodeError
-from router.tools.show import compact
+from router.tools.ros_show import ros_json, ros_words
+from router.tools.show import compact, one_line
 from router.tools.wire import Decoded, Wire
 
+if TYPE_CHECKING:
+    from router.edges.ros_listen import TopicListener
+
 LARGEST_DATAGRAM = 65_507
+
+PATIENCE = 0.2
+"""Seconds after which Ctrl-C is noticed at the latest, while no message comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +40,7 @@ class Heard:
 
     def line(self, with_hex: bool) -> str:
         """`12:00:00.123 sensor_board imu_info accel_x=1.5`."""
-        start = f"{self.at.strftime('%H:%M:%S.%f')[:-3]} {self.peer}"
+        start = f"{_clock(self.at)} {self.peer}"
         if self.decoded is None:
             return f"{start} undecodable ({self.problem}): {self.data.hex() or 'no bytes'}"
         line = f"{start} {self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}"
@@ -55,6 +63,43 @@ class Heard:
         if with_hex or self.decoded is None:
             said["hex"] = self.data.hex()
         return json.dumps(said)
+
+
+@dataclass(frozen=True, slots=True)
+class HeardMessage:
+    """One ROS message: when it arrived (local time), its type, its CDR bytes, and rclpy's object of them."""
+
+    at: dt.datetime
+    type_name: str
+    cdr: bytes
+    message: Any
+
+    def line(self, with_hex: bool) -> str:
+        """`12:00:00.123 comms/msg/BasestationManualDrive forward_backward=5`."""
+        line = f"{_clock(self.at)} {self.type_name} {one_line(ros_words(self.message))}"
+        return f"{line} [{self.cdr.hex()}]" if with_hex else line
+
+    def json(self, with_hex: bool) -> str:
+        """One JSON object."""
+        said = {
+            "time": self.at.isoformat(),
+            "type": self.type_name,
+            "bytes": len(self.cdr),
+            "fields": ros_json(self.message),
+        }
+        return json.dumps(said | {"hex": self.cdr.hex()} if with_hex else said)
+
+
+def _clock(at: dt.datetime) -> str:
+    return f"{at:%H:%M:%S.%f}"[:-3]
+
+
+def listen_to_topic(listener: TopicListener) -> Iterator[HeardMessage]:
+    """Wait for one message after the other, for ever."""
+    while True:
+        for cdr, arrived in listener.take(PATIENCE):
+            at = dt.datetime.fromtimestamp(arrived / 1e9).astimezone()
+            yield HeardMessage(at, listener.type_name, cdr, listener.message(cdr))
 
 
 def listen(receiver: socket.socket, wire: Wire, name_of: Callable[[tuple[str, int]], str]) -> Iterator[Heard]:

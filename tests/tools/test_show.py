@@ -47,11 +47,6 @@ def test_defaults_are_left_out(every_kind: PayloadCase) -> None:
     assert compact(every_kind.message_class(), every_kind.type) == "(all default)"
 
 
-def test_a_line_is_cut_to_its_width(every_kind: PayloadCase) -> None:
-    message = every_kind.message_class(i32=123456, i64=5)
-    assert compact(message, every_kind.type, width=10) == "i32=12345…"
-
-
 def test_a_text_of_several_lines_stays_one_line(every_kind: PayloadCase) -> None:
     assert compact(every_kind.message_class(text="a\nb"), every_kind.type) == "'text=a\\nb'"
 

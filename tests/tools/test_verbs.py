@@ -11,6 +11,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from geometry_msgs.msg import Point
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from router.cli import main
 from router.tools.wire import read_table
@@ -111,6 +116,61 @@ def test_tap_prints_what_arrives(table_path: Callable[..., Path]) -> None:
         board.sendto(EMPTY_PLAIN, station)
         assert tap.stdout.read().split(" ", 1)[1] == "board plain (all default)\n"
     assert tap.returncode == 0
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publisher]:
+    """Of `tap_test`; what it has published reaches late subscribers as well."""
+    context = Context()
+    context.init()
+    node = Node("tap_test_publisher", context=context)
+    qos = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    yield node.create_publisher(Point, "tap_test", qos)
+    node.destroy_node()
+    context.shutdown()
+
+
+def test_tap_prints_what_a_topic_carries(publisher: Publisher) -> None:
+    publisher.publish(Point(x=1.5))
+    publisher.publish(Point(z=-2.0))
+    command = [sys.executable, "-m", "router", "tap", "--topic", "tap_test", "--count", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stderr.splitlines()[-1] == "listening to tap_test of geometry_msgs/msg/Point; Ctrl-C ends it"
+    assert [line.split(" ", 1)[1] for line in done.stdout.splitlines()] == [
+        "geometry_msgs/msg/Point x=1.5",
+        "geometry_msgs/msg/Point z=-2.0",
+    ]
+
+
+def test_tap_that_waits_for_a_topic_ends_with_ctrl_c() -> None:
+    command = [sys.executable, "-m", "router", "tap", "--topic", "nobody_publishes_this"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
+        assert tap.stderr is not None
+        assert tap.stderr.readline() == "waiting for a publisher of nobody_publishes_this; Ctrl-C ends it\n"
+        tap.send_signal(signal.SIGINT)
+        out, err = tap.communicate()
+    assert (tap.returncode, out, err) == (0, "", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--topic", "t", "--type", "Point"], "'Point' is no message type; they are written like std_msgs/msg/String"),
+        (["--topic", "t", "--type", "no/msg/Such"], "no/msg/Such is not installed"),
+        (["--topic", "no topic", "--type", "std_msgs/msg/String"], "topic 'no topic' cannot be listened to: "),
+        (["5000", "--type", "std_msgs/msg/String"], "--type belongs to --topic"),
+    ],
+)
+def test_a_mistake_in_tap_is_one_line_and_exit_code_2(
+    words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["tap", *words]) == 2
+    assert f"router tap: {complaint}" in capsys.readouterr().err
+
+
+def test_tap_listens_to_a_port_or_a_topic_not_both() -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["tap", "5000", "--topic", "imu_data"])
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
