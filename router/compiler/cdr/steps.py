@@ -19,6 +19,8 @@ from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 HEADER = b"\x00\x01\x00\x00"
 """Representation identifier CDR_LE and two option bytes."""
 
+CDR_LE = HEADER[:2]
+
 _EMPTY = b"\0"
 """What stands for a message without fields: IDL has none, so rosidl adds `structure_needs_at_least_one_member`."""
 

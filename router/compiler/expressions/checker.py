@@ -23,9 +23,13 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
     """Raises Finding. `expected` is the field to be filled: clamp() and wrap() take bounds of it, bare names values."""
     if expression.items is not None:
         items = [check(item, scope, _element(expected)) for item in expression.items]
-        return literals.list_of(items, expression.span)
-    text = Parsed(expression)
-    return _Checker(text, scope).check(text.tree, expected)
+        typed = literals.list_of(items, expression.span)
+    else:
+        text = Parsed(expression)
+        typed = _Checker(text, scope).check(text.tree, expected)
+    if typed.path is None:
+        scope.reads.need_objects(typed.node)
+    return typed
 
 
 def _element(expected: Type | None) -> Type | None:

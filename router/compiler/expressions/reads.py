@@ -33,6 +33,10 @@ class Reads(ABC):
         """The submessage at a path."""
 
     @abstractmethod
+    def need_objects(self, node: ast.expr) -> None:
+        """Told of each expression that is more than a path: a message in it must be there as an object."""
+
+    @abstractmethod
     def write(self, out: Source, span: SourceSpan) -> None:
         """Appends the statements that make what the expressions use; to be called when all of them are checked."""
 
@@ -61,6 +65,9 @@ class ParsedReads(Reads):
         if path:
             self.message(path[:-1])  # a submessage's own holder comes before it
         return load(self._variable(path))
+
+    def need_objects(self, node: ast.expr) -> None:
+        """They always are."""
 
     def write(self, out: Source, span: SourceSpan) -> None:
         for path, variable in self.variables.items():
