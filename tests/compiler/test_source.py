@@ -8,9 +8,8 @@ import traceback
 
 import pytest
 
-from router.compiler import check_table
+from router.compiler import Checked, check_table
 from router.compiler.books import Books
-from router.compiler.checked import CheckedRoute
 from router.compiler.definitions import Definitions
 from router.compiler.handlers import HandlerSource
 from router.compiler.source import Source
@@ -21,19 +20,26 @@ from tests.compiler.conftest import ROUTES, CheckText
 SPAN = SourceSpan("table.yaml", 3, 5, 9)
 
 
-def generated(route: CheckedRoute) -> Source:
-    generator = HandlerSource(route.case.name, Books(), route.route.case.span)
-    generator.generate([served.target for served in route.targets])
-    return generator.out
+def generated(checked: Checked) -> list[Source]:
+    """The code of all routes of a table."""
+    assert checked.schema is not None
+    made = []
+    for route in checked.routes:
+        generator = HandlerSource(route.route, route.case, checked.schema, Books())
+        if not route.route.is_outbound:
+            generator.inbound([served.target for served in route.targets], route.collect)
+            made.append(generator.out)
+        for feed in route.feeds:
+            generator = HandlerSource(route.route, route.case, checked.schema, Books())
+            generator.outbound(feed)
+            made.append(generator.out)
+    assert made
+    return made
 
 
 @pytest.mark.parametrize("table", ["rover", "sim", "legacy"])
 def test_text_is_the_code_that_runs(definitions: Definitions, table: str) -> None:
-    checked = check_table(ROUTES / f"{table}.yaml", {}, definitions)
-    inbound = [route for route in checked.routes if not route.route.is_outbound]
-    assert inbound
-    for route in inbound:
-        out = generated(route)
+    for out in generated(check_table(ROUTES / f"{table}.yaml", {}, definitions)):
         # unparsed, because a literal -1 is one node in the tree and two in parsed text
         assert ast.unparse(ast.parse(out.text())) == ast.unparse(out.tree())
 
@@ -43,10 +49,8 @@ def test_every_node_stands_somewhere_in_the_table(definitions: Definitions, tabl
     checked = check_table(ROUTES / f"{table}.yaml", {}, definitions)
     assert checked.table is not None
     lines = max(len(path.read_text(encoding="utf-8").splitlines()) for path in checked.table.files)
-    for route in checked.routes:
-        if route.route.is_outbound:
-            continue
-        for node in ast.walk(generated(route).tree()):
+    for out in generated(checked):
+        for node in ast.walk(out.tree()):
             if isinstance(node, (ast.expr, ast.stmt)):
                 assert 1 <= node.lineno <= lines
                 assert node.end_col_offset is not None
