@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from router.compiler.books import DROP_REASONS, Books
+from router.compiler.books import Books
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
 from router.engine.delivery import Deliver, immediately
@@ -14,7 +14,7 @@ from router.engine.freshness import Freshness
 from router.engine.latest import Latest
 from router.engine.limiter import RateLimit
 from router.engine.machine import Guard
-from router.engine.outcome import MAPPING_FAILURES, Outcome, Report, reason_of
+from router.engine.outcome import MAPPING_FAILURES, Outcome, Report
 from router.engine.pacing import Pacer
 from router.table.model import Keep
 
@@ -81,7 +81,7 @@ def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness)
 
 def _bound(target: TargetPlan, route: str, books: Books, outlets: Outlets) -> dict[str, Any]:
     name = target.name
-    bound: dict[str, Any] = {f"lost_{name}": _lost(route, target, books, outlets)}
+    bound: dict[str, Any] = {f"lost_{name}": Outcome(books, outlets.counts, route, target, outlets.report).failed}
     if target.is_topic:
         bound[f"wanted_{name}"] = outlets.wanted[target.target]
     if target.is_deferred:
@@ -94,18 +94,6 @@ def _bound(target: TargetPlan, route: str, books: Books, outlets: Outlets) -> di
     if target.max_rate is not None and target.keep is Keep.FIRST:
         bound[f"limit_{name}"] = RateLimit(target.max_rate).may_pass
     return bound
-
-
-def _lost(route: str, target: TargetPlan, books: Books, outlets: Outlets) -> Callable[[Exception], None]:
-    slots = {reason: books.slot("messages_dropped", route, target.target, reason) for reason in DROP_REASONS}
-    counts, report = outlets.counts, outlets.report
-
-    def lost(error: Exception) -> None:
-        reason = reason_of(error, target.is_topic)
-        counts[slots[reason]] += 1
-        report(Report("drop", route, target.target, reason, error))
-
-    return lost
 
 
 def _collect(handler: Handler, timeout: int, books: Books, outlets: Outlets) -> Callable[..., list[object] | None]:

@@ -32,17 +32,6 @@ class Report:
     detail: str = ""
 
 
-def reason_of(error: Exception, is_topic: bool) -> str:
-    """The drop reason of what a mapping, the network or the middleware raised."""
-    if isinstance(error, NonFiniteError):
-        return "non_finite"
-    if isinstance(error, MAPPING_FAILURES):
-        return "mapping_error"
-    if is_topic:
-        return "publish_error"
-    return "send_buffer_full" if isinstance(error, OSError) and error.errno in _FULL else "send_error"
-
-
 class Outcome:
     """The books of one target of one route, in a list of counts that its user owns.
 
@@ -81,7 +70,7 @@ class Outcome:
 
     def failed(self, error: Exception) -> None:
         """Lost because mapping it or handing it over raised `error`."""
-        self.dropped(reason_of(error, self._is_topic), error)
+        self.dropped(_reason(error, self._is_topic), error)
 
     def filtered(self) -> None:
         self._counts[self._filtered] += 1
@@ -89,3 +78,13 @@ class Outcome:
     def collected(self) -> None:
         """Joined a frame. Only a target of a route that collects has this series, so the slot is looked up."""
         self._counts[self._books.slot("messages_collected", self._route, self._target)] += 1
+
+
+def _reason(error: Exception, is_topic: bool) -> str:
+    if isinstance(error, NonFiniteError):
+        return "non_finite"
+    if isinstance(error, MAPPING_FAILURES):
+        return "mapping_error"
+    if is_topic:
+        return "publish_error"
+    return "send_buffer_full" if isinstance(error, OSError) and error.errno in _FULL else "send_error"
