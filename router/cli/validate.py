@@ -83,5 +83,6 @@ def _is_table(file: Path) -> bool:
 def summary(table: RouteTable) -> str:
     """`26 payload cases, 31 topics, 8 endpoints`."""
     topics = sum(len(route.topics) for route in table.routes)
-    counts = (len(table.routes), "payload case"), (topics, "topic"), (len(table.endpoints), "endpoint")
+    cases = {route.case.value for route in table.routes}
+    counts = (len(cases), "payload case"), (topics, "topic"), (len(table.endpoints), "endpoint")
     return ", ".join(plural(count, noun) for count, noun in counts)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from router.compiler.cdr.reading import CdrReads
 from router.compiler.checked import CheckedFeed, CheckedRoute, CheckedTarget
 from router.compiler.destinations import destinations, target_to
-from router.compiler.expressions import ParsedReads, Scope, Typed
+from router.compiler.expressions import Scope, Typed
 from router.compiler.kinds import ListKind, kind_of
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
@@ -56,7 +57,7 @@ def _feed(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
 ) -> CheckedFeed | None:
     """None where it is not known what `item` is: all that names it would only seem wrong."""
-    reads = ParsedReads()
+    reads = CdrReads(ros_type)
     scope = lookup.scope(ros_type, reads, ros_type)
     stamp = _stamp(scope, topic.span) if route.ttl else None
     for_each = None
