@@ -90,9 +90,9 @@ class RosEdge:
         return subscription.events
 
     def start(self, receive: Mapping[str, Receive], failed: Callable[[Exception], None]) -> None:
-        """Calls `receive[topic]` with each message's CDR bytes and its arrival in wall clock ns, on one thread.
+        """Calls `receive[topic]` with each message's CDR bytes and the wall clock ns at which it set out.
 
-        What that raises goes to `failed`.
+        One thread does that. What it raises goes to `failed`.
         """
         if self._subscriptions:
             self._messages = MessageThread(self._node, self._subscriptions, receive, failed)

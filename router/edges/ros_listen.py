@@ -48,7 +48,7 @@ class TopicListener:
             self._open = opening.pop_all()
 
     def take(self, timeout: float) -> list[tuple[bytes, int]]:
-        """Waits up to `timeout` seconds for messages: the CDR bytes of each, and its arrival in wall clock ns.
+        """Waits up to `timeout` seconds for messages: the CDR bytes of each, and the wall clock ns at which it set out.
 
         Ctrl-C is only noticed when the wait is over.
         """

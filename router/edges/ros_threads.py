@@ -65,7 +65,7 @@ class EventThread(_WaitThread):
 
 
 class MessageThread(_WaitThread):
-    """Calls `receive[topic]` with each message's CDR bytes and its arrival in wall clock ns.
+    """Calls `receive[topic]` with each message's CDR bytes and the wall clock ns at which it set out.
 
     What that raises goes to `failed`, and receiving goes on. Stopping serves what has arrived by then.
     """

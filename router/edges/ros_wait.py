@@ -41,12 +41,18 @@ class RawSubscription:
         self._message_class = message_class
 
     def take(self) -> tuple[bytes, int] | None:
-        """The oldest message that waits, and when it arrived by the wall clock in ns; None when there is none."""
+        """The oldest message that waits, and when it set out, in ns of the wall clock; None when there is none.
+
+        That is when it was sent by the sender's clock, or came in by ours if that is earlier. When it came in alone
+        would make new what is not: reliable DDS repairs a loss seconds later, keeps messages for late joiners, and
+        a process that was stopped finds all that was sent meanwhile coming in at once.
+        """
         taken = self.handle.take_message(self._message_class, True)
         if taken is None:
             return None
         cdr, info = taken
-        return cdr, info["received_timestamp"] or wall_ns()  # 0 from a middleware that does not tell
+        sent, came_in = info["source_timestamp"], info["received_timestamp"]  # 0 from a middleware that does not tell
+        return cdr, min(sent or came_in, came_in or sent) or wall_ns()
 
 
 class WaitSet:

@@ -44,11 +44,11 @@ def raising(error: Exception) -> None:
 
 
 class Receiver:
-    """Receives on `subscriptions`; `messages` has what came, in order, each with its topic."""
+    """Receives on `subscriptions`; `messages` has what came, each with its topic, and `stamps` their times."""
 
     def __init__(self, *subscriptions: TopicPlan) -> None:
         self.messages: list[tuple[str, bytes]] = []
-        self.arrivals: list[int] = []
+        self.stamps: list[int] = []
         self.failures: list[Exception] = []
         self.ros = open_ros(subscriptions=subscriptions)
         self._topics = [plan.topic for plan in subscriptions]
@@ -57,8 +57,8 @@ class Receiver:
         self.ros.start({topic: self._receiver(topic) for topic in self._topics}, self.failures.append)
 
     def _receiver(self, topic: str) -> Callable[[bytes, int], None]:
-        def receive(data: bytes, arrived_at: int) -> None:
-            self.arrivals.append(arrived_at)
+        def receive(data: bytes, stamp: int) -> None:
+            self.stamps.append(stamp)
             self.messages.append((topic, data))
 
         return receive
@@ -83,7 +83,7 @@ def test_bytes_arrive_as_they_were_sent(publisher: Publish, qos: QosPlan, option
         publisher("greeting", *options).publish(texts)
         wait_until(lambda: len(receiver.messages) == len(texts))
     assert receiver.of("greeting") == texts
-    assert before < receiver.arrivals[0] <= receiver.arrivals[-1] <= wall_ns()
+    assert before < receiver.stamps[0] <= receiver.stamps[-1] <= wall_ns()
 
 
 def test_a_burst_as_long_as_the_queue_arrives_whole_and_in_order(publisher: Publish) -> None:
@@ -95,12 +95,15 @@ def test_a_burst_as_long_as_the_queue_arrives_whole_and_in_order(publisher: Publ
     assert receiver.of("greeting") == burst
 
 
-def test_late_joining_gets_what_was_kept() -> None:
+def test_late_joining_gets_what_was_kept_and_it_is_as_old_as_it_is() -> None:
     with closing(Publisher("greeting", STRING, "--transient-local")) as peer:
         peer.publish([HELLO])
+        peer.await_receipt()
+        sent_before = wall_ns()
         with Receiver(string_topic(QosPlan("reliable", "transient_local", "keep_last", 10))) as receiver:
             receiver.start()
             wait_until(lambda: receiver.of("greeting") == [HELLO])
+        assert receiver.stamps[0] < sent_before
 
 
 def test_nothing_is_received_before_the_start_and_nothing_is_lost(publisher: Publish) -> None:
