@@ -1,7 +1,7 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
-Knows `extends`, and that a route is either carried or ignored. Mappings merge key by key, everything else
-replaces; every node keeps the span of the file in which it was written.
+Knows `extends`, that a route is either carried or ignored, and that a deadman sends one payload. Mappings merge key
+by key, everything else replaces; every node keeps the span of the file in which it was written.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from router.table.source import Source, read_source
 KEY = "extends"
 IGNORE = "ignore"
 _ROUTE_DEPTH = len(("routes", "case"))
+_PAYLOAD = ("deadman", "send")
 
 
 def load_chain(
@@ -62,9 +63,12 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
-    """A route that one of the two ignores and the other carries: there is nothing to merge."""
-    is_route = len(path) == _ROUTE_DEPTH and path[0] == "routes"
-    return is_route and (IGNORE in over.entries) != (IGNORE in base.entries)
+    """Nothing to merge: a route that one of the two ignores and the other carries; payloads of two cases."""
+    if path[0] != "routes":
+        return False
+    if path[_ROUTE_DEPTH:] == _PAYLOAD:
+        return over.entries.keys() != base.entries.keys()
+    return len(path) == _ROUTE_DEPTH and (IGNORE in over.entries) != (IGNORE in base.entries)
 
 
 def _root_mapping(root: Node) -> MappingNode:

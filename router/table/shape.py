@@ -90,8 +90,19 @@ def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnost
         raise TypeError("only a mapping has keys")
     for name, entry in node.entries.items():
         if name not in known and not entry.key.broken:
-            hint = did_you_mean(name, known)
+            elsewhere = "" if nearest(name, known) else _owners(name)
+            hint = elsewhere or did_you_mean(name, known)
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{subject(path)} has no key '{name}'", hint)
+
+
+def _owners(name: str) -> str:
+    """A hint for a key that there is, but elsewhere in a table; empty where there is no such key."""
+    owners = [owner for owner, schema in table_schema()["definitions"].items() if _has(schema, name)]
+    return f"that is a key of: {', '.join(owners)}" if owners else ""
+
+
+def _has(schema: Any, name: str) -> bool:
+    return any(name in part.get("properties", ()) for part in (schema, schema.get("then", {}), schema.get("else", {})))
 
 
 def _with_known_keys(node: Node, known: list[str]) -> Node:

@@ -18,7 +18,7 @@ listen:
   rover: {address: 0.0.0.0:5000, framing: exact, receive_buffer: 64kB}
 endpoints:
   sensor_board: {address: 192.168.0.30:8, kind: board, source_port: 9}
-  basestation: {address: "${BASESTATION:-192.168.0.10:9000}", kind: basestation, trim_trailing_zeros: true}
+  basestation: {address: "${BASESTATION:-192.168.0.10:9000}", kind: tool, trim_trailing_zeros: true, budget: 500kB/s}
 routes:
   imu_info:
     source: sensor_board
@@ -44,6 +44,23 @@ routes:
     fields: auto
     destinations: [basestation]
   ph_info: {ignore: nobody needs it}
+  manual_drive:
+    source: basestation
+    destinations: [{endpoint: sensor_board, max_rate: 20 Hz, keep: latest}]
+    priority: command
+    ttl: 200ms
+    deadman: {timeout: 300 ms, send: {manual_brake: {brake: true, by.who: "'router'"}}, to: [sensor_board, basestation]}
+  detected_object:
+    - source: ros
+      for_each: detections
+      topics: [{topic: detected_objects, type: comms/msg/DetectedObjectArray}]
+      fields: {auto: true, total_count: count}
+      destinations: [basestation]
+      deadman: nothing moves because of it
+    - source: [basestation, sensor_board]
+      collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
+      topics: [{topic: objects, type: comms/msg/DetectedObjectArray, fields: {detections: items}}]
+    - {source: ros, topics: [{topic: it, type: comms/msg/DetectedObject}], fields: auto, destinations: [basestation]}
 """
 
 

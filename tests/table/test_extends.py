@@ -50,6 +50,49 @@ def test_a_route_is_turned_off_and_on_as_a_whole(base: Path) -> None:
     assert (table.routes[0].ignore, table.routes[0].topics) == (None, ())
 
 
+def test_a_list_of_routes_replaces_and_is_replaced_whole(base: Path) -> None:
+    text = """\
+extends: base.yaml
+routes:
+  imu_info: [{source: sensor_board, destinations: [basestation]}, {source: ros, topics: [], fields: auto}]
+  detected_object: {source: any, destinations: [basestation]}
+  ph_info: [{source: any, destinations: [basestation]}]
+"""
+    table, findings = load(base, text)
+    assert not findings
+    assert table
+    names = [route.name for route in table.routes]
+    assert names == [
+        "imu_info_from_sensor_board", "imu_info_from_ros", "arm_target", "ph_info", "manual_drive", "detected_object",
+    ]  # fmt: skip
+    assert all(route.ignore is None and route.collect is None for route in table.routes)
+
+
+@pytest.mark.parametrize(
+    ("send", "case", "fields"),
+    [
+        ("{manual_brake: {brake: false}}", "manual_brake", {"brake": "false", "by.who": "'router'"}),
+        ("{drive_motor: {speed: 0}}", "drive_motor", {"speed": "0"}),
+    ],
+)
+def test_a_deadman_merges_but_for_the_payload_of_another_case(
+    base: Path, send: str, case: str, fields: dict[str, str]
+) -> None:
+    table, findings = load(base, f"extends: base.yaml\nroutes:\n  manual_drive: {{deadman: {{send: {send}}}}}\n")
+    assert not findings
+    assert table
+    [deadman] = [route.deadman for route in table.routes if route.deadman]
+    assert (deadman.timeout.value, deadman.case.value) == (300_000_000, case)
+    assert {".".join(entry.path): entry.value.text for entry in deadman.fields.entries} == fields
+
+
+def test_a_reason_takes_the_place_of_a_deadman(base: Path) -> None:
+    table, findings = load(base, "extends: base.yaml\nroutes:\n  manual_drive: {deadman: no wheels here}\n")
+    assert not findings
+    assert table
+    assert not any(route.deadman for route in table.routes)
+
+
 def test_values_keep_the_place_where_they_were_written(base: Path) -> None:
     table, _ = load(base, "extends: base.yaml\nendpoints:\n  basestation: {address: 127.0.0.9:1}\n")
     assert table

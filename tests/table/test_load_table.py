@@ -7,7 +7,7 @@ import pytest
 
 from router.errors import Code
 from router.table import load_table
-from router.table.model import Address, EndpointKind, Framing, RouteTable
+from router.table.model import Address, EndpointKind, Framing, Keep, Priority, Route, RouteTable
 from tests.table.tables import GOOD, load, places
 
 
@@ -17,6 +17,11 @@ def table(tmp_path: Path) -> RouteTable:
     assert findings == []
     assert table
     return table
+
+
+def route(table: RouteTable, name: str) -> Route:
+    [found] = [route for route in table.routes if route.name == name]
+    return found
 
 
 def test_listeners_endpoints_and_settings_are_typed(table: RouteTable) -> None:
@@ -31,10 +36,11 @@ def test_listeners_endpoints_and_settings_are_typed(table: RouteTable) -> None:
     board, basestation = table.endpoints.values()
     assert (board.kind, board.source_port and board.source_port.value) == (EndpointKind.BOARD, 9)
     assert (basestation.address.value.port, basestation.trim_trailing_zeros) == (9000, True)
+    assert (board.budget, basestation.budget and basestation.budget.value) == (None, 500_000)
 
 
 def test_routes_are_typed(table: RouteTable) -> None:
-    imu, arm, ph = table.routes
+    imu, arm, ph, *_ = table.routes
     assert [source.value for source in imu.sources] == ["sensor_board"]
     assert [destination.endpoint.value for destination in imu.destinations] == ["basestation", "basestation"]
     conditional = imu.destinations[1]
@@ -51,6 +57,71 @@ def test_routes_are_typed(table: RouteTable) -> None:
     assert arm.fields.auto
     assert ph.ignore
     assert ph.ignore.value == "nobody needs it"
+
+
+def test_what_a_route_says_of_time_and_order_is_typed(table: RouteTable) -> None:
+    drive = route(table, "manual_drive")
+    [destination] = drive.destinations
+    assert destination.keep
+    assert destination.keep.value is Keep.LATEST
+    assert drive.priority
+    assert drive.priority.value is Priority.COMMAND
+    assert drive.ttl
+    assert drive.ttl.value == 200_000_000
+
+
+def test_a_deadman_is_typed(table: RouteTable) -> None:
+    deadman = route(table, "manual_drive").deadman
+    assert deadman
+    assert (deadman.timeout.value, deadman.repeat.value, deadman.case.value) == (
+        300_000_000,
+        100_000_000,
+        "manual_brake",
+    )
+    assert [name.value for name in deadman.to] == ["sensor_board", "basestation"]
+    assert not deadman.fields.auto
+    fields = {entry.path: entry.value.text for entry in deadman.fields.entries}
+    assert fields == {("brake",): "true", ("by", "who"): "'router'"}
+
+
+def test_a_payload_of_defaults_and_a_repeat_of_its_own_are_taken(tmp_path: Path) -> None:
+    text = GOOD.replace("{brake: true, by.who: \"'router'\"}", "{}").replace(
+        "300 ms, send", "300 ms, repeat: 20ms, send"
+    )
+    table, findings = load(tmp_path, text)
+    assert not findings
+    assert table
+    deadman = route(table, "manual_drive").deadman
+    assert deadman
+    assert (deadman.repeat.value, deadman.fields.entries) == (20_000_000, ())
+
+
+def test_a_case_may_have_several_routes_each_with_a_name(table: RouteTable) -> None:
+    routes = [route for route in table.routes if route.case.value == "detected_object"]
+    assert [route.name for route in routes] == [
+        "detected_object_from_ros", "detected_object_from_basestation", "detected_object_from_ros_2",
+    ]  # fmt: skip
+    each, together, _ = routes
+    assert each.for_each
+    assert each.for_each.text == "detections"
+    assert each.deadman is None
+    assert each.no_deadman
+    assert each.no_deadman.value == "nothing moves because of it"
+    assert together.collect
+    collect = together.collect
+    assert (collect.by.text, collect.count.text, collect.order.text) == ("frame_id", "total_count", "index")
+    assert collect.timeout.value == 1_000_000_000
+
+
+def test_names_of_routes_differ_whatever_cases_are_called(tmp_path: Path) -> None:
+    text = GOOD + "  detected_object_from_ros: {source: any, destinations: [basestation]}\n  imu: [{source: any}]\n"
+    table, findings = load(tmp_path, text)
+    assert not findings
+    assert table
+    assert [route.name for route in table.routes][-5:] == [
+        "detected_object_from_ros_2", "detected_object_from_basestation", "detected_object_from_ros_3",
+        "detected_object_from_ros", "imu",
+    ]  # fmt: skip
 
 
 def test_fields_are_flattened_to_paths_with_a_place_for_each_part(table: RouteTable) -> None:
@@ -163,3 +234,46 @@ def test_the_environment_is_the_process_environment_unless_given(
     table, _ = load_table(path)
     assert table
     assert table.endpoints["basestation"].address.value == Address("10.0.0.9", 1)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [("300 ms, send", "0s, send"), ("manual_brake: {", "manual_brake: 5, x: {"), ("to: [sensor_board, ", "to: [5, ")],
+)
+def test_of_a_route_with_a_broken_deadman_the_rest_is_left(tmp_path: Path, right: str, wrong: str) -> None:
+    table, findings = load(tmp_path, GOOD.replace(right, wrong))
+    assert findings
+    assert table
+    drive = route(table, "manual_drive")
+    assert (drive.deadman, drive.no_deadman, len(drive.destinations)) == (None, None, 1)
+    assert table.broken == {"routes/manual_drive"}  # which tells it from one that has none
+
+
+def test_of_a_deadman_with_a_broken_repeat_the_rest_is_left(tmp_path: Path) -> None:
+    table, [finding] = load(tmp_path, GOOD.replace("300 ms, send", "300 ms, repeat: often, send"))
+    assert finding.code is Code.BAD_VALUE
+    assert table
+    assert route(table, "manual_drive").deadman
+
+
+def test_of_several_routes_the_sound_ones_and_the_sound_parts_are_left(tmp_path: Path) -> None:
+    text = GOOD.replace("[basestation, sensor_board]", "[5]").replace(
+        "[basestation]\n      deadman", "5\n      deadman"
+    )
+    table, findings = load(tmp_path, text)
+    assert len(findings) == 2
+    assert table
+    assert table.broken == {"routes/detected_object"}
+    routes = [route for route in table.routes if route.case.value == "detected_object"]
+    assert [(len(route.topics), len(route.destinations)) for route in routes] == [(1, 0), (1, 1)]
+
+
+def test_expressions_are_left_out_with_what_gives_them_their_names(tmp_path: Path) -> None:
+    text = GOOD.replace("order: index, ", "").replace("for_each: detections", "for_each: 5")
+    table, findings = load(tmp_path, text)
+    assert len(findings) == 2
+    assert table
+    each = route(table, "detected_object_from_ros")
+    assert (each.for_each, each.fields, each.destinations, len(each.topics)) == (None, None, (), 1)
+    together = route(table, "detected_object_from_basestation")
+    assert (together.collect, together.topics) == (None, ())

@@ -15,6 +15,7 @@ from tests.table.tables import GOOD, load
 LINES = GOOD.splitlines(keepends=True)
 WORDS = ["version", "extends", "envelope", "listen", "endpoints", "routes", "imu_info", "source", "topics", "fields"]
 WORDS += ["qos", "depth", "auto", "ros", "any", "address", "kind", "ignore", "when", "max_rate", "<<", "no", "0777"]
+WORDS += ["deadman", "timeout", "send", "to", "collect", "by", "for_each", "keep", "ttl", "budget", "latest", "1s"]
 
 scalars = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from([*WORDS, "${X"])

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from router.table.units import parse_duration, parse_rate, parse_size
+from router.table.units import parse_data_rate, parse_duration, parse_rate, parse_size
 
 
 @pytest.mark.parametrize(
@@ -29,6 +29,11 @@ def test_sizes_are_exact(text: str, size: int) -> None:
     assert parse_size(text) == size
 
 
+@pytest.mark.parametrize(("text", "rate"), [("500kB/s", 500_000), ("1 MiB/s", 1 << 20), ("0.5kB/s", 500), ("9B/s", 9)])
+def test_data_rates_are_exact(text: str, rate: int) -> None:
+    assert parse_data_rate(text) == rate
+
+
 @pytest.mark.parametrize(("value", "hertz"), [("30 Hz", 30.0), ("0.5Hz", 0.5), (10, 10.0), (0.25, 0.25)])
 def test_rates_are_numbers_or_carry_their_unit(value: str | float, hertz: float) -> None:
     assert parse_rate(value) == hertz
@@ -49,6 +54,12 @@ def test_rates_are_numbers_or_carry_their_unit(value: str | float, hertz: float)
         (parse_size, "0B"),
         (parse_size, "1.5B"),
         (parse_size, "1024MiB"),
+        (parse_size, "64kB/s"),
+        (parse_data_rate, "64kB"),
+        (parse_data_rate, "64 kbit/s"),
+        (parse_data_rate, "0kB/s"),
+        (parse_data_rate, "0.5B/s"),
+        (parse_data_rate, "999999999999999MB/s"),
         (parse_rate, "30"),
         (parse_rate, "0 Hz"),
         (parse_rate, 0),
