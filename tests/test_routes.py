@@ -105,7 +105,24 @@ def test_rover_table_keeps_the_existing_topics_and_names_the_others_after_their_
     for route in rover.table.routes:
         plain = [topic.topic.value for topic in route.topics if topic.type.value.startswith("comms/")]
         assert len(plain) == 1
-        assert plain[0] == route.case.value or plain[0] in EXISTING_TOPICS
+        named = route.case.value + "s" * (route.for_each is not None)
+        assert plain[0] == named or plain[0] in EXISTING_TOPICS
+
+
+def test_commands_that_move_the_rover_go_stale_and_have_a_deadman(rover: Program) -> None:
+    stops = {
+        "drive_motor": ("manual_brake", ("driving_board",)),
+        "manual_drive": ("manual_brake", ("driving_board",)),
+        "manual_arm": ("manual_arm", ("arm_board",)),
+    }
+    routes = {route.name: route for route in rover.table.routes}
+    assert {name for name, route in routes.items() if route.deadman} == set(stops)
+    for name, (case, to) in stops.items():
+        deadman, ttl = routes[name].deadman, routes[name].ttl
+        assert deadman is not None
+        assert (deadman.case.value, tuple(endpoint.value for endpoint in deadman.to)) == (case, to)
+        assert ttl is not None
+        assert ttl.value < deadman.timeout.value
 
 
 def test_simulation_table_is_the_rover_on_loopback_addresses_of_its_own(rover: Program) -> None:

@@ -144,5 +144,6 @@ class Published:
         self.reports.clear()
         for published in self.topics.values():
             published.clear()
-        self._handle(message, b"datagram", RECEIVED_AT, 1, SOURCE)
+        born = (1,) if self.handler.ttl is not None else ()
+        self._handle(message, b"datagram", RECEIVED_AT, 1, SOURCE, *born)
         return {topic: published[0] for topic, published in self.topics.items() if published}

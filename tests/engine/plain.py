@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 
 from router.compiler.books import Books
@@ -18,7 +19,7 @@ def plain_outlets(
     counts: list[int] | None = None,
     publish_errors: tuple[type[Exception], ...] = (),
 ) -> Outlets:
-    """Everybody listens on every topic, and the clocks stand still."""
+    """Everybody listens on every topic, the clocks stand still, and no deadman ever trips."""
     counts = books.fresh_counts() if counts is None else counts
     return Outlets(
         counts=counts,
@@ -31,4 +32,5 @@ def plain_outlets(
         pacing=unguarded(counts),
         collecting=unguarded(counts),
         publish_errors=publish_errors,
+        feed=defaultdict(lambda: lambda _: None),
     )
