@@ -30,7 +30,7 @@ def write_envelope(out: Source, plan: Record, case: PayloadCase, schema: ProtoSc
     `name` goes into the names of what the code calls; payloads of one function have different ones.
     """
     methods = case.message_class  # called on the class: a field may have the name of a method
-    make = out.constant(f"payload_{name}", case.message_class)
+    make = out.constant(f"make_{name}", case.message_class)
     serialize = out.constant(f"serialize_{name}", methods.SerializeToString)
     present = out.constant(f"present_{name}", methods.SetInParent)
     clear = out.constant(f"clear_{name}", methods.Clear)

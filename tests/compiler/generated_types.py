@@ -1,4 +1,4 @@
-"""Hypothesis strategies: pairs of a ROS type and a source type that fills it, and values of the source."""
+"""Hypothesis strategies: types with source types that fill them, payloads with sources, values of sources."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
+from router.compiler.kinds import INT32
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 INTS = [Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (True, False)]
@@ -129,6 +130,45 @@ def pairs(depth: int = 2) -> st.SearchStrategy[Pair]:
         inner = message_pairs(members)
         members = members | inner | list_pairs(inner)
     return message_pairs(members, top=True)
+
+
+@st.composite
+def payload_sources(draw: st.DrawFn, payload: MessageType, depth: int = 2) -> MessageType:
+    """A message with some of the fields of a payload, one of each oneof, and all that it requires."""
+    fields = [field for field in payload.fields if depth or not isinstance(_innermost(field.type), MessageType)]
+    chosen = draw(st.lists(st.sampled_from(fields), min_size=1, unique=True)) if fields else []
+    one_each = {field.oneof or field.name: field for field in chosen}
+    required = {field.name: field for field in fields if field.is_required}
+    return message(
+        True,
+        *(Field(field.name, draw(_payload_source(field.type, depth))) for field in (one_each | required).values()),
+    )
+
+
+def _innermost(declared: Type) -> Type:
+    return declared.element if isinstance(declared, List) else declared
+
+
+def _payload_source(target: Type, depth: int) -> st.SearchStrategy[Type]:
+    """Types of which any value fills a field of a payload, or is refused when it runs."""
+    match target:
+        case Int():
+            return st.sampled_from([*_wider(target), STATE])
+        case Float():
+            return st.sampled_from(_exact(target))
+        case String():
+            return st.booleans().map(lambda wide: String(wide=wide))
+        case Enum():
+            return st.sampled_from([target, *_wider(INT32)])
+        case Bytes():
+            return st.sampled_from([target, List(Int(8, signed=False), 2), List(Int(8, signed=False))])
+        case List():
+            lengths = st.sampled_from([None, 2])
+            return st.builds(List, _payload_source(target.element, depth), lengths)
+        case MessageType():
+            return payload_sources(target, depth - 1)
+        case _:
+            return st.just(target)
 
 
 def values(declared: Type) -> st.SearchStrategy[Any]:

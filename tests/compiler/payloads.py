@@ -1,0 +1,87 @@
+"""Payloads of every kind of field (`protos/made`), and mappings compiled to functions that make envelopes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from router.assets import asset
+from router.compiler.mapping import build
+from router.compiler.namespace import NAMESPACE
+from router.compiler.payload import write_envelope
+from router.compiler.reference import fill_given
+from router.compiler.reference_protobuf import envelope_of
+from router.compiler.source import Source
+from router.table.model import EnvelopeSettings, FieldMap, Located
+from router.types.model import Field, MessageType, Type
+from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
+from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, scope_of
+
+Wire = tuple[ProtoSchema, Envelope]
+MakeEnvelope = Callable[[Any], bytes]
+"""Takes a message of the source's type. Raises one of MAPPING_FAILURES."""
+
+
+@cache
+def made_wire() -> Wire:
+    """The definitions in `protos/made`."""
+    return _wire(Path(__file__).parent / "protos", "made.Envelope")
+
+
+@cache
+def rover_wire() -> Wire:
+    return _wire(asset("protos"), "PBEnvelope")
+
+
+def _wire(root: Path, name: str) -> Wire:
+    schema = load_protos(root)
+    settings = EnvelopeSettings(Located(root, SPAN), Located(name, SPAN), Located("payload", SPAN))
+    return schema, find_envelope(schema, settings)
+
+
+def compiled_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> MakeEnvelope:
+    """What the compiler makes of a mapping without findings."""
+    schema, _ = wire
+    scope = scope_of(source, tuple(schema.enums.values()))
+    mapping = build(fields, case.type, scope, SPAN)
+    assert mapping.findings == []
+    out = Source()
+    with out.block("def envelope(m, source, received_at):", SPAN):
+        scope.reads.write(out, SPAN)
+        out.line(f"return {write_envelope(out, mapping.plan, case, schema, 'it')}", SPAN)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    function = namespace["envelope"]
+    return lambda message: function(message, SOURCE, RECEIVED_AT)
+
+
+def reference_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> MakeEnvelope:
+    """What the oracle makes of it."""
+    schema, envelope = wire
+    enums = tuple(schema.enums.values())
+
+    def make(message: Any) -> bytes:
+        payload = fill_given(fields, case.type, context_of(message, source, enums))
+        return envelope_of(schema, envelope, case, payload)
+
+    return make
+
+
+def made(case: str, fields: FieldMap, /, **given: tuple[Type, Any]) -> Any:
+    """The payload of `made_wire` that a mapping makes of a message with these fields.
+
+    That it is the oracle's, in the envelope as protobuf serialises it, is seen to.
+    """
+    wire = made_wire()
+    declared = wire[1].cases[case]
+    source = MessageType("made/msg/Source", tuple(Field(name, type_) for name, (type_, _) in given.items()))
+    message = SimpleNamespace(**{name: value for name, (_, value) in given.items()})
+    datagram = compiled_envelope(wire, declared, fields, source)(message)
+    assert datagram == reference_envelope(wire, declared, fields, source)(message)
+    parsed = wire[1].message_class.FromString(datagram)
+    assert parsed.WhichOneof(wire[1].oneof) == case
+    assert parsed.SerializeToString() == datagram
+    return getattr(parsed, case)

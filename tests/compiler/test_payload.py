@@ -1,0 +1,293 @@
+"""What a mapping fills of a payload: presence, extreme values, enums, bytes, lists, maps, names of every kind."""
+
+from __future__ import annotations
+
+import linecache
+import math
+import struct
+import traceback
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from router.engine.outcome import MAPPING_FAILURES
+from router.errors import Code, MappingError, SourceSpan
+from router.table.model import Expression, FieldEntry, FieldMap
+from router.table.places import TextPlace
+from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
+from tests.compiler.compiling import AUTO, RECEIVED_AT, SPAN, field_map, findings_of, scope_of
+from tests.compiler.payloads import compiled_envelope, made, made_wire
+
+I32, I64, U8, U64 = Int(32, True), Int(64, True), Int(8, False), Int(64, False)
+F32, F64 = Float(32), Float(64)
+POINT = MessageType("made/msg/Point", (Field("x", F32), Field("y", F32)))
+ENTRY = MessageType("made/msg/Entry", (Field("key", String()), Field("value", I32)))
+
+
+def point(x: float, y: float) -> SimpleNamespace:
+    return SimpleNamespace(x=x, y=y)
+
+
+def codes_of(case: str, fields: FieldMap, *source: Field) -> list[Code]:
+    schema, envelope = made_wire()
+    scope = scope_of(MessageType("made/msg/Source", source), tuple(schema.enums.values()))
+    return [finding.code for finding in findings_of(fields, envelope.cases[case].type, scope)]
+
+
+# presence
+
+
+def test_nothing_is_set_that_is_not_mapped() -> None:
+    assert made("optional", field_map(text="'a'")).ListFields() == [
+        (made_wire()[1].cases["optional"].message_class.DESCRIPTOR.fields_by_name["text"], "a")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "zero"),
+    [("number", "0"), ("single", "0.0"), ("flag", "false"), ("text", "''"), ("data", "[]"), ("rock", "0")],
+)
+def test_an_optional_field_is_set_to_its_default(name: str, zero: str) -> None:
+    assert made("optional", field_map(**{name: zero})).HasField(name)
+
+
+def test_a_mapped_submessage_is_there_also_when_all_in_it_is_zero() -> None:
+    payload = made("optional", field_map(point="p"), p=(POINT, point(0.0, 0.0)))
+    assert payload.HasField("point")
+    assert not payload.HasField("nothing")
+
+
+def test_a_message_without_fields_is_a_payload() -> None:
+    made("nothing", AUTO)
+
+
+def test_negative_zero_is_no_default() -> None:
+    assert math.copysign(1, made("scalars", field_map(single="x"), x=(F32, -0.0)).single) == -1
+
+
+# scalars
+
+
+@pytest.mark.parametrize("name", ["i32", "s32", "sf32", "u32", "f32", "i64", "s64", "sf64", "u64", "f64"])
+def test_integers_are_kept_up_to_their_bounds_and_refused_beyond(name: str) -> None:
+    member = made_wire()[1].cases["scalars"].type.field(name)
+    assert member is not None
+    assert isinstance(member.type, Int)
+    for value in (member.type.low, member.type.high):
+        assert getattr(made("scalars", AUTO, **{name: (member.type, value)}), name) == value
+        assert getattr(made("scalars", field_map(**{name: str(value)})), name) == value
+    for value in (member.type.low - 1, member.type.high + 1):
+        assert codes_of("scalars", field_map(**{name: str(value)})) == [Code.OUT_OF_RANGE]
+        with pytest.raises(MappingError):
+            made("scalars", field_map(**{name: "round(x)"}), x=(F64, value * 2.0))
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 3.4028234663852886e38, 1e-45])
+@pytest.mark.parametrize("expression", ["x", "x * 1", "float32(y)", "xs[0]"])
+def test_what_a_float32_can_hold_passes(value: float, expression: str) -> None:
+    given: dict[str, tuple[Type, Any]] = {"x": (F32, value), "y": (F64, value), "xs": (List(F32), (value,))}
+    single = made("scalars", field_map(single=expression), **given).single
+    assert struct.pack("<f", single) == struct.pack("<f", value)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [field_map(single=expression) for expression in ("x * 2", "float32(y)", "-x * 2 if y > 0 else x", "[x, x * 2][1]",
+                                                     "round(y)")],
+)  # fmt: skip
+def test_a_computed_number_too_large_for_a_float32_is_refused(fields: FieldMap) -> None:
+    with pytest.raises(MappingError):
+        made("scalars", fields, x=(F32, 3e38), y=(F64, 1e39))
+
+
+def test_a_computed_list_is_looked_at_number_by_number() -> None:
+    fields = field_map(singles="[x, x * 2] if flag else xs")
+    given: dict[str, tuple[Type, Any]] = {"x": (F32, 3e38), "xs": (List(F32), (1.5, math.inf))}
+    assert made("many", fields, flag=(Bool(), False), **given).singles == [1.5, math.inf]
+    with pytest.raises(MappingError):
+        made("many", fields, flag=(Bool(), True), **given)
+
+
+# enums
+
+
+@pytest.mark.parametrize(
+    ("expression", "number"),
+    [("ROCK_BLUE", -3), ("'ROCK_BLUE'", -3), ("Rock.ROCK_GREEN", 1), ("77", 77), ("-2147483648", -(1 << 31)),
+     ("ROCK_GREEN if flag else ROCK_BLUE", 1), ("'ROCK_' + color", 1), ("color_number", 200), ("wrapped", 5)],
+)  # fmt: skip
+def test_an_enum_takes_numbers_and_names(expression: str, number: int) -> None:
+    payload = made(
+        "scalars",
+        field_map(rock=expression),
+        flag=(Bool(), True),
+        color=(String(), "GREEN"),
+        color_number=(U8, 200),
+        wrapped=(MessageType("made/msg/State", (Field("state", U8),)), SimpleNamespace(state=5)),
+    )
+    assert payload.rock == number
+
+
+def test_names_of_an_enum_stand_in_lists() -> None:
+    assert made("many", field_map(rocks="[ROCK_BLUE, 1]")).rocks == [-3, 1]
+    assert made("many", field_map(rocks="['ROCK_BLUE', 'ROCK_GREEN']")).rocks == [-3, 1]
+    assert made("many", AUTO, rocks=(List(String()), ("ROCK_BLUE", "ROCK_GREEN"))).rocks == [-3, 1]
+
+
+def test_a_field_wins_over_the_name_of_an_enum_value() -> None:
+    assert made("scalars", field_map(rock="ROCK_BLUE"), ROCK_BLUE=(U8, 1)).rock == 1
+
+
+@pytest.mark.parametrize(("case", "name", "value"), [("scalars", "rock", "ROCK_RED"), ("many", "rocks", ("ROCK_RED",))])
+def test_an_unknown_name_is_refused_when_it_comes(case: str, name: str, value: object) -> None:
+    type_: Type = String() if isinstance(value, str) else List(String())
+    with pytest.raises(MAPPING_FAILURES):
+        made(case, AUTO, **{name: (type_, value)})
+
+
+@pytest.mark.parametrize(("number", "refused"), [("2", False), ("'HIGH'", False), ("3", True), ("0", True)])
+def test_a_closed_enum_takes_only_what_it_names(number: str, refused: bool) -> None:
+    fields = field_map(gear=number, number="1")
+    if not refused:
+        assert made("closed", fields).gear == 2
+        return
+    with pytest.raises(ValueError, match="invalid enumerator"):
+        made("closed", fields)
+
+
+# bytes and texts
+
+
+@pytest.mark.parametrize("value", [b"", b"\0\xff", (0, 255), [1]])
+def test_a_list_of_octets_fills_bytes(value: Any) -> None:
+    assert made("scalars", AUTO, data=(List(U8), value)).data == bytes(value)
+    assert made("scalars", field_map(data="[1, 255, 0]")).data == b"\1\xff\0"
+
+
+@pytest.mark.parametrize("value", ["", "äöü\0", "x" * 20_000])
+def test_text_of_any_length_is_kept(value: str) -> None:
+    assert made("scalars", AUTO, text=(String(), value)).text == value
+
+
+@pytest.mark.parametrize(
+    ("name", "fits", "too_much"),
+    [("text", (String(), "abc"), (String(), "äöü")), ("data", (Bytes(), b"abc"), (Bytes(), b"abcd")),
+     ("data", (List(U8), (1, 2, 3)), (List(U8), (1, 2, 3, 4))), ("few", (List(I32), (1, 2)), (List(I32), (1, 2, 3))),
+     ("two", (List(POINT), (point(0, 0),) * 2), (List(POINT), (point(0, 0),)))],
+)  # fmt: skip
+def test_what_is_larger_than_the_boards_expect_is_refused(
+    name: str, fits: tuple[Type, Any], too_much: tuple[Type, Any]
+) -> None:
+    made("bounded", AUTO, **{name: fits})
+    with pytest.raises(MappingError):
+        made("bounded", AUTO, **{name: too_much})
+
+
+def test_half_a_character_is_refused() -> None:
+    with pytest.raises(ValueError, match="surrogates"):
+        made("scalars", AUTO, text=(String(wide=True), "\ud800"))
+
+
+# messages
+
+
+def test_lists_of_messages_of_lists() -> None:
+    inner = MessageType("made/msg/Many", (Field("numbers", List(I32)), Field("points", List(POINT))))
+    rows = [SimpleNamespace(numbers=[1, 2], points=[point(1, 2)]), SimpleNamespace(numbers=[], points=[])]
+    payload = made("many", AUTO, many=(List(inner), rows), points=(List(POINT), [point(3, 4)]))
+    assert [list(row.numbers) for row in payload.many] == [[1, 2], []]
+    assert (payload.many[0].points[0].y, payload.points[0].x) == (2, 3)
+
+
+def test_a_map_takes_a_list_of_entries_and_keeps_the_last_of_each_key() -> None:
+    entries = [SimpleNamespace(key=key, value=value) for key, value in (("a", 1), ("b", 0), ("a", 2))]
+    assert dict(made("maps", AUTO, counts=(List(ENTRY), entries)).counts) == {"a": 2, "b": 0}
+    wide = MessageType("made/msg/Wide", (Field("number", I32), Field("text", String())))
+    narrow = MessageType("made/msg/Entry", (Field("key", I32), Field("value", wide)))
+    twice = [
+        SimpleNamespace(key=1, value=SimpleNamespace(number=3, text="old")),
+        SimpleNamespace(key=1, value=SimpleNamespace(number=0, text="")),
+    ]
+    optionals = made("maps", AUTO, optionals=(List(narrow), twice)).optionals
+    assert (optionals[1].number, optionals[1].text) == (0, "")
+
+
+def test_a_time_fills_a_timestamp() -> None:
+    stamp = made("stamped", field_map(stamp="received_at")).stamp
+    assert stamp.seconds * 10**9 + stamp.nanos == RECEIVED_AT
+    before = made("stamped", field_map(stamp="time_from_seconds(-0.5)")).stamp
+    assert (before.seconds, before.nanos) == (-1, 500_000_000)
+
+
+def test_fields_may_be_called_as_anything_in_python() -> None:
+    entry = MessageType("made/msg/Entry", (Field("key", I32), Field("value", POINT)))
+    numbers: dict[str, tuple[Type, Any]] = dict.fromkeys(
+        ("from", "None", "self", "SerializeToString", "__debug__"), (I32, 7)
+    )
+    messages: dict[str, tuple[Type, Any]] = {
+        "class": (POINT, point(1, 0)),
+        "SetInParent": (POINT, point(2, 0)),
+        "is": (List(I32), [1, 2]),
+        "in": (List(POINT), [point(3, 0)]),
+        "lambda": (List(entry), [SimpleNamespace(key=4, value=point(5, 0))]),
+        "it": (POINT, point(6, 0)),
+    }
+    payload = made("names", AUTO, **numbers, **messages)
+    assert {getattr(payload, name) for name in numbers} == {7}
+    assert payload.it.x == 6  # the name that the helpers give to the payload
+    assert (getattr(payload, "class").x, payload.SetInParent.x, getattr(payload, "in")[0].x) == (1, 2, 3)
+    assert (getattr(payload, "is"), getattr(payload, "lambda")[4].x) == ([1, 2], 5)
+
+
+# what does not fit
+
+
+@pytest.mark.parametrize(
+    ("case", "fields", "code"),
+    [
+        ("scalars", field_map(rock="'ROCK_GREN'"), Code.UNKNOWN_ENUM_VALUE),
+        ("scalars", field_map(rock="ROCK_GREN"), Code.UNKNOWN_FIELD),
+        ("scalars", field_map(rock="2147483648"), Code.OUT_OF_RANGE),
+        ("scalars", field_map(rock="flag"), Code.TYPE_MISMATCH),
+        ("scalars", field_map(data="numbers"), Code.TYPE_MISMATCH),
+        ("scalars", field_map(data="[256]"), Code.TYPE_MISMATCH),
+        ("scalars", field_map(data="text"), Code.TYPE_MISMATCH),
+        ("scalars", field_map(single="real"), Code.LOSSY_CONVERSION),
+        ("bounded", field_map(data="[1, 2, 3, 4]"), Code.OUT_OF_RANGE),
+        ("bounded", field_map(few="[1, 2, 3]"), Code.OUT_OF_RANGE),
+        ("choice", field_map(number="1", text="'a'"), Code.DUPLICATE_FIELD),
+        ("closed", field_map(gear="LOW"), Code.NOTHING_MAPPED),
+        ("optional", field_map(closed__gear="LOW"), Code.NOTHING_MAPPED),
+        ("maps", field_map(counts="keys"), Code.NOTHING_MAPPED),
+    ],
+)
+def test_what_cannot_fill_a_payload_is_a_finding(case: str, fields: FieldMap, code: Code) -> None:
+    keys = MessageType("made/msg/Keys", (Field("key", String()),))
+    source = (
+        Field("flag", Bool()), Field("numbers", List(I32)), Field("text", String()), Field("real", F64),
+        Field("keys", List(keys)),
+    )  # fmt: skip
+    assert codes_of(case, fields, *source) == [code]
+
+
+def test_both_members_of_a_oneof_by_auto_are_a_finding() -> None:
+    assert codes_of("choice", AUTO, Field("number", I32), Field("text", String())) == [Code.DUPLICATE_FIELD]
+    assert made("choice", AUTO, number=(I32, 0), flag=(Bool(), True)).WhichOneof("chosen") == "number"
+
+
+def test_what_protobuf_refuses_is_blamed_on_the_line_of_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "table.yaml").write_text("\n" * 8 + "  rock: text\n", encoding="utf-8")
+    linecache.clearcache()
+    span = SourceSpan("table.yaml", 9, 9, 13)
+    entry = FieldEntry(("rock",), (SPAN,), Expression("text", TextPlace(span, ((0, span),))))
+    wire = made_wire()
+    source = MessageType("made/msg/Source", (Field("text", String()),))
+    make = compiled_envelope(wire, wire[1].cases["scalars"], FieldMap(SPAN, False, (entry,)), source)
+    with pytest.raises(ValueError, match="ROCK_RED") as caught:
+        make(SimpleNamespace(text="ROCK_RED"))
+    assert traceback.extract_tb(caught.value.__traceback__)[-1].lineno == 9
