@@ -19,6 +19,7 @@ from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope_of, serializer
 from tests.compiler.generated_types import mirror, values
 from tests.compiler.interface_package import MESSAGES, NAME, InterfacePackage, built, is_buildable
+from tests.compiler.reading import WHOLE, field_values, reader
 
 pytest.importorskip("rclpy")
 pytestmark = pytest.mark.skipif(not is_buildable(), reason="cmake and the ROS interface generators are needed")
@@ -38,9 +39,10 @@ def declared_type(package: InterfacePackage, name: str) -> MessageType:
 
 
 @pytest.mark.parametrize("name", MESSAGES)
-def test_message_is_written_as_rclpy_does(package: InterfacePackage, name: str) -> None:
+def test_message_is_written_and_read_as_rclpy_does(package: InterfacePackage, name: str) -> None:
     declared = declared_type(package, name)
     source = mirror(declared)
+    _, read_whole = reader(declared, [WHOLE])
 
     @settings(max_examples=60, suppress_health_check=list(HealthCheck))
     @given(values(source))
@@ -54,6 +56,8 @@ def test_message_is_written_as_rclpy_does(package: InterfacePackage, name: str) 
         theirs, read = package.ask(name, value, ours)
         assert_same_message(ours, theirs, declared, value)
         assert same(read, value)
+        (found,) = read_whole(theirs)
+        assert same(field_values(found, declared), value)
 
     equal()
 

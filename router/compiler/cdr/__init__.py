@@ -1,4 +1,4 @@
-"""From a mapping's plan to code that fills a ROS message straight into CDR bytes.
+"""ROS messages as CDR bytes: code that fills them straight from a mapping's plan, and code that reads them.
 
 Plain CDR, little-endian (XCDR1, as Fast DDS and Cyclone DDS speak it): four bytes of header, then each
 scalar aligned to its own size counted from behind the header. Up to the first string or sequence of
@@ -8,6 +8,7 @@ unknown length all offsets are known when the code is made, so that whole stretc
 from __future__ import annotations
 
 from router.compiler.cdr.generation import write_message
+from router.compiler.cdr.reading import CdrReads
 from router.compiler.cdr.steps import message_size
 
-__all__ = ["write_message", "message_size"]
+__all__ = ["write_message", "message_size", "CdrReads"]

@@ -146,7 +146,7 @@ class _Walk:
             yield Take("B", 1, self.variable((*path, "nothing")) if whole else None)
         if whole:
             fields = tuple(self.value(member.type, (*path, member.name)) for member in declared.fields)
-            is_moment = declared.name in TIME_TYPES
+            is_moment = path != () and declared.name in TIME_TYPES  # a topic of times gives messages as others do
             yield Moment(self.variable(path), *fields) if is_moment else Object(self.variable(path), declared, fields)
 
     def _list(self, declared: List, path: Path, variable: str | None) -> Iterator[Step]:

@@ -1,0 +1,125 @@
+"""Compiled readers of CDR bytes, what they may be asked for, and what they read in a form that compares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from hypothesis import strategies as st
+
+from router.compiler.cdr.reading import CdrReads
+from router.compiler.kinds import TIME_TYPES
+from router.compiler.namespace import NAMESPACE
+from router.compiler.source import Source
+from router.compiler.syntax import placed
+from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
+from tests.compiler.compiling import SPAN
+from tests.compiler.generated_types import INTS
+
+Path = tuple[str, ...]
+WHOLE: Path = ()
+
+TIMES = tuple(
+    MessageType(name, (Field("sec", Int(32, signed=True)), Field("nanosec", Int(32, signed=False))))
+    for name in sorted(TIME_TYPES)
+)
+_NAMES = ["from", "in", "is", "class", "count", "index", "a", "a_b", "b", "b_c", "c", "item", "length", "at", "header"]
+"""Of fields. Some are Python's, some methods of tuples, some run together when they are put side by side."""
+
+
+def paths(declared: MessageType, holder: Path = ()) -> Iterator[tuple[Path, Type]]:
+    """Everything in a message that expressions reach by name, times being values."""
+    yield holder, declared
+    for member in declared.fields:
+        path = (*holder, member.name)
+        if isinstance(member.type, MessageType) and member.type.name not in TIME_TYPES:
+            yield from paths(member.type, path)
+        else:
+            yield path, member.type
+
+
+def at(declared: MessageType, path: Path) -> Type:
+    return dict(paths(declared))[path]
+
+
+def reader(declared: MessageType, wanted: Sequence[Path]) -> tuple[str, Callable[[bytes], list[Any]]]:
+    """The code, and as a function what it reads at each of `wanted`, in this order."""
+    reads, out = CdrReads(declared), Source()
+    nodes = []
+    for path in wanted:
+        found = at(declared, path)
+        if isinstance(found, MessageType) and (path == WHOLE or found.name not in TIME_TYPES):
+            node = reads.message(path)
+            reads.need_objects(node)
+        else:
+            node = reads.field(path[:-1], Field(path[-1], found))
+        nodes.append(placed(node, SPAN))
+    with out.block("def read(cdr):", SPAN):
+        reads.write(out, SPAN)
+        out.line(f"return [{', '.join(map(out.expression, nodes))}]", SPAN)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    return out.text(), namespace["read"]
+
+
+def plain(value: Any, declared: Type) -> Any:
+    """A value as dictionaries and lists, whether it is ours or of whom else messages are objects with attributes."""
+    match declared:
+        case MessageType() if declared.name in TIME_TYPES:
+            return value if isinstance(value, int) else value.sec * 10**9 + value.nanosec
+        case MessageType():
+            return {field.name: plain(getattr(value, field.name), field.type) for field in declared.fields}
+        case List():
+            return [plain(element, declared.element) for element in value]
+        case Int(octet=True) if isinstance(value, bytes):
+            return value[0]  # rclpy's way
+        case _:
+            return value
+
+
+def field_values(value: Any, declared: Type) -> Any:
+    """The same as what the reference takes for writing, where a time is a message as others are."""
+    match declared:
+        case MessageType():
+            return {field.name: field_values(getattr(value, field.name), field.type) for field in declared.fields}
+        case List():
+            return [field_values(element, declared.element) for element in value]
+        case _:
+            return value
+
+
+def wanted_paths(declared: MessageType) -> st.SearchStrategy[list[Path]]:
+    known = [path for path, _ in paths(declared)]
+    return st.lists(st.sampled_from(known), max_size=5, unique=True)
+
+
+# types
+
+_scalars: st.SearchStrategy[Type] = st.one_of(
+    st.just(Bool()),
+    st.sampled_from(INTS),
+    st.sampled_from([Float(32), Float(64)]),
+    st.builds(String, st.none() | st.integers(1, 6), st.booleans()),
+)
+
+
+def _lists(elements: st.SearchStrategy[Any]) -> st.SearchStrategy[Type]:
+    sizes = st.sampled_from([(None, None), (None, 3), (1, None), (3, None)])
+    return st.builds(lambda element, size: List(element, *size), elements, sizes)
+
+
+@st.composite
+def _message(draw: st.DrawFn, members: st.SearchStrategy[Type], smallest: int) -> MessageType:
+    types = draw(st.lists(members, min_size=smallest, max_size=6))
+    names = draw(st.permutations(_NAMES))
+    return MessageType("made/msg/Made", tuple(map(Field, names, types)))
+
+
+def messages(depth: int = 2) -> st.SearchStrategy[MessageType]:
+    """ROS messages of messages, `depth` deep."""
+    members: st.SearchStrategy[Type] = _scalars | st.sampled_from(TIMES)
+    members = members | _lists(members)
+    for _ in range(depth):
+        inner = _message(members, 0)
+        members = members | inner | _lists(inner)
+    return _message(members, 1)
