@@ -12,7 +12,7 @@ from router.table.address import BadAddressError, parse_address
 from router.table.model import Address
 from router.table.shape import SCHEMA
 
-PATTERN = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))["definitions"]["address"]["else"]["pattern"]
+PATTERN = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))["definitions"]["address"]["pattern"]
 
 octets = st.one_of(st.integers(0, 400).map(str), st.sampled_from(["01", "", "0", "255", "256", "x"]))
 ports = st.one_of(st.integers(0, 70000).map(str), st.sampled_from(["", "08", "65535", "65536", "8 ", "x"]))

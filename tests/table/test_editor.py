@@ -25,7 +25,7 @@ listen:
   rover: {address: 0.0.0.0:5000, framing: zero_trimmed, receive_buffer: "${BUFFER:-4MiB}"}
 endpoints:
   sensor_board: {address: "${SENSOR:-192.168.0.30:8}", kind: board}
-  basestation: {address: 192.168.0.10:9000, kind: basestation}
+  basestation: {address: 192.168.0.10:9000, kind: basestation, budget: 500kB/s}
 routes:
   imu_info:
     source: [sensor_board]
@@ -40,6 +40,21 @@ routes:
           header.stamp: received_at
           linear_acceleration: {x: accel_x, y: accel_y, z: 9.81}
   ph_info: {ignore: nobody needs it}
+  manual_drive:
+    source: basestation
+    destinations: [{endpoint: driving_board, max_rate: 20 Hz, keep: latest}]
+    priority: command
+    ttl: 200ms
+    deadman: {timeout: 400ms, send: {manual_brake: {}}, to: [driving_board], repeat: 50ms}
+  detected_object:
+    - source: ros
+      for_each: detections
+      topics: [{topic: detected_objects, type: comms/msg/DetectedObjectArray}]
+      fields: {auto: true, index: index}
+      destinations: [basestation]
+    - source: basestation
+      collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
+      deadman: nothing moves because of it
 """
 
 
@@ -98,6 +113,16 @@ def test_the_tables_of_the_repository_are_underlined_nowhere_but_for_what_they_i
         ("500ms", "500 millis", "500 millis", "must be a duration above zero with its unit"),
         ("    source: [sensor_board]\n", "", "imu_info", 'Missing property "source"'),
         ("ignore: nobody", "source: ros, ignore: nobody", "source: ros", "has no place beside 'ignore'"),
+        ("max_rate: 20 Hz, ", "", "keep: latest", "has its place beside 'max_rate' only"),
+        ("500kB/s", "500kB", "500kB", "must be bytes per second above zero"),
+        ("ttl: 200ms", "ttl: 0ms", "ttl: 0ms", "must be a duration above zero"),
+        ("repeat: 50ms", "repat: 50ms", "repat", "Property repat is not allowed."),
+        ("{manual_brake: {}}", "{manual_brake: {}, arm_ctrl: {}}", "send", "more properties than limit of 1"),
+        ("nothing moves because of it", "500ms", "deadman: 500ms", "a sentence that says why none is needed"),
+        ("order: index, ", "", "collect", 'Missing property "order"'),
+        ("collect: {", "for_each: items\n      collect: {", "for_each: items", "its place beside 'source: ros' only"),
+        ("for_each: detections", "collect: {}", "collect: {}", "it has no place beside 'source: ros'"),
+        ("    - source: basestation\n      collect", "    - collect", "- collect", 'Missing property "source"'),
     ],
 )
 def test_a_mistake_is_underlined_where_it_is(
@@ -122,6 +147,22 @@ def test_a_mistake_is_underlined_where_it_is(
         ("queue_depth", "Queue depth", "ROS history"),
         ("deadline", "Deadline", "longest time between two messages"),
         ("auto: true", "Auto", "Fields of the same name"),
+        ("budget", "Budget", "commands go first"),
+        ("keep", "Keep", "first: they are dropped"),
+        ("priority", "Priority", "command where a destination is a board"),
+        ("ttl", "Time to live", "dropped as stale"),
+        ("deadman: {", "Deadman", "armed by the first command"),
+        ("timeout: 400ms", "Timeout", "no fresh command"),
+        ("send", "Send", "The payload that stops the rover"),
+        ("to: [", "To", "endpoints that get it"),
+        ("repeat", "Repeat", "datagrams get lost"),
+        ("detected_object", "Payload case", "a list of routes"),
+        ("for_each", "For each", "'item', 'index' and 'count'"),
+        ("collect", "Collect", "published once"),
+        ("by: frame_id", "By", "have in common"),
+        ("count: total", "Count", "How many messages"),
+        ("order", "Order", "counted from 0"),
+        ("timeout: 1s", "Timeout", "the rest of a frame"),
     ],
 )
 def test_hovering_over_a_key_tells_what_it_is_for(editor: LanguageServer, word: str, title: str, part: str) -> None:
@@ -147,6 +188,21 @@ def test_completion_offers_the_keys_of_a_route(editor: LanguageServer) -> None:
     editor.open(table, text)
     offered = editor.completions(table, text.count("\n") - 1, 4)
     assert {"source", "destinations", "topics", "ignore"} <= offered
+
+
+@pytest.mark.parametrize("text", [GOOD, GOOD + "    - source: ros\n"])
+def test_completion_offers_the_keys_of_a_route_in_a_list(editor: LanguageServer, text: str) -> None:
+    text += "      \n"
+    table = new_table()
+    editor.open(table, text)
+    assert {"ttl", "topics", "priority"} <= editor.completions(table, text.count("\n") - 1, 6)
+
+
+def test_completion_offers_the_keys_of_a_deadman(editor: LanguageServer) -> None:
+    text = GOOD + "  manual_arm:\n    source: basestation\n    deadman:\n      \n"
+    table = new_table()
+    editor.open(table, text)
+    assert {"timeout", "send", "to", "repeat"} <= editor.completions(table, text.count("\n") - 1, 6)
 
 
 def test_completion_offers_the_words_of_the_quality_of_service(editor: LanguageServer) -> None:
