@@ -97,7 +97,7 @@ class Code(enum.Enum):
     SOURCE_CLASH = ("source-clash", "Two routes of one payload case take it from the same source.")
     NO_DEADMAN = ("no-deadman", "Commands to a board that nothing stops when they stop coming.")
     # the mapping
-    DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice.")
+    DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two fields that exclude each other.")
     NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")
     EXPRESSION_SYNTAX = ("expression-syntax", "Not an expression.")
     FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python that expressions do not have.")

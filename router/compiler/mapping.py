@@ -58,14 +58,12 @@ def build(
     given = builder.sort(fields.entries if fields else (), target)
     automatic = (whole or scope.whole_message(span)) if fields and fields.auto else None
     plan = builder.record(given, automatic, "")
-    outcome = FieldMapping(plan, builder.rows, builder.findings)
-    if target.fields and not builder.rows and not builder.findings:
+    outcome = FieldMapping(plan, builder.rows, builder.findings or list(presence_findings(plan)))
+    if target.fields and not builder.rows and not outcome.findings:
         hint = "map its fields, or say `fields: auto`"
         if automatic is not None:
             hint = f"{automatic.kind} and {target} have no field name in common; map the fields by hand"
         outcome.findings.append(Diagnostic(builder.span, Code.NOTHING_MAPPED, f"nothing fills {target}", hint))
-    if not outcome.findings:
-        outcome.findings += presence_findings(plan)
     return outcome
 
 

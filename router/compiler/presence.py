@@ -33,11 +33,11 @@ def _oneof_findings(plan: Record) -> Iterator[Diagnostic]:
         other = first.setdefault(member.oneof, member.name)
         if other != member.name:
             message = f"'{other}' and '{member.name}' are of one oneof, '{member.oneof}', and exclude each other"
-            yield Diagnostic(made.span, Code.DUPLICATE_FIELD, message, "map one of them, by hand and without `auto`")
+            yield Diagnostic(plan.span, Code.DUPLICATE_FIELD, message, "map one of them, by hand and without `auto`")
 
 
 def _required_findings(plan: Record) -> Iterator[Diagnostic]:
     for member, made in plan.members:
         if member.is_required and isinstance(made, Unset):
             message = f"nothing fills '{member.name}', without which there is no {plan.type}"
-            yield Diagnostic(plan.span, Code.NOTHING_MAPPED, message, "map it")
+            yield Diagnostic(plan.span, Code.MISSING_KEY, message, "map it")

@@ -258,9 +258,9 @@ def test_fields_may_be_called_as_anything_in_python() -> None:
         ("bounded", field_map(data="[1, 2, 3, 4]"), Code.OUT_OF_RANGE),
         ("bounded", field_map(few="[1, 2, 3]"), Code.OUT_OF_RANGE),
         ("choice", field_map(number="1", text="'a'"), Code.DUPLICATE_FIELD),
-        ("closed", field_map(gear="LOW"), Code.NOTHING_MAPPED),
-        ("optional", field_map(closed__gear="LOW"), Code.NOTHING_MAPPED),
-        ("maps", field_map(counts="keys"), Code.NOTHING_MAPPED),
+        ("closed", field_map(gear="LOW"), Code.MISSING_KEY),
+        ("optional", field_map(closed__gear="LOW"), Code.MISSING_KEY),
+        ("maps", field_map(counts="keys"), Code.MISSING_KEY),
     ],
 )
 def test_what_cannot_fill_a_payload_is_a_finding(case: str, fields: FieldMap, code: Code) -> None:
