@@ -57,6 +57,7 @@ class ReadingCode:
         self.at = at
         self.is_checked = True
         """Whether `struct` has seen that the bytes reach as far as has been read."""
+        self._is_behind = False
         self._together: list[Take] = []
         self._made: list[Made] = []
 
@@ -67,16 +68,27 @@ class ReadingCode:
                     self._together.append(step)
                 case Object() | Moment() | Unpack():
                     self._made.append(step)
-                case Stretch():
+                case Stretch() | Loop() | Leap():
                     self._flush()
-                    self._stretch(step)
-                case Loop():
-                    self._flush()
-                    self._loop(step)
-                case Leap():
-                    self._flush()
-                    self._leap(step)
+                    self._advance()
+                    self._vary(step)
         self._flush()
+
+    def _vary(self, step: Stretch | Loop | Leap) -> None:
+        """What has its length in the message."""
+        match step:
+            case Stretch():
+                self._stretch(step)
+            case Loop():
+                self._loop(step)
+            case Leap():
+                self._leap(step)
+
+    def _advance(self) -> None:
+        """Brings `at` behind what was unpacked last; not needed where nothing follows."""
+        if self._is_behind:
+            self._line("at += size")
+            self._is_behind = False
 
     def _line(self, text: str) -> None:
         self.out.line(text, self.span)
@@ -123,7 +135,7 @@ class ReadingCode:
         at = self.out.constant("unpack_at", tuple((struct.Struct(it).unpack_from, size) for it, size in layouts))
         self._line(f"unpack, size = {at}[at & 7]")
         self._spread("", variables, " = unpack(cdr, at)")
-        self._line("at += size")
+        self._is_behind = True
 
     def _make(self, made: Made) -> None:
         match made:
@@ -166,6 +178,7 @@ class ReadingCode:
         body = ReadingCode(self.out, self.span, None)
         with self.out.block(f"for _ in range({'length' if loop.count is None else loop.count}):", self.span):
             body.write(loop.body)
+            body._advance()
             if loop.variable is not None:
                 self._line(f"{loop.variable}.append({loop.element})")
         self.is_checked = body.is_checked
