@@ -1,0 +1,90 @@
+"""Deadmen: which routes need one, and what it may send to whom."""
+
+from __future__ import annotations
+
+import pytest
+
+from router.compiler.payload import constant_envelope
+from router.errors import Code, Diagnostic
+from tests.compiler.conftest import CheckText
+
+ROUTE = """
+routes:
+  manual_drive:
+    source: base
+    destinations: [{destinations}]
+    deadman: {deadman}
+"""
+BRAKE = "{timeout: 500ms, send: {manual_brake: {brake: true}}, to: [board]}"
+
+
+def findings(check_text: CheckText, destinations: str, deadman: str) -> list[Diagnostic]:
+    found = check_text(ROUTE.format(destinations=destinations, deadman=deadman)).diagnostics
+    return [finding for finding in found if finding.code is not Code.UNCOVERED_PAYLOAD_CASE]
+
+
+def test_one_warning_for_each_route_that_commands_boards(check_text: CheckText) -> None:
+    routes = """
+    routes:
+      manual_drive: {source: base, destinations: [board, other]}
+      manual_brake:
+        {source: ros, topics: [{topic: a, type: std_msgs/msg/Bool}], fields: {brake: data}, destinations: [board]}
+      manual_arm: {source: board, destinations: [base]}
+      arm_ctrl: {ignore: not part of this test}
+      arm_target: {source: base, destinations: [board], deadman: the board knows when it is there}
+    """
+    endpoints = (
+        "{board: {address: 127.0.0.2:8, kind: board}, other: {address: 127.0.0.4:8, kind: board},"
+        " base: {address: 127.0.0.3:9000, kind: basestation}}"
+    )
+    found = [each for each in check_text(routes, endpoints=endpoints).diagnostics if each.code is Code.NO_DEADMAN]
+    assert [each.message for each in found] == [
+        "nothing stops 'board' when 'manual_drive' stops coming",
+        "nothing stops 'board' when 'manual_brake' stops coming",
+    ]
+
+
+def test_deadman_that_is_written_wrong_is_not_missing_as_well(check_text: CheckText) -> None:
+    found = findings(check_text, "board", "{timeout: 500, send: {manual_brake: {brake: true}}, to: [board]}")
+    assert [each.code for each in found] == [Code.WRONG_TYPE]
+
+
+@pytest.mark.parametrize(
+    ("send", "envelope"), [("manual_brake: {brake: true}", "ca01020801"), ("manual_arm: {}", "d20100")]
+)
+def test_payload_is_known_before_the_start(check_text: CheckText, send: str, envelope: str) -> None:
+    deadman = f"{{timeout: 500ms, send: {{{send}}}, to: [board, base]}}"
+    checked = check_text(ROUTE.format(destinations="board", deadman=deadman))
+    (route,) = checked.routes
+    assert not checked.has_errors
+    assert checked.schema is not None
+    assert route.deadman is not None
+    assert route.deadman.to == ("board", "base")
+    assert constant_envelope(route.deadman.plan, route.deadman.case, checked.schema).hex() == envelope
+
+
+@pytest.mark.parametrize("value", ["brake", "message", "source == 'base'", "received_at > 0", "turn > 0", "has(turn)"])
+def test_payload_is_made_of_constants(check_text: CheckText, value: str) -> None:
+    deadman = f'{{timeout: 500ms, send: {{manual_brake: {{brake: "{value}"}}}}, to: [board]}}'
+    (finding,) = findings(check_text, "board", deadman)
+    assert finding.code is Code.UNKNOWN_FIELD
+    assert "a deadman has no field" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("destinations", "timeout", "trips"),
+    [
+        ("{endpoint: board, max_rate: 10 Hz}", "100ms", True),
+        ("{endpoint: board, max_rate: 10 Hz}", "101ms", False),
+        ("{endpoint: board, max_rate: 10 Hz}, {endpoint: tool, max_rate: 2 Hz}", "101ms", False),
+        ("{endpoint: board, max_rate: 10 Hz}, tool", "10ms", False),
+    ],
+)
+def test_deadman_does_not_trip_by_itself(check_text: CheckText, destinations: str, timeout: str, trips: bool) -> None:
+    endpoints = (
+        "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation},"
+        " tool: {address: 127.0.0.4:9000, kind: tool}}"
+    )
+    routes = ROUTE.format(destinations=destinations, deadman=BRAKE.replace("500ms", timeout))
+    found = check_text(routes, endpoints=endpoints).diagnostics
+    assert (Code.BAD_VALUE in {finding.code for finding in found}) == trips
