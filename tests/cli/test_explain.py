@@ -45,7 +45,7 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
         "\n"
         f"  destination laptop (127.0.0.99:9999): unchanged  ({table}:6:34)\n"
         "    when is_calibrated\n"
-        "    at most 5 Hz\n"
+        "    at most 5 Hz, keeping the first\n"
         "\n"
         f"  topic x: std_msgs/msg/Float32  ({table}:8:10)\n"
         "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
