@@ -9,6 +9,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from router.assets import asset
+from router.compiler.cdr import CdrReads
+from router.compiler.expressions import ParsedReads, Reads, Scope
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
@@ -18,7 +20,7 @@ from router.compiler.source import Source
 from router.table.model import EnvelopeSettings, FieldMap, Located
 from router.types.model import Field, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
-from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of, scope_of
+from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of
 
 Wire = tuple[ProtoSchema, Envelope]
 MakeEnvelope = Callable[[Any], bytes]
@@ -42,14 +44,16 @@ def _wire(root: Path, name: str) -> Wire:
     return schema, find_envelope(schema, settings)
 
 
-def compiled_envelope(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType) -> MakeEnvelope:
-    """What the compiler makes of a mapping without findings."""
+def compiled_envelope(
+    wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType, reads: Reads | None = None
+) -> MakeEnvelope:
+    """What the compiler makes of a mapping without findings. With CdrReads the message comes as CDR bytes."""
     schema, _ = wire
-    scope = scope_of(source, tuple(schema.enums.values()))
+    scope = Scope(source, tuple(schema.enums.values()), (), reads or ParsedReads())
     mapping = build(fields, case.type, scope, SPAN)
     assert mapping.findings == []
     out = Source()
-    with out.block("def envelope(m, source, received_at):", SPAN):
+    with out.block(f"def envelope({'cdr' if isinstance(reads, CdrReads) else 'm'}, source, received_at):", SPAN):
         scope.reads.write(out, SPAN)
         out.line(f"return {write_envelope(out, mapping.plan, case, schema, 'it')}", SPAN)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}

@@ -10,19 +10,25 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
+from router.compiler.cdr import CdrReads
+from router.compiler.definitions import Definitions
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
+from router.compiler.reference import fill
+from router.compiler.reference_cdr import cdr
 from router.engine.outcome import MAPPING_FAILURES
 from router.errors import MappingError
 from router.table.model import FieldMap
 from router.types.model import MessageType
-from tests.compiler.compiling import AUTO, SPAN, field_map, outcome, scope_of
-from tests.compiler.generated_types import payload_sources, values
+from tests.compiler.compiling import AUTO, SPAN, context_of, field_map, outcome, scope_of
+from tests.compiler.generated_types import mirror, payload_sources, values
 from tests.compiler.payloads import Wire, compiled_envelope, made_wire, reference_envelope, rover_wire
 
 GOLDEN: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "wire" / "golden_envelopes.json").read_text(encoding="utf-8")
 )
+_ROS_NAMES = {"imu_info": "ImuSensorInformation"}
+"""Of the one ROS type that has another name than its payload."""
 MANY = settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 
 
@@ -59,6 +65,24 @@ def test_golden_payloads_mapped_to_themselves_keep_their_bytes(entry: dict[str, 
     expected = datagram.SerializeToString()
     assert compiled_envelope(wire, case, AUTO, case.type)(payload) == expected
     assert reference_envelope(wire, case, AUTO, case.type)(payload) == expected
+
+
+@pytest.mark.parametrize("name", rover_wire()[1].cases)
+def test_ros_messages_of_the_rover_make_the_envelopes_of_the_reference(definitions: Definitions, name: str) -> None:
+    wire = rover_wire()
+    case = wire[1].cases[name]
+    declared = definitions.interfaces.get(f"comms/msg/{_ROS_NAMES.get(name, case.type.name)}")
+    assert declared is not None
+    compiled = compiled_envelope(wire, case, AUTO, declared, CdrReads(declared))
+    reference = reference_envelope(wire, case, AUTO, declared)
+
+    @settings(max_examples=30, suppress_health_check=list(HealthCheck))
+    @given(values(mirror(declared)))
+    def equal(message: Any) -> None:
+        value = fill(AUTO, declared, context_of(message, mirror(declared)))
+        assert compiled(cdr(declared, value)) == reference(message)
+
+    equal()
 
 
 def constant(case: str, fields: FieldMap) -> bytes:
