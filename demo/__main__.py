@@ -1,4 +1,7 @@
-"""`python -m demo`: simulator, router and a ROS subscriber for 15 seconds; exit 0 when everything arrived."""
+"""`python -m demo`: simulated rover, router and real ROS nodes for some seconds; exit 0 when everything arrived.
+
+In the middle the basestation is cut off, and a deadman has to halt the rover.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,16 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from demo.children import Child
+from demo.expected import FOUND, LOST, SILENT
 from demo.places import free_ros_domain, taken_places
 from demo.screen import open_screen
 from demo.verdict import Finding, judge
@@ -23,19 +29,22 @@ from router.tools.wire import read_table
 
 ROOT = Path(__file__).parent.parent
 TABLE = Path("routes/sim.yaml")
-SIMULATOR = "simulator"
-DURATION = 15.0
+DURATION = 12.0
 START_PATIENCE = 30.0
-"""Seconds within which router and ROS listener must be up; a cold start reads a lot from disk."""
+"""Seconds within which a process must be up; a cold start reads a lot from disk."""
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 MATCHING = 0.5
 """Seconds after the listener has found the router until the router has found the listener."""
 
 REFRESH = 0.5
-SETTLING = 1.5
+DRAINING = 0.5
+"""Seconds after the talker's last message in which boards and basestation may still be sent something."""
+
+SETTLING = 1.0
 """Seconds after the last datagram was sent, for the listener's last report."""
 
+SUCCESS = "It works: boards, basestation and real ROS 2 heard each other, and a lost link stopped the rover."
 NEXT_STEPS = f"""\
 Where to look next:
   routes/rover.yaml                      what goes where
@@ -50,7 +59,7 @@ class DemoError(RouterError):
 
 
 class Demo:
-    """The three processes and what they say. The router starts first, the simulator when all listen."""
+    """The four processes and what they say. Router and ROS listener start first, the others when those are up."""
 
     def __init__(self, table: RouteTable) -> None:
         if table.metrics is None:
@@ -62,41 +71,55 @@ class Demo:
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "PYTHONUNBUFFERED": "1",
         }
-        self.children: list[Child] = []
+        self._running: list[Child] = []
 
     def _start(self, name: str, *module: str) -> Child:
         child = Child(name, self._env, *module)
-        self.children.append(child)
+        self._running.append(child)
         return child
+
+    def _finish(self, child: Child) -> None:
+        self._running.remove(child)
+        child.end()
+        _check_exit(child, expected=0)
 
     def run(self, console: Console) -> list[Finding]:
         listener = self._start("listener", "demo.ros_listener", str(TABLE))
         self._start("router", "router", "run", str(TABLE))
         self._wait_until_up(listener)
-        simulator = self._start(SIMULATOR, "router", "sim", str(TABLE), "--json", "--duration", str(DURATION))
+        cut_off = f"{SILENT}:{LOST}-{FOUND}"
+        simulator = self._start("simulator", "router", "sim", str(TABLE), "--json", "--silent", cut_off)
+        self._wait_until(lambda: bool(simulator.latest), "the simulator did not start")
+        talker = self._start("talker", "demo.ros_talker", str(TABLE))
         window = Window()
-        start = time.monotonic()
         with open_screen(console, self._table, DURATION) as screen:
-            while simulator.exit_code is None:
+            while simulator.latest["seconds"] < DURATION:
                 time.sleep(REFRESH)
-                screen.show(time.monotonic() - start, window.add(self._snapshot()), listener.latest, simulator.latest)
-        simulator.end()
-        self._check()
+                screen.show(window.add(self._snapshot()), listener.latest, simulator.latest)
+        self._finish(talker)
+        time.sleep(DRAINING)
+        self._finish(simulator)
         time.sleep(SETTLING)
         return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()))
 
     def _wait_until_up(self, listener: Child) -> None:
         """Until the ROS listener has found the router's topics: before that, the router withholds messages."""
+        self._wait_until(
+            lambda: bool(listener.latest) and all(topic["publishers"] for topic in listener.latest["topics"].values()),
+            "router and ROS listener did not find each other",
+        )
+        time.sleep(MATCHING)
+
+    def _wait_until(self, holds: Callable[[], bool], complaint: str) -> None:
         deadline = time.monotonic() + START_PATIENCE
-        while time.monotonic() < deadline:
+        while not holds():
+            if time.monotonic() > deadline:
+                raise DemoError(f"{complaint} within {START_PATIENCE:.0f} s")
             self._check()
             time.sleep(0.1)
-            if listener.latest and all(topic["publishers"] for topic in listener.latest["topics"].values()):
-                time.sleep(MATCHING)
-                return
-        raise DemoError(f"router and ROS listener did not find each other within {START_PATIENCE:.0f} s")
 
     def _snapshot(self) -> Snapshot:
+        self._check()
         try:
             return parse_metrics(scrape(self._metrics), time.monotonic())
         except TransportError:
@@ -104,19 +127,23 @@ class Demo:
             raise
 
     def _check(self) -> None:
-        """The simulator ends by itself and well; the others must not end at all."""
-        for child in self.children:
-            if child.exit_code is not None and (child.exit_code or child.name != SIMULATOR):
-                raise DemoError(f"the {child.name} ended with exit code {child.exit_code}:\n{child.last_words()}")
+        """Nobody ends by itself."""
+        for child in self._running:
+            _check_exit(child, expected=None)
 
     def end(self) -> None:
         """All are asked to end before any is waited for; nothing interrupts this."""
         for number in ENDING:
             signal.signal(number, signal.SIG_IGN)
-        for child in self.children:
+        for child in self._running:
             child.ask_to_end()
-        for child in self.children:
+        for child in self._running:
             child.end()
+
+
+def _check_exit(child: Child, expected: int | None) -> None:
+    if child.exit_code != expected:
+        raise DemoError(f"the {child.name} ended with exit code {child.exit_code}:\n{child.last_words()}")
 
 
 def leave(number: int, frame: FrameType | None) -> None:
@@ -139,11 +166,16 @@ def play(console: Console) -> list[Finding]:
 
 def tell(console: Console, findings: list[Finding]) -> int:
     """The verdict, and the exit code that belongs to it."""
+    verdicts = Table.grid(padding=(0, 2))
     for finding in findings:
-        mark, style = ("ok  ", "green") if finding.ok else ("FAIL", "red")
-        console.print(Text.assemble((mark, style), f"  {finding.text}"))
+        mark = Text("ok", style="green") if finding.ok else Text("FAIL", style="red")
+        verdicts.add_row(mark, Text(finding.text))
+    console.print(verdicts)
     if all(finding.ok for finding in findings):
-        console.print("\nIt works: boards and basestation talked over UDP, the router, and real ROS 2.\n", style="bold")
+        console.print(
+            "\nIt works: boards, basestation and real ROS 2 heard each other, and a lost link stopped the rover.\n",
+            style="bold",
+        )
         console.print(NEXT_STEPS, highlight=False)
         return 0
     console.print("\nThe demo failed: see the lines above.", style="bold red")
@@ -155,7 +187,7 @@ def main() -> int:
     for number in ENDING:
         signal.signal(number, leave)
     console = Console()
-    console.print(f"Starting simulator, router and a ROS 2 listener on {TABLE} ...", highlight=False)
+    console.print(f"Starting router, simulated rover and two ROS 2 nodes on {TABLE} ...", highlight=False)
     try:
         findings = play(console)
     except RouterError as error:

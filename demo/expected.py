@@ -4,21 +4,46 @@ from __future__ import annotations
 
 from router.table.model import Route, RouteTable
 
+SILENT = "basestation"
+"""The endpoint whose link is lost for a while."""
 
-def udp_routes(table: RouteTable) -> list[Route]:
-    """The routes that carry what the simulator sends."""
-    return [route for route in table.routes if route.sources and not route.is_outbound]
+LOST, FOUND = 5.0, 8.0
+"""Seconds after the simulator's start at which that link is lost and found again."""
 
 
-def expected_topics(table: RouteTable) -> dict[str, str]:
-    """ROS type by topic, as the table names both."""
-    return {topic.topic.value: topic.type.value for route in udp_routes(table) for topic in route.topics}
+def active_routes(table: RouteTable) -> list[Route]:
+    """All that carry something."""
+    return [route for route in table.routes if route.sources]
+
+
+def inbound_topics(table: RouteTable) -> dict[str, str]:
+    """ROS type by topic of what the router publishes."""
+    return _topics([route for route in active_routes(table) if not route.is_outbound])
+
+
+def outbound_topics(table: RouteTable) -> dict[str, str]:
+    """ROS type by topic of what the router subscribes to."""
+    return _topics([route for route in active_routes(table) if route.is_outbound])
+
+
+def _topics(routes: list[Route]) -> dict[str, str]:
+    return {topic.topic.value: topic.type.value for route in routes for topic in route.topics}
 
 
 def expected_arrivals(table: RouteTable) -> set[tuple[str, str]]:
-    """Destination endpoint and payload case of everything that is to come back to the simulator."""
+    """Destination endpoint and payload case of everything that is to arrive at the simulator."""
     return {
         (destination.endpoint.value, route.case.value)
-        for route in udp_routes(table)
+        for route in active_routes(table)
         for destination in route.destinations
+    }
+
+
+def halted_boards(table: RouteTable) -> set[str]:
+    """To whom deadmen speak while the link is lost."""
+    return {
+        to.value
+        for route in active_routes(table)
+        if route.deadman is not None and any(source.value == SILENT for source in route.sources)
+        for to in route.deadman.to
     }

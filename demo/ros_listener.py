@@ -7,12 +7,10 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
@@ -20,7 +18,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
-from demo.expected import expected_topics
+from demo.expected import inbound_topics
+from demo.ros_messages import message_class
 from router.tools.wire import read_table
 
 REPORT_INTERVAL = 0.5
@@ -37,10 +36,9 @@ class Listener:
         self._node = node
         self._counts = dict.fromkeys(topics, 0)
         self._newest: dict[str, bytes] = {}
-        self._types = {topic: _message_class(name) for topic, name in topics.items()}
-        for topic, message_class in self._types.items():
-            callback = partial(self._take, topic)
-            node.create_subscription(message_class, topic, callback, ANY_PUBLISHER, raw=True)
+        self._types = {topic: message_class(name) for topic, name in topics.items()}
+        for topic, kind in self._types.items():
+            node.create_subscription(kind, topic, partial(self._take, topic), ANY_PUBLISHER, raw=True)
 
     def _take(self, topic: str, data: bytes) -> None:
         self._counts[topic] += 1
@@ -58,16 +56,11 @@ class Listener:
         return "" if data is None else str(deserialize_message(data, self._types[topic]))
 
 
-def _message_class(name: str) -> Any:
-    package, _, short = name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), short)
-
-
 def main() -> int:
     table = read_table(Path(sys.argv[1]))
     rclpy.init()
     node = rclpy.create_node("demo_listener", namespace=table.node.namespace)
-    listener = Listener(node, expected_topics(table))
+    listener = Listener(node, inbound_topics(table))
     node.create_timer(REPORT_INTERVAL, listener.report)
     listener.report()
     try:

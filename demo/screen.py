@@ -10,7 +10,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from demo.expected import udp_routes
+from demo.expected import active_routes
 from demo.verdict import Said, arrival_count, topic_count
 from router.table.model import RouteTable
 from router.tools.live import RouteRow, View
@@ -19,10 +19,13 @@ from router.tools.live_view import route_table, summary_line
 LINE_INTERVAL = 3.0
 """Seconds between two lines where there is no terminal."""
 
+CHANGES_SHOWN = 3
+"""Of the boards' states, the newest."""
+
 
 class Screen(Protocol):
-    def show(self, seconds: float, view: View, heard: Said, simulated: Said) -> None:
-        """`seconds` since the simulator started; the newest words of listener and simulator."""
+    def show(self, view: View, heard: Said, simulated: Said) -> None:
+        """`heard` and `simulated` are the newest words of listener and simulator."""
 
 
 @contextmanager
@@ -38,44 +41,55 @@ class _Lines:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._next = LINE_INTERVAL
+        self._told = 0
 
-    def show(self, seconds: float, view: View, heard: Said, simulated: Said) -> None:
+    def show(self, view: View, heard: Said, simulated: Said) -> None:
+        for change in _changes(simulated)[self._told :]:
+            self._print(change)
+            self._told += 1
+        seconds = simulated["seconds"]
         if seconds < self._next:
             return
         self._next += LINE_INTERVAL
         ros = sum(topic["count"] for topic in heard.get("topics", {}).values())
-        back = sum(case["count"] for cases in simulated.get("received", {}).values() for case in cases.values())
-        line = f"{seconds:4.0f} s  {summary_line(view)}; heard on ROS {ros}, back at the simulator {back}"
+        arrived = sum(case["count"] for cases in simulated["received"].values() for case in cases.values())
+        line = f"{seconds:.0f} s: {summary_line(view)}; heard on ROS {ros}, arrived at boards and basestation {arrived}"
+        self._print(line)
+
+    def _print(self, line: str) -> None:
         self._console.print(line, highlight=False, soft_wrap=True)
+
+
+def _changes(simulated: Said) -> list[str]:
+    """How the boards' states have changed, in words, the newest last."""
+    return [f"{change['at']:.1f} s: {change['board']} {change['text']}" for change in simulated["changes"]]
 
 
 class _Terminal:
     def __init__(self, console: Console, live: Live, table: RouteTable, duration: float) -> None:
         self._console, self._live, self._duration = console, live, duration
-        self._routes = {route.case.value: route for route in udp_routes(table)}
+        self._routes = {route.name: route for route in active_routes(table)}
 
-    def show(self, seconds: float, view: View, heard: Said, simulated: Said) -> None:
+    def show(self, view: View, heard: Said, simulated: Said) -> None:
         def on_ros(row: RouteRow) -> Text:
             """The slowest topic of the route counts: each shall get every message."""
-            return _count([topic_count(heard, t.topic.value) for t in self._routes[row.route].topics])
+            route = self._routes[row.route]
+            topics = () if route.is_outbound else route.topics
+            return _count([topic_count(heard, topic.topic.value) for topic in topics])
 
-        def came_back(row: RouteRow) -> Text:
-            ends = [d.endpoint.value for d in self._routes[row.route].destinations]
-            return _count([arrival_count(simulated, endpoint, row.route) for endpoint in ends])
+        def on_udp(row: RouteRow) -> Text:
+            route = self._routes[row.route]
+            ends = [destination.endpoint.value for destination in route.destinations]
+            return _count([arrival_count(simulated, endpoint, route.case.value) for endpoint in ends])
 
-        shown = View(
-            tuple(row for row in view.routes if row.route in self._routes),
-            view.received,
-            view.rate,
-            view.rejected,
-            view.kernel_drops,
-        )
-        title = Text(f"router demo, {seconds:.0f} of {self._duration:.0f} s", style="bold")
+        title = Text(f"router demo, {simulated['seconds']:.0f} of {self._duration:.0f} s", style="bold")
         title.append(f"  {summary_line(view)}", style="not bold")
+        changes = [Text(change, style="yellow", no_wrap=True) for change in _changes(simulated)[-CHANGES_SHOWN:]]
         legend = Text(style="dim").append("destinations", style="cyan").append(", ").append("ROS topics", style="green")
-        legend.append("; on ROS, back: counted by a ROS node, by the simulator")
-        table = route_table(shown, self._console.height - 3, {"on ROS": on_ros, "back": came_back})
-        self._live.update(Group(title, table, legend), refresh=True)
+        legend.append("; on ROS, on UDP: counted by a ROS node, by the simulator")
+        room = self._console.height - 3 - len(changes)
+        table = route_table(view, room, {"on ROS": on_ros, "on UDP": on_udp})
+        self._live.update(Group(title, table, *changes, legend), refresh=True)
 
 
 def _count(counts: list[int]) -> Text:

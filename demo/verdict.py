@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from demo.expected import expected_arrivals, expected_topics
+from demo.expected import FOUND, LOST, SILENT, expected_arrivals, halted_boards, inbound_topics, outbound_topics
 from router.table.model import RouteTable
 from router.tools.live import View
 from router.tools.live_view import reasons_text
 
-WANTED_DROPS = frozenset({"rate_limited"})
-"""Losses that a table asks for by `max_rate`."""
+WANTED_DROPS = frozenset({"rate_limited", "stale"})
+"""Losses that a table asks for, by `max_rate` and `ttl`."""
 
 
 Said = Mapping[str, Any]
@@ -29,7 +31,13 @@ class Finding:
 
 def judge(table: RouteTable, heard: Said, simulated: Said, view: View | None) -> list[Finding]:
     """`heard` and `simulated` are the last words of the ROS listener and the simulator, `view` the last scrape."""
-    return [_topics(table, heard), _arrivals(table, simulated), _losses(view)]
+    return [
+        _topics(table, heard),
+        _arrivals(table, simulated),
+        *_frames(table, simulated),
+        _deadman(table, simulated),
+        _losses(view),
+    ]
 
 
 def topic_count(heard: Said, topic: str) -> int:
@@ -38,12 +46,12 @@ def topic_count(heard: Said, topic: str) -> int:
 
 
 def arrival_count(simulated: Said, endpoint: str, case: str) -> int:
-    """Datagrams of a payload case that came back to a simulated endpoint."""
+    """Datagrams of a payload case that arrived at a simulated endpoint."""
     return int(simulated.get("received", {}).get(endpoint, {}).get(case, {}).get("count", 0))
 
 
 def _topics(table: RouteTable, heard: Said) -> Finding:
-    counts = {topic: topic_count(heard, topic) for topic in expected_topics(table)}
+    counts = {topic: topic_count(heard, topic) for topic in inbound_topics(table)}
     silent = [topic for topic, count in counts.items() if not count]
     if silent:
         return Finding(False, f"nothing arrived on {len(silent)} of {len(counts)} ROS topics: {', '.join(silent)}")
@@ -56,23 +64,55 @@ def _arrivals(table: RouteTable, simulated: Said) -> Finding:
     missing = [f"{case} at {endpoint}" for (endpoint, case), count in counts.items() if not count]
     undecodable = sum(simulated.get("undecodable", {}).values())
     if missing:
-        return Finding(False, f"{len(missing)} of {len(counts)} forwards never came: {', '.join(missing)}")
+        return Finding(False, f"{len(missing)} of {len(counts)} payload cases never arrived: {', '.join(missing)}")
     if undecodable:
-        return Finding(False, f"{undecodable} datagrams came back undecodable")
-    names = {endpoint for endpoint, _ in counts}
-    return Finding(True, f"datagrams came back at all {len(names)} destinations: {sum(counts.values())}")
+        return Finding(False, f"{undecodable} datagrams arrived undecodable")
+    topics, datagrams = len(outbound_topics(table)), sum(counts.values())
+    words = f"all {len(counts)} payload cases at boards and basestation, those from {topics} ROS topics among them"
+    return Finding(True, f"{words}: {datagrams} datagrams")
+
+
+def _frames(table: RouteTable, simulated: Said) -> Iterator[Finding]:
+    """What is split into one datagram for each element is put together again."""
+    for route in table.routes:
+        for destination in route.destinations if route.for_each else ():
+            case, endpoint = route.case.value, destination.endpoint.value
+            frames = simulated.get("frames", {}).get(endpoint, {}).get(case, {"complete": 0})
+            yield Finding(frames["complete"] > 0, f"{endpoint} put {frames['complete']} frames of {case} together")
+
+
+def _deadman(table: RouteTable, simulated: Said) -> Finding:
+    """Whether each board was told to halt while the link was lost, and obeyed again when it was found."""
+    boards = sorted(halted_boards(table))
+    if not boards:
+        return Finding(False, f"no deadman guards what {SILENT} commands")
+    halted = {board: _change(simulated, board, "halted", LOST, FOUND) for board in boards}
+    released = {board: _change(simulated, board, "obeying", FOUND, math.inf) for board in boards}
+    missing = [f"{board} was not halted" for board, at in halted.items() if at is None]
+    missing += [f"{board} did not obey again" for board, at in released.items() if at is None]
+    if missing:
+        return Finding(False, f"{SILENT} was cut off from {LOST:.0f} to {FOUND:.0f} s, and {', '.join(missing)}")
+    told = ", ".join(f"{board} after {at - LOST:.2f} s" for board, at in halted.items() if at is not None)
+    return Finding(True, f"{SILENT} was cut off for {FOUND - LOST:.0f} s: halted {told}; obeyed again when it was back")
+
+
+def _change(simulated: Said, board: str, state: str, start: float, end: float) -> float | None:
+    """When a board first came into a state within these seconds."""
+    changes = (c for c in simulated.get("changes", ()) if (c["board"], c["state"]) == (board, state))
+    return next((float(change["at"]) for change in changes if start <= change["at"] < end), None)
 
 
 def _losses(view: View | None) -> Finding:
     if view is None:
         return Finding(False, "the router's metrics could not be read")
-    lost = dict(view.rejected)
+    lost, wanted = Counter(view.rejected), Counter[str]()
     for row in view.routes:
         for reason, count in row.dropped.items():
-            if reason not in WANTED_DROPS:
-                lost[reason] = lost.get(reason, 0) + count
+            (wanted if reason in WANTED_DROPS else lost)[reason] += count
     if view.kernel_drops:
         lost["kernel_drops"] = view.kernel_drops
     if lost:
         return Finding(False, f"the router lost messages: {reasons_text(lost)}")
-    return Finding(True, f"the router took {view.received} datagrams and lost none")
+    received = sum(row.received for row in view.routes)
+    withheld = f", withheld {reasons_text(wanted)} as the table asks" if wanted else ""
+    return Finding(True, f"the router took {received} messages and lost none{withheld}")

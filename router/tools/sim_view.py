@@ -97,7 +97,7 @@ class SimView:
             for case, frames in inbox.frames.items():
                 told = f"{case}: {frames.complete} frames complete, {frames.incomplete} incomplete"
                 if frames.astray:
-                    told += f", {frames.astray} objects of no possible frame"
+                    told += f", {frames.astray} parts of no frame"
                 yield endpoint, told, "yellow" if frames.incomplete or frames.astray else "green"
             if inbox.undecodable:
                 yield endpoint, f"{inbox.undecodable} undecodable datagrams", "bold red"
@@ -112,7 +112,7 @@ class SimView:
         return table
 
     def table(self, height: int) -> Table:
-        """One line for each endpoint and payload case, at most `height` with the header."""
+        """One line for each endpoint and payload case, at most `height` with the header; boards first."""
         table = Table(box=None, pad_edge=False, expand=True, header_style="bold")
         table.add_column("endpoint", no_wrap=True)
         table.add_column("received", no_wrap=True)
@@ -120,7 +120,7 @@ class SimView:
         table.add_column("/s", justify="right", no_wrap=True)
         table.add_column("age", justify="right", no_wrap=True)
         table.add_column("last value", no_wrap=True, ratio=1, overflow="ellipsis")
-        rows = sorted(self._arrivals(), key=lambda row: row[0])
+        rows = sorted(self._arrivals(), key=lambda row: (self._statistics.inboxes[row[0][0]].board is None, row[0]))
         shown = rows if len(rows) < height else rows[: max(height - 2, 0)]
         for (endpoint, case), arrivals in shown:
             rate = self._rates.get((endpoint, case), 0.0)

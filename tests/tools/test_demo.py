@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from demo.children import Child
+from demo.expected import FOUND, LOST, expected_arrivals, inbound_topics, outbound_topics
 from demo.places import free_ros_domain, taken_places
 from demo.verdict import judge
 from router.table.model import RouteTable
@@ -32,16 +33,20 @@ def seen(dropped: dict[str, int] | None = None, rejected: dict[str, int] | None 
 
 
 def all_heard(table: RouteTable) -> dict[str, Any]:
-    topics = (topic.topic.value for route in table.routes if not route.is_outbound for topic in route.topics)
-    return {"topics": {topic: {"count": 3} for topic in topics}}
+    return {"topics": {topic: {"count": 3} for topic in inbound_topics(table)}}
 
 
-def all_came_back(table: RouteTable) -> dict[str, Any]:
+def all_arrived(table: RouteTable) -> dict[str, Any]:
     received: dict[str, dict[str, Any]] = {}
-    for route in table.routes:
-        for destination in route.destinations if not route.is_outbound else ():
-            received.setdefault(destination.endpoint.value, {})[route.case.value] = {"count": 3}
-    return {"received": received, "undecodable": {}}
+    for endpoint, case in expected_arrivals(table):
+        received.setdefault(endpoint, {})[case] = {"count": 3}
+    changes = [
+        {"at": at, "board": board, "state": state, "text": state}
+        for at, state in ((0.1, "obeying"), (LOST + 0.5, "halted"), (FOUND + 0.1, "obeying"))
+        for board in ("driving_board", "arm_board")
+    ]
+    frames = {"basestation": {"detected_object": {"complete": 5, "incomplete": 0, "astray": 0}}}
+    return {"received": received, "undecodable": {}, "changes": changes, "frames": frames}
 
 
 @pytest.fixture(scope="module")
@@ -49,44 +54,79 @@ def sim_table() -> RouteTable:
     return read_table(ROOT / "routes" / "sim.yaml")
 
 
-def complaints(table: RouteTable, heard: dict[str, Any], came_back: dict[str, Any], view: View) -> list[str]:
-    return [finding.text for finding in judge(table, heard, came_back, view) if not finding.ok]
+def complaints(table: RouteTable, heard: dict[str, Any], arrived: dict[str, Any], view: View) -> list[str]:
+    return [finding.text for finding in judge(table, heard, arrived, view) if not finding.ok]
 
 
 def test_all_is_well_when_everything_arrived_and_nothing_was_lost(sim_table: RouteTable) -> None:
-    view = seen(dropped={"rate_limited": 5})
-    assert complaints(sim_table, all_heard(sim_table), all_came_back(sim_table), view) == []
+    view = seen(dropped={"rate_limited": 5, "stale": 1})
+    assert complaints(sim_table, all_heard(sim_table), all_arrived(sim_table), view) == []
+    *_, losses = judge(sim_table, all_heard(sim_table), all_arrived(sim_table), view)
+    assert losses.text.endswith("lost none, withheld 5 rate_limited, 1 stale as the table asks")
+
+
+def test_both_directions_are_expected(sim_table: RouteTable) -> None:
+    """Every case from ROS, and nothing that the router itself publishes among what the talker says."""
+    from_ros = {route.case.value for route in sim_table.routes if route.is_outbound}
+    assert from_ros <= {case for _, case in expected_arrivals(sim_table)}
+    assert not outbound_topics(sim_table).keys() & inbound_topics(sim_table).keys()
 
 
 def test_one_silent_topic_fails(sim_table: RouteTable) -> None:
     heard = all_heard(sim_table)
     heard["topics"]["imu/mag"]["count"] = 0
-    (complaint,) = complaints(sim_table, heard, all_came_back(sim_table), seen())
+    (complaint,) = complaints(sim_table, heard, all_arrived(sim_table), seen())
     assert complaint.startswith("nothing arrived on 1 of ")
     assert complaint.endswith(" ROS topics: imu/mag")
 
 
-def test_one_missing_forward_fails(sim_table: RouteTable) -> None:
-    came_back = all_came_back(sim_table)
-    del came_back["received"]["driving_board"]["manual_drive"]
-    (complaint,) = complaints(sim_table, all_heard(sim_table), came_back, seen())
-    assert complaint.endswith("never came: manual_drive at driving_board")
+@pytest.mark.parametrize("case", ["manual_drive", "drive_motor"])
+def test_one_missing_payload_case_fails(sim_table: RouteTable, case: str) -> None:
+    arrived = all_arrived(sim_table)
+    del arrived["received"]["driving_board"][case]
+    (complaint,) = complaints(sim_table, all_heard(sim_table), arrived, seen())
+    assert complaint.endswith(f"never arrived: {case} at driving_board")
+
+
+def test_frames_that_are_never_whole_fail(sim_table: RouteTable) -> None:
+    arrived = all_arrived(sim_table)
+    arrived["frames"]["basestation"]["detected_object"]["complete"] = 0
+    assert complaints(sim_table, all_heard(sim_table), arrived, seen()) == [
+        "basestation put 0 frames of detected_object together"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("at", "state", "complaint"),
+    [
+        (LOST + 0.5, "halted", "driving_board was not halted"),
+        (FOUND + 0.1, "obeying", "driving_board did not obey again"),
+    ],
+)
+def test_a_deadman_that_does_not_trip_or_release_fails(
+    sim_table: RouteTable, at: float, state: str, complaint: str
+) -> None:
+    arrived = all_arrived(sim_table)
+    arrived["changes"].remove({"at": at, "board": "driving_board", "state": state, "text": state})
+    assert complaints(sim_table, all_heard(sim_table), arrived, seen()) == [
+        f"basestation was cut off from {LOST:.0f} to {FOUND:.0f} s, and {complaint}"
+    ]
 
 
 @pytest.mark.parametrize(
     ("view", "complaint"),
     [
-        (seen(dropped={"stale": 2}), "the router lost messages: 2 stale"),
+        (seen(dropped={"queue_full": 2}), "the router lost messages: 2 queue_full"),
         (seen(rejected={"malformed": 1}), "the router lost messages: 1 malformed"),
         (seen(kernel_drops=4), "the router lost messages: 4 kernel_drops"),
     ],
 )
 def test_any_loss_fails(sim_table: RouteTable, view: View, complaint: str) -> None:
-    assert complaints(sim_table, all_heard(sim_table), all_came_back(sim_table), view) == [complaint]
+    assert complaints(sim_table, all_heard(sim_table), all_arrived(sim_table), view) == [complaint]
 
 
 def test_silence_of_the_witnesses_fails(sim_table: RouteTable) -> None:
-    assert len(complaints(sim_table, {}, {}, seen())) == 2
+    assert len(complaints(sim_table, {}, {}, seen())) == 4
 
 
 def test_addresses_that_are_taken_are_named(table: RouteTable) -> None:

@@ -198,9 +198,35 @@ def test_sim_writes_lines_where_there_is_no_terminal(
     assert main(["sim", str(table_path()), "--duration", "0.1"]) == 0
     title, last = capsys.readouterr().out.splitlines()
     assert title.startswith("2 endpoints send 2 payload cases, 4/s, to 127.0.0.1:")
-    assert "came back 0" in last
+    assert "received 0" in last
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+def test_sim_tells_when_a_board_stops_and_what_it_cannot_read(table_path: Callable[..., Path]) -> None:
+    path = table_path()
+    board = read_table(path).endpoints["board"].address.value
+    command = [sys.executable, "-m", "router", "sim", str(path)]
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as sim,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as router,
+    ):
+        assert sim.stdout is not None
+        sim.stdout.readline()
+        for data in (EMPTY_PLAIN, b"\xff"):
+            router.sendto(data, board)
+        obeyed, stopped = sim.stdout.readline(), sim.stdout.readline()
+        sim.send_signal(signal.SIGINT)
+        last = sim.stdout.read()
+    assert obeyed.endswith(" s: board obeys commands\n")
+    assert " s: board no commands for 1." in stopped
+    assert "received 1, undecodable 1" in last
+
+
+def test_sim_explains_a_silence_that_it_does_not_understand(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "--silent", "basestation"]) == 2
+    complaint = "'basestation' is not NAME:FROM-TO with seconds, such as basestation:5-8"
+    assert capsys.readouterr().err == f"router sim: {complaint}\n"
 
 
 def test_a_table_with_errors_is_shown_with_its_findings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

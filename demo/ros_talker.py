@@ -1,0 +1,54 @@
+"""The rover's software, as far as the router can tell: publishes every topic that the table takes from ROS.
+
+`python -m demo.ros_talker TABLE`
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import sys
+from pathlib import Path
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from demo.expected import outbound_topics
+from demo.ros_messages import filled, message_class
+from router.tools.wire import read_table
+
+INTERVAL = 0.1
+"""Seconds."""
+
+ANY_SUBSCRIBER = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Reliable and kept: what a subscriber may ask for at most."""
+
+
+def talk(node: Node, topics: dict[str, str]) -> None:
+    """From now on one message on each topic in every INTERVAL."""
+    classes = {topic: message_class(name) for topic, name in topics.items()}
+    publishers = {topic: node.create_publisher(kind, topic, ANY_SUBSCRIBER) for topic, kind in classes.items()}
+    numbers = itertools.count()
+
+    def publish() -> None:
+        number, stamp = next(numbers), node.get_clock().now().to_msg()
+        for topic, publisher in publishers.items():
+            publisher.publish(filled(classes[topic], number, stamp))
+
+    node.create_timer(INTERVAL, publish)
+
+
+def main() -> int:
+    table = read_table(Path(sys.argv[1]))
+    rclpy.init()
+    node = rclpy.create_node("demo_talker", namespace=table.node.namespace)
+    talk(node, outbound_topics(table))
+    with contextlib.suppress(ExternalShutdownException):  # which is how SIGTERM ends it
+        rclpy.spin(node)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
