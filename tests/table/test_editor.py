@@ -149,7 +149,7 @@ def test_a_mistake_is_underlined_where_it_is(
         ("auto: true", "Auto", "Fields of the same name"),
         ("budget", "Budget", "commands go first"),
         ("keep", "Keep", "first: they are dropped"),
-        ("priority", "Priority", "command where a destination is a board"),
+        ("priority", "Priority", "command on the way to a board"),
         ("ttl", "Time to live", "dropped as stale"),
         ("deadman: {", "Deadman", "armed by the first command"),
         ("timeout: 400ms", "Timeout", "no fresh command"),
