@@ -112,7 +112,7 @@ def presence(path: tuple[str, ...], field_span: SourceSpan, span: SourceSpan, sc
         holder = inner.type
     member = holder.field(path[-1])
     if member is None or not member.has_presence:
-        hint = "has() is for submessages and optional fields"
+        hint = "has() is for a payload's submessages and optional fields"
         raise Finding(field_span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always there", hint)
     has_field = attribute(scope.reads.message(path[:-1]), "HasField")
     return Typed.at(span, BoolKind(), ast.Call(has_field, [ast.Constant(path[-1])], []))
