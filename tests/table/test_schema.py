@@ -8,8 +8,9 @@ from typing import Any
 import jsonschema
 
 from router.table.build import DEFAULT_NODE, DEFAULT_RECEIVE_BUFFER
+from router.table.build_routes import DEFAULT_REPEAT
 from router.table.shape import table_schema
-from router.table.units import parse_size
+from router.table.units import parse_duration, parse_size
 
 
 def keys(schema: object, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
@@ -54,3 +55,5 @@ def test_documented_defaults_are_those_of_the_code() -> None:
     assert properties["node"]["default"] == {"name": DEFAULT_NODE.name, "namespace": DEFAULT_NODE.namespace}
     buffer = table_schema()["definitions"]["listener"]["properties"]["receive_buffer"]
     assert parse_size(buffer["default"]) == DEFAULT_RECEIVE_BUFFER
+    repeat = table_schema()["definitions"]["deadman"]["else"]["properties"]["repeat"]
+    assert parse_duration(repeat["default"]) == DEFAULT_REPEAT
