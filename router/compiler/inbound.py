@@ -5,14 +5,14 @@ from __future__ import annotations
 from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedTarget
 from router.compiler.destinations import destinations, keep, max_rate, target_to
 from router.compiler.expressions import ParsedReads, Typed
-from router.compiler.kinds import BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind, kind_of
+from router.compiler.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.syntax import load
 from router.compiler.target import Target
 from router.errors import Code, SourceSpan
 from router.table.model import Collect, Destination, Endpoint, Route, Topic
-from router.types.model import Int, MessageType
+from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 
@@ -57,7 +57,7 @@ def _publish(
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Typed]:
     """What the topics of a route that collects see beside the fields of the frame's first part."""
     items = Typed.at(span, ListKind(MessageKind(case.type)), load("items"))
-    return {"items": items, "count": Typed.at(span, kind_of(Int(32, signed=False)), load("count"))}
+    return {"items": items, "count": Typed.at(span, UINT32, load("count"))}
 
 
 def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) -> CheckedCollect | None:

@@ -107,6 +107,9 @@ class ListKind:
 
 
 ANY_INT = IntKind(None, None)
+UINT32 = IntKind(0, 0xFFFF_FFFF)
+"""How many there are of something, and which of them one is."""
+
 Kind = Union[BoolKind, IntKind, FloatKind, StringKind, BytesKind, EnumKind, TimeKind, MessageKind, ListKind]
 Number = (IntKind, FloatKind, EnumKind)
 """The kinds that arithmetic takes, for isinstance()."""

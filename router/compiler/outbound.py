@@ -8,17 +8,16 @@ from router.compiler.cdr.reading import CdrReads
 from router.compiler.checked import CheckedFeed, CheckedRoute, CheckedTarget
 from router.compiler.destinations import destinations, target_to
 from router.compiler.expressions import Scope, Typed
-from router.compiler.kinds import ListKind, kind_of
+from router.compiler.kinds import UINT32, ListKind
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.syntax import load
 from router.errors import Code, SourceSpan
 from router.table.model import Destination, Endpoint, Expression, Route, Topic
-from router.types.model import Int, MessageType
+from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 Destinations = Sequence[tuple[Destination, "Endpoint | None"]]
-
 HEADER = "std_msgs/msg/Header"
 
 
@@ -101,9 +100,8 @@ def _element_names(elements: Typed) -> dict[str, Typed]:
     """What expressions see beside the fields of the message that has the list."""
     assert isinstance(elements.kind, ListKind)  # noqa: S101 - see _elements
     assert elements.kind.element is not None  # noqa: S101
-    number = kind_of(Int(32, signed=False))
     return {
         "item": Typed.at(elements.span, elements.kind.element, load("item")),
-        "index": Typed.at(elements.span, number, load("index")),
-        "count": Typed.at(elements.span, number, load("count")),
+        "index": Typed.at(elements.span, UINT32, load("index")),
+        "count": Typed.at(elements.span, UINT32, load("count")),
     }
