@@ -28,21 +28,30 @@ class Ledger:
         return sum(count for key, count in self.counted(metric).items() if key[: 1 + len(labels)] == (metric, *labels))
 
     def imbalances(self) -> Iterator[str]:
+        """Expects that nothing waits: no frame is open, and nothing is held back for later."""
+        inbound = [handler for handlers in self._program.inbound.values() for handler in handlers]
+        outbound = [handler for handlers in self._program.outbound.values() for handler in handlers]
         received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")
-        if received != (accepted := self.total("messages_received")) + rejected:
+        accepted = sum(self.total("messages_received", handler.route) for handler in inbound)
+        if received != accepted + rejected:
             yield f"received {received}, but accepted {accepted} and rejected {rejected}"
-        for [handler] in self._program.inbound.values():
-            yield from self._of_route(handler)
+        for handler in inbound:
+            yield from self._time_of_route(handler.route)
+        for handler in (*inbound, *outbound):
+            yield from self._fates(handler)
 
-    def _of_route(self, handler: Handler) -> Iterator[str]:
-        route = handler.case.name
+    def _time_of_route(self, route: str) -> Iterator[str]:
         accepted = self.total("messages_received", route)
         first = self._program.books.slot("route_seconds", route)
         if accepted != (timed := sum(self._counts[first : first + HISTOGRAM_SLOTS - 1])):
             yield f"{route}: accepted {accepted}, but the histogram holds {timed}"
+
+    def _fates(self, handler: Handler) -> Iterator[str]:
+        route, accepted = handler.route, self.total("messages_received", handler.route)
         for target in handler.targets:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
-            metrics = (delivered, "messages_dropped", "messages_filtered")
+            metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected")
             fates = [self.total(metric, route, target.target) for metric in metrics]
             if accepted != sum(fates):
-                yield f"{route} to {target.target}: accepted {accepted}, but delivered, dropped, filtered {fates}"
+                kinds = "delivered, dropped, filtered, collected"
+                yield f"{route} to {target.target}: accepted {accepted}, but {kinds} {fates}"

@@ -7,8 +7,8 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.engine import MAX_DATAGRAM
 from router.engine.binding import bind
-from router.engine.freshness import Freshness
 from router.engine.framing import restored
+from router.engine.freshness import Freshness
 from router.table.model import Framing
 from tests.engine.rig import Rig
 
@@ -20,7 +20,9 @@ class Naive:
         self.rig = rig
         self.program = rig.program
         handlers = [(number, handler) for number, [handler] in self.program.inbound.items()]
-        self.handles = {number: bind(handler, self.program.books, rig.outlets, Freshness()) for number, handler in handlers}
+        self.handles = {
+            number: bind(handler, self.program.books, rig.outlets, Freshness()) for number, handler in handlers
+        }
 
     def receive(self, data: bytes, peer: tuple[str, int], listener: str) -> None:
         self._add(1, "datagrams_received", listener)
