@@ -22,7 +22,7 @@ setup:  ## build .venv with the router, ROS 2 Jazzy and the comms interfaces; wh
 test: setup  ## run the tests; TESTS=tests/wire for some of them
 	@$(ENV) .venv/bin/python -m pytest $(TESTS)
 
-demo: setup  ## simulator and router on real ROS for 15 seconds, with live rates
+demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost link halts the rover
 	@$(ENV) .venv/bin/python -m demo
 
 validate: setup  ## say what is wrong with the tables in routes/

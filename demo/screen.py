@@ -86,7 +86,7 @@ class _Terminal:
         title.append(f"  {summary_line(view)}", style="not bold")
         changes = [Text(change, style="yellow", no_wrap=True) for change in _changes(simulated)[-CHANGES_SHOWN:]]
         legend = Text(style="dim").append("destinations", style="cyan").append(", ").append("ROS topics", style="green")
-        legend.append("; on ROS, on UDP: counted by a ROS node, by the simulator")
+        legend.append("; on ROS, on UDP: what has really arrived there")
         room = self._console.height - 3 - len(changes)
         table = route_table(view, room, {"on ROS": on_ros, "on UDP": on_udp})
         self._live.update(Group(title, table, *changes, legend), refresh=True)

@@ -33,6 +33,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Send plausible, moving values from every endpoint of a table and show what each receives. "
         "Boards obey commands, halt for a deadman, and stop when left alone for a second. "
         "The endpoints' addresses must be this machine's, as they are in routes/sim.yaml.",
+        epilog="A lost link, and what the boards make of it: router sim --silent basestation:5-8",
     )
     default = Path("routes/sim.yaml")
     parser.add_argument(
@@ -46,8 +47,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         action="append",
         default=[],
         metavar="NAME:FROM-TO",
-        help="an endpoint or payload case that says nothing from second FROM to second TO, again and again if you "
-        "like: --silent basestation:5-8 is a lost link; without TO for ever",
+        help="nothing is sent by this endpoint, or of this payload case, from second FROM to second TO; without TO for "
+        "ever. Several are possible",
     )
     parser.add_argument("--json", action="store_true", help="statistics as JSON lines, the last one final")
 

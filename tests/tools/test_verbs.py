@@ -168,6 +168,15 @@ def test_a_mistake_in_tap_is_one_line_and_exit_code_2(
     assert f"router tap: {complaint}" in capsys.readouterr().err
 
 
+def test_tap_of_a_topic_without_ros_says_what_is_missing() -> None:
+    program = (
+        "import sys; from router.cli import main; sys.modules['rclpy'] = None; sys.exit(main(['tap', '--topic', 't']))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("router tap: a topic needs ROS 2, which is not installed here (")
+
+
 def test_tap_listens_to_a_port_or_a_topic_not_both() -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["tap", "5000", "--topic", "imu_data"])
