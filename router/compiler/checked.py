@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
-from router.compiler.plan import Record
 from router.compiler.target import Target
 from router.errors import SourceSpan
 from router.table.model import Route, Topic
@@ -61,10 +60,10 @@ class CheckedCollect:
 
 @dataclass(frozen=True, slots=True)
 class CheckedDeadman:
-    """The payload that is sent when commands stop coming: `plan` has constants only. `to` are endpoint names."""
+    """What is sent when commands stop coming: the envelope, with its zeros, of a `case`. `to` are endpoint names."""
 
     case: PayloadCase
-    plan: Record
+    datagram: bytes
     to: tuple[str, ...]
 
 

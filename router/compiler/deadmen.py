@@ -5,17 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
-from router.compiler.destinations import recipient
+from router.compiler.destinations import keep, recipient
 from router.compiler.expressions import ParsedReads
 from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
-from router.compiler.plan import Record
 from router.errors import Code, MappingError
-from router.table.model import Deadman, EndpointKind, Route
+from router.table.model import Deadman, EndpointKind, Keep, Route
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
+
+SHORTEST_REPEAT = 10_000_000
+"""ns. Faster is no brake but a flood, for a board that may still be busy with the last one."""
 
 _NOTHING = MessageType("a deadman")
 """What a deadman's payload is made of: there is no message that it could be filled from."""
@@ -33,8 +35,8 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
         return None
     for name in deadman.to:
         recipient(lookup, case, name, sources=frozenset())
-    plan = _payload(lookup, deadman, case)
-    return CheckedDeadman(case, plan, tuple(name.value for name in deadman.to)) if plan else None
+    datagram = _datagram(lookup, deadman, case)
+    return CheckedDeadman(case, datagram, tuple(name.value for name in deadman.to)) if datagram is not None else None
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
@@ -62,9 +64,27 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     if len(limited) == len(rates) and deadman.timeout.value * max(limited) <= NS_PER_SECOND:
         message = f"it would trip between commands that `max_rate` holds down to {max(limited):g} Hz"
         lookup.report(deadman.timeout.span, Code.BAD_VALUE, message, "a longer timeout, or a higher max_rate")
+    if deadman.repeat.value < SHORTEST_REPEAT:
+        message = "more than 100 datagrams per second would flood who gets them"
+        lookup.report(deadman.repeat.span, Code.BAD_VALUE, message, "repeat it every 10ms at most")
+    _want_no_late_commands(lookup, route, deadman)
 
 
-def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> Record | None:
+def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
+    """A command that waits to be sent must be stale before the deadman speaks, or it would undo that."""
+    if route.ttl is not None and route.ttl.value <= deadman.timeout.value:
+        return
+    for destination in route.destinations:
+        endpoint = lookup.table.endpoints.get(destination.endpoint.value)
+        waits_for = "`keep: latest`" if keep(destination) is Keep.LATEST else "the endpoint's budget"
+        if keep(destination) is Keep.LATEST or (endpoint is not None and endpoint.budget is not None):
+            message = f"a command that waits for {waits_for} could be sent after the deadman has tripped"
+            span = route.ttl.span if route.ttl else destination.endpoint.span
+            lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
+            return
+
+
+def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | None:
     """A payload of which nothing is filled is one: all zero."""
     scope = replace(lookup.scope(_NOTHING, ParsedReads()), given=())
     mapping = build(deadman.fields, case.type, scope, deadman.case.span)
@@ -73,8 +93,7 @@ def _payload(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> Record | No
     if findings:
         return None
     try:
-        constant_envelope(mapping.plan, case, lookup.schema)
+        return constant_envelope(mapping.plan, case, lookup.schema)
     except (MappingError, ValueError) as error:
         lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None
-    return mapping.plan

@@ -12,7 +12,6 @@ from router.compiler.checked import CheckedRoute
 from router.compiler.handlers import HandlerSource
 from router.compiler.lookup import nested_types
 from router.compiler.namespace import NAMESPACE
-from router.compiler.payload import constant_envelope
 from router.compiler.program import (
     STRANGER,
     DeadmanPlan,
@@ -43,7 +42,7 @@ def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Seq
                 inbound[number] = (*inbound.get(number, ()), handler)
             else:
                 outbound[handler.topic] = (*outbound.get(handler.topic, ()), handler)
-    deadmen = tuple(_deadman(checked, table, schema, books) for checked in served if checked.deadman)
+    deadmen = tuple(_deadman(checked, table, books) for checked in served if checked.deadman)
     destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     return Program(
@@ -143,11 +142,10 @@ def _handler(
     )
 
 
-def _deadman(checked: CheckedRoute, table: RouteTable, schema: ProtoSchema, books: Books) -> DeadmanPlan:
+def _deadman(checked: CheckedRoute, table: RouteTable, books: Books) -> DeadmanPlan:
     route, deadman = checked.route, checked.deadman
     assert route.deadman is not None  # noqa: S101 - the caller's choice
     assert deadman is not None  # noqa: S101
-    datagram = constant_envelope(deadman.plan, deadman.case, schema)
     for metric in ("deadman_active", "deadman_trips"):
         books.slot(metric, route.name)
     for endpoint in deadman.to:
@@ -158,7 +156,7 @@ def _deadman(checked: CheckedRoute, table: RouteTable, schema: ProtoSchema, book
         timeout=route.deadman.timeout.value,
         repeat=route.deadman.repeat.value,
         datagrams=tuple(
-            (name, datagram.rstrip(b"\0") if table.endpoints[name].trim_trailing_zeros else datagram)
+            (name, deadman.datagram.rstrip(b"\0") if table.endpoints[name].trim_trailing_zeros else deadman.datagram)
             for name in deadman.to
         ),
     )

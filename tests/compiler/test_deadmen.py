@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from router.compiler.payload import constant_envelope
 from router.errors import Code, Diagnostic
 from tests.compiler.conftest import CheckText
 
@@ -57,10 +56,9 @@ def test_payload_is_known_before_the_start(check_text: CheckText, send: str, env
     checked = check_text(ROUTE.format(destinations="board", deadman=deadman))
     (route,) = checked.routes
     assert not checked.has_errors
-    assert checked.schema is not None
     assert route.deadman is not None
     assert route.deadman.to == ("board", "base")
-    assert constant_envelope(route.deadman.plan, route.deadman.case, checked.schema).hex() == envelope
+    assert route.deadman.datagram.hex() == envelope
 
 
 @pytest.mark.parametrize("value", ["brake", "message", "source == 'base'", "received_at > 0", "turn > 0", "has(turn)"])
@@ -88,3 +86,33 @@ def test_deadman_does_not_trip_by_itself(check_text: CheckText, destinations: st
     routes = ROUTE.format(destinations=destinations, deadman=BRAKE.replace("500ms", timeout))
     found = check_text(routes, endpoints=endpoints).diagnostics
     assert (Code.BAD_VALUE in {finding.code for finding in found}) == trips
+
+
+@pytest.mark.parametrize(("repeat", "accepted"), [("9ms", False), ("10ms", True)])
+def test_a_deadman_floods_nobody(check_text: CheckText, repeat: str, accepted: bool) -> None:
+    deadman = f"{{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}, to: [board], repeat: {repeat}}}"
+    assert [each.code for each in findings(check_text, "board", deadman)] == ([] if accepted else [Code.BAD_VALUE])
+
+
+@pytest.mark.parametrize(
+    ("destination", "ttl", "accepted"),
+    [
+        ("{endpoint: board, max_rate: 10 Hz, keep: latest}", None, False),
+        ("{endpoint: board, max_rate: 10 Hz, keep: latest}", "501ms", False),
+        ("{endpoint: board, max_rate: 10 Hz, keep: latest}", "500ms", True),
+        ("{endpoint: board, max_rate: 10 Hz, keep: first}", None, True),
+        ("paced", None, False),
+        ("paced", "200ms", True),
+    ],
+)
+def test_no_command_waits_until_after_the_deadman_has_tripped(
+    check_text: CheckText, destination: str, ttl: str | None, accepted: bool
+) -> None:
+    route = ROUTE.format(destinations=destination, deadman=BRAKE) + (f"    ttl: {ttl}\n" if ttl else "")
+    endpoints = (
+        "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation},"
+        " paced: {address: 127.0.0.4:8, kind: board, budget: 10kB/s}}"
+    )
+    found = check_text(route, endpoints=endpoints).diagnostics
+    codes = [finding.code for finding in found if finding.code is not Code.UNCOVERED_PAYLOAD_CASE]
+    assert codes == ([] if accepted else [Code.BAD_VALUE])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import pytest
 
@@ -82,7 +83,7 @@ def enveloped(**payload: object) -> bytes:
     return message
 
 
-def ros(type_name: str, **values: object) -> bytes:
+def ros(type_name: str, **values: Any) -> bytes:
     message = ros_interfaces().get(type_name)
     assert message is not None
     return cdr(message, values)
