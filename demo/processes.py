@@ -1,0 +1,124 @@
+"""The demo's four processes: started in order, watched, ended in order, and judged by what they said."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from demo.children import Child
+from demo.expected import FOUND, LOST, SILENT
+from demo.places import free_ros_domain
+from demo.screen import open_screen
+from demo.verdict import Finding, judge
+from router.errors import RouterError, TransportError
+from router.table.model import Address, RouteTable
+from router.tools.live import Snapshot, Window, parse_metrics, scrape
+
+TABLE = Path("routes/sim.yaml")
+DURATION = 12.0
+START_PATIENCE = 30.0
+"""Seconds within which a process must be up; a cold start reads a lot from disk."""
+
+MATCHING = 0.5
+"""Seconds after the listener has found the router until the router has found the listener."""
+
+REFRESH = 0.5
+DRAINING = 0.5
+"""Seconds after the talker's last message in which boards and basestation may still be sent something."""
+
+SETTLING = 1.0
+"""Seconds after the last datagram was sent, for the listener's last report."""
+
+
+class DemoError(RouterError):
+    """The demo cannot go on; the message says why, for a person who has just arrived."""
+
+
+class Demo:
+    """The four processes and what they say. Router and ROS listener start first, the others when those are up."""
+
+    def __init__(self, table: RouteTable) -> None:
+        if table.metrics is None:
+            raise DemoError(f"{TABLE} has no metrics address, and the demo reads its rates there")
+        self._metrics: Address = table.metrics.value
+        self._table = table
+        self._env = os.environ | {
+            "ROS_DOMAIN_ID": str(free_ros_domain()),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "PYTHONUNBUFFERED": "1",
+        }
+        self._running: list[Child] = []
+
+    def _start(self, name: str, *module: str) -> Child:
+        child = Child(name, self._env, *module)
+        self._running.append(child)
+        return child
+
+    def _finish(self, child: Child) -> None:
+        self._running.remove(child)
+        child.end()
+        _check_exit(child, expected=0)
+
+    def run(self, console: Console) -> list[Finding]:
+        listener = self._start("listener", "demo.ros_listener", str(TABLE))
+        self._start("router", "router", "run", str(TABLE))
+        self._wait_until_up(listener)
+        cut_off = f"{SILENT}:{LOST}-{FOUND}"
+        simulator = self._start("simulator", "router", "sim", str(TABLE), "--json", "--silent", cut_off)
+        self._wait_until(lambda: bool(simulator.latest), "the simulator did not start")
+        talker = self._start("talker", "demo.ros_talker", str(TABLE))
+        window = Window()
+        with open_screen(console, self._table, DURATION) as screen:
+            while simulator.latest["seconds"] < DURATION:
+                time.sleep(REFRESH)
+                screen.show(window.add(self._snapshot()), listener.latest, simulator.latest)
+        self._finish(talker)
+        time.sleep(DRAINING)
+        self._finish(simulator)
+        time.sleep(SETTLING)
+        return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()))
+
+    def _wait_until_up(self, listener: Child) -> None:
+        """Until the ROS listener has found the router's topics: before that, the router withholds messages."""
+        self._wait_until(
+            lambda: bool(listener.latest) and all(topic["publishers"] for topic in listener.latest["topics"].values()),
+            "router and ROS listener did not find each other",
+        )
+        time.sleep(MATCHING)
+
+    def _wait_until(self, holds: Callable[[], bool], complaint: str) -> None:
+        deadline = time.monotonic() + START_PATIENCE
+        while not holds():
+            if time.monotonic() > deadline:
+                raise DemoError(f"{complaint} within {START_PATIENCE:.0f} s")
+            self._check()
+            time.sleep(0.1)
+
+    def _snapshot(self) -> Snapshot:
+        self._check()
+        try:
+            return parse_metrics(scrape(self._metrics), time.monotonic())
+        except TransportError:
+            self._check()  # a router that has ended has better words than a refused connection
+            raise
+
+    def _check(self) -> None:
+        """Nobody ends by itself."""
+        for child in self._running:
+            _check_exit(child, expected=None)
+
+    def end(self) -> None:
+        """All are asked to end before any is waited for."""
+        for child in self._running:
+            child.ask_to_end()
+        for child in self._running:
+            child.end()
+
+
+def _check_exit(child: Child, expected: int | None) -> None:
+    if child.exit_code != expected:
+        raise DemoError(f"the {child.name} ended with exit code {child.exit_code}:\n{child.last_words()}")
