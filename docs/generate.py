@@ -34,14 +34,19 @@ def metrics_page() -> str:
     bounds = ", ".join(f"{bound / 1000:g}" for bound in HISTOGRAM_BOUNDS_NS)
     lines = ["# Metrics", "", _MADE, "| metric | type | labels | meaning |", "|---|---|---|---|"]
     for metric in METRICS:
-        suffix = "_total" if metric.kind == "counter" else ""
-        labels = ", ".join(metric.labels)
-        lines.append(f"| `router_{metric.name}{suffix}` | {'gauge' if metric.kind in ('time', 'number') else metric.kind} | {labels} | {metric.help} |")
+        kind = metric.kind if metric.kind in ("counter", "histogram") else "gauge"
+        name = f"router_{metric.name}_total" if kind == "counter" else f"router_{metric.name}"
+        lines.append(f"| `{name}` | {kind} | {', '.join(metric.labels)} | {metric.help} |")
     lines += [
         "| `router_build_info` | gauge | version, table_sha256, protos_sha256 | Always 1; says what is running. |",
         "",
-        "Every series exists at 0 from the start. The books balance: per listener, received = rejected + accepted;",
-        "per route and target, accepted = delivered + dropped + filtered.",
+        "Every series exists at 0 from the start. The books balance. Per listener, received = rejected + accepted. Per",
+        "route and target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames,",
+        "the queue of a budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element",
+        "is a message. What a deadman sends is in its own metrics alone, and its bytes in none.",
+        "",
+        "`route` is the payload case, and where a case has several routes its first source as well:",
+        "[names](table.md#several-routes-of-one-case).",
         "",
         *_reasons("router_datagrams_rejected_total", REJECT_REASONS),
         *_reasons("router_messages_dropped_total", DROP_REASONS),
