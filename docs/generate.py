@@ -16,6 +16,11 @@ from router.errors import Code
 HERE = Path(__file__).parent
 WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
+_BOOKS = """\
+Every series exists at 0 from the start. The books balance. Per listener, received = rejected + accepted. Per route and
+target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames, the queue of a
+budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element is a message. What a
+deadman sends is in its own metrics alone, and its bytes in none."""
 
 
 def functions_page() -> str:
@@ -40,10 +45,7 @@ def metrics_page() -> str:
     lines += [
         "| `router_build_info` | gauge | version, table_sha256, protos_sha256 | Always 1; says what is running. |",
         "",
-        "Every series exists at 0 from the start. The books balance. Per listener, received = rejected + accepted. Per",
-        "route and target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames,",
-        "the queue of a budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element",
-        "is a message. What a deadman sends is in its own metrics alone, and its bytes in none.",
+        fill(_BOOKS, WIDTH),
         "",
         "`route` is the payload case, and where a case has several routes its first source as well:",
         "[names](table.md#several-routes-of-one-case).",
