@@ -6,8 +6,7 @@ Knows bytes and topics; what the bytes mean and why they are published is the en
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any
+from contextlib import ExitStack, contextmanager
 
 from rclpy.event_handler import EventHandler
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -45,40 +44,36 @@ class RosEdge:
         self.publish: dict[str, Callable[[bytes], None]] = {}
         self.wanted: dict[str, list[bool]] = {}
         self._subscriptions: dict[str, RawSubscription] = {}
-        self._entered: list[Any] = []
         self._messages: MessageThread | None = None
         classes = {
             plan.topic: checked_class(plan.type_name, plan.definitions, spans[plan.topic])
             for plan in (*publishers, *subscriptions)
         }
-        self._node = open_node(node.name, node.namespace, ros_args)
         peers = PeerEvents(incompatible)
         events: list[EventHandler] = []
-        for plan in publishers:
-            with self._refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be published"):
-                events += self._open_publisher(plan, classes[plan.topic], peers)
-        for plan in subscriptions:
-            with self._refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be subscribed to"):
-                events += self._open_subscription(plan, classes[plan.topic], peers)
-        self._events = EventThread(self._node, events)
-        self._events.start()
+        with ExitStack() as opening:
+            self._node = open_node(node.name, node.namespace, ros_args)
+            opening.callback(close_node, self._node)
+            for plan in publishers:
+                with _refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be published"):
+                    events += self._open_publisher(plan, classes[plan.topic], peers, opening)
+            for plan in subscriptions:
+                with _refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be subscribed to"):
+                    events += self._open_subscription(plan, classes[plan.topic], peers)
+            thread = EventThread(self._node, events)
+            thread.start()
+            opening.callback(thread.stop)
+            self._open = opening.pop_all()
 
-    @contextmanager
-    def _refusing(self, problem: str) -> Iterator[None]:
-        try:
-            yield
-        except RCL_ERRORS as error:
-            self._destroy()
-            raise StartError(f"{problem}: {error}") from error
-
-    def _open_publisher(self, plan: TopicPlan, message: type, peers: PeerEvents) -> list[EventHandler]:
+    def _open_publisher(
+        self, plan: TopicPlan, message: type, peers: PeerEvents, opening: ExitStack
+    ) -> list[EventHandler]:
         wanted = [plan.qos.serves_late_joiners]
         callbacks = peers.of_publisher(plan, wanted)
         publisher = self._node.create_publisher(message, plan.topic, qos_profile(plan.qos), event_callbacks=callbacks)
         # Publisher.publish() enters the handle and looks at the message's type each time, which doubles its cost.
         handle = publisher.handle
-        handle.__enter__()
-        self._entered.append(handle)
+        opening.enter_context(handle)
         self.publish[plan.topic] = handle.publish_raw
         self.wanted[plan.topic] = wanted
         return publisher.event_handlers  # type: ignore[no-any-return]
@@ -107,10 +102,12 @@ class RosEdge:
     def close(self) -> None:
         """Nothing may be published any more when this is called."""
         self.stop_receiving()
-        self._events.stop()
-        self._destroy()
+        self._open.close()
 
-    def _destroy(self) -> None:
-        for handle in self._entered:
-            handle.__exit__(None, None, None)
-        close_node(self._node)
+
+@contextmanager
+def _refusing(problem: str) -> Iterator[None]:
+    try:
+        yield
+    except RCL_ERRORS as error:
+        raise StartError(f"{problem}: {error}") from error
