@@ -19,7 +19,7 @@ class Timekeeper:
     not wait: another thread may be waiting for the lock to receive a message.
 
     `clock_ns` is a monotonic clock in ns. What a machine raises when it is due or ended goes to `failed`; the
-    others are served all the same, and it is not tried again before 100 ms have passed.
+    others are served all the same, and it is tried again after 100 ms, or when one of them is used.
     """
 
     def __init__(self, name: str, clock_ns: Callable[[], int], failed: Callable[[Exception], None]) -> None:

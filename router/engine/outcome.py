@@ -19,9 +19,9 @@ _FULL = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Something was lost. `kind` is `drop` (one target) or `reject` (a whole datagram).
+    """Something was lost. `kind` is `drop` (one target), `reject` (a whole datagram) or `deadman` (what one sent).
 
-    `place` is the route for a drop, the listener for a reject; `target` is empty for a reject.
+    `place` is the listener for a reject, else the route; `target` is empty for a reject.
     """
 
     kind: str
