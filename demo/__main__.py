@@ -62,10 +62,7 @@ def tell(console: Console, findings: list[Finding]) -> int:
         verdicts.add_row(mark, Text(finding.text))
     console.print(verdicts)
     if all(finding.ok for finding in findings):
-        console.print(
-            "\nIt works: boards, basestation and real ROS 2 heard each other, and a lost link stopped the rover.\n",
-            style="bold",
-        )
+        console.print(f"\n{SUCCESS}\n", style="bold")
         console.print(NEXT_STEPS, highlight=False)
         return 0
     console.print("\nThe demo failed: see the lines above.", style="bold red")
