@@ -100,10 +100,10 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             f"  frames by {collect.by.text}, of {collect.count.text} datagrams in the order of {collect.order.text}, "
             f"complete within {_milliseconds(collect.timeout.value)}"
         )
-    if route.deadman is not None and deadman is not None:
+    if deadman is not None:
         yield (
             f"  deadman: {deadman.case.name} to {', '.join(deadman.to)} when no command came for "
-            f"{_milliseconds(route.deadman.timeout.value)}, again every {_milliseconds(route.deadman.repeat.value)}"
+            f"{_milliseconds(deadman.timeout)}, again every {_milliseconds(deadman.repeat)}"
         )
     if route.no_deadman is not None:
         yield f"  no deadman: {route.no_deadman.value}"

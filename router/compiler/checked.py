@@ -60,8 +60,13 @@ class CheckedCollect:
 
 @dataclass(frozen=True, slots=True)
 class CheckedDeadman:
-    """What is sent when commands stop coming: the envelope, with its zeros, of a `case`. `to` are endpoint names."""
+    """What is sent when commands stop coming: the envelope, with its zeros, of a `case`.
 
+    `to` are endpoint names, `timeout` and `repeat` in ns.
+    """
+
+    timeout: int
+    repeat: int
     case: PayloadCase
     datagram: bytes
     to: tuple[str, ...]

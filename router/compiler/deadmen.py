@@ -36,7 +36,10 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
     for name in deadman.to:
         recipient(lookup, case, name, sources=frozenset())
     datagram = _datagram(lookup, deadman, case)
-    return CheckedDeadman(case, datagram, tuple(name.value for name in deadman.to)) if datagram is not None else None
+    if datagram is None:
+        return None
+    to = tuple(name.value for name in deadman.to)
+    return CheckedDeadman(deadman.timeout.value, deadman.repeat.value, case, datagram, to)
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:

@@ -99,13 +99,13 @@ class HandlerSource:
         name = self._unique(namespace_name(target.name))
         self.plans.append(
             TargetPlan(
-                name,
-                target.name,
-                target.is_topic,
-                target.max_rate,
-                target.keep,
-                target.priority,
-                target.is_deferred,
+                name=name,
+                target=target.name,
+                is_topic=target.is_topic,
+                max_rate=target.max_rate,
+                keep=target.keep,
+                priority=target.priority,
+                is_deferred=target.is_deferred,
             )
         )
         return name

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from router.compiler.books import QOS_POLICIES, REJECT_REASONS, UNKNOWN_CASE, Books
-from router.compiler.checked import CheckedRoute
+from router.compiler.checked import CheckedDeadman, CheckedRoute
 from router.compiler.handlers import HandlerSource
 from router.compiler.lookup import nested_types
 from router.compiler.namespace import NAMESPACE
@@ -42,7 +42,9 @@ def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Seq
                 inbound[number] = (*inbound.get(number, ()), handler)
             else:
                 outbound[handler.topic] = (*outbound.get(handler.topic, ()), handler)
-    deadmen = tuple(_deadman(checked, table, books) for checked in served if checked.deadman)
+    deadmen = tuple(
+        _deadman(checked.route.name, checked.deadman, table, books) for checked in served if checked.deadman
+    )
     destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     return Program(
@@ -142,19 +144,16 @@ def _handler(
     )
 
 
-def _deadman(checked: CheckedRoute, table: RouteTable, books: Books) -> DeadmanPlan:
-    route, deadman = checked.route, checked.deadman
-    assert route.deadman is not None  # noqa: S101 - the caller's choice
-    assert deadman is not None  # noqa: S101
+def _deadman(route: str, deadman: CheckedDeadman, table: RouteTable, books: Books) -> DeadmanPlan:
     for metric in ("deadman_active", "deadman_trips"):
-        books.slot(metric, route.name)
+        books.slot(metric, route)
     for endpoint in deadman.to:
         for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
-            books.slot(metric, route.name, endpoint)
+            books.slot(metric, route, endpoint)
     return DeadmanPlan(
-        route=route.name,
-        timeout=route.deadman.timeout.value,
-        repeat=route.deadman.repeat.value,
+        route=route,
+        timeout=deadman.timeout,
+        repeat=deadman.repeat,
         datagrams=tuple(
             (name, deadman.datagram.rstrip(b"\0") if table.endpoints[name].trim_trailing_zeros else deadman.datagram)
             for name in deadman.to
