@@ -1,4 +1,4 @@
-"""What has to arrive on ROS topics for a payload: computed here from units and directions, not by the router."""
+"""What has to arrive for a payload or a ROS message: computed here from units and directions, not by the router."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import Any
 
 from google.protobuf.descriptor import FieldDescriptor
 
+from tests.acceptance.payloads import WIRE, Sample, sample
 from tests.acceptance.rover_map import FLOWS
+from tests.wire.test_golden_envelopes import values_of
 
 _NO_PLACE = {("SensorBoardDiagnostics", "load_cell"), ("SensorBoardDiagnostics", "pressure_sensor")}
 _RENAMED = {("SensorBoardDiagnostics", "gps_sensor_1"): "gps_sensor"}
@@ -39,6 +41,46 @@ def _in_board_units(field: FieldDescriptor, value: Any) -> Any:
         return value
     byte = min(max(value, 0), 255)
     return {"state": byte} if field.enum_type.name == "SensorState" else byte
+
+
+def from_board_units(case: str, values: Values) -> Sample:
+    """The inverse: what has to be sent for a `comms` message. It has no way to leave a nested message out."""
+    payload = WIRE.envelope.cases[case].message_class()
+    _fill(payload, values)
+    return sample(case, payload)
+
+
+def _fill(message: Any, values: Values) -> None:
+    kind = message.DESCRIPTOR.name
+    for field in message.DESCRIPTOR.fields:
+        name = _RENAMED.get((kind, field.name), field.name)
+        if name not in values:
+            continue
+        if field.message_type is not None:
+            getattr(message, field.name).SetInParent()
+            _fill(getattr(message, field.name), values[name])
+        else:
+            value = values[name]
+            setattr(message, field.name, value["state"] if isinstance(value, dict) else value)
+
+
+def same_datagram(one: bytes, other: bytes) -> bool:
+    """Byte for byte, but that a NaN is a NaN."""
+    return one == other or _decoded(one) == _decoded(other)
+
+
+def _decoded(datagram: bytes) -> tuple[str, Any]:
+    decoded = WIRE.decode(datagram)
+    return decoded.case.name, spelled(values_of(decoded.message, {}))
+
+
+def spelled(value: Any) -> Any:
+    """Comparable to the last bit: -0.0 is not 0.0, and NaN is itself. An integer is no float."""
+    if isinstance(value, dict):
+        return {name: spelled(member) for name, member in value.items()}
+    if isinstance(value, list):
+        return [spelled(element) for element in value]
+    return "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
 
 
 def _header(frame: str) -> Values:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import random
+import struct
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
@@ -30,6 +32,8 @@ _LIMITS: dict[int, tuple[Any, ...]] = {
     FieldDescriptor.TYPE_BOOL: (True, True),
     FieldDescriptor.TYPE_ENUM: (*_INT32, 255, 256, -1),
 }
+_NOT_FINITE = (math.inf, -math.inf, math.nan)
+_BITS = {FieldDescriptor.TYPE_FLOAT: (4, "<f"), FieldDescriptor.TYPE_DOUBLE: (8, "<d")}
 
 
 class Sample(NamedTuple):
@@ -64,6 +68,15 @@ def generated(case: str) -> Iterator[Sample]:
         yield sample(case, payload)
 
 
+def arbitrary(case: str, seed: int = 0) -> Iterator[Sample]:
+    """Of one payload case, without end: any value that a field can have, NaN, infinities and absence included."""
+    value = partial(_any, random.Random(f"{case} arbitrary {seed}"))
+    while True:
+        payload = WIRE.envelope.cases[case].message_class()
+        _fill(payload, value)
+        yield sample(case, payload)
+
+
 Value = Callable[[FieldDescriptor], Any]
 """What a field gets: a scalar, True for a message that is to be filled, or None to leave it out."""
 
@@ -76,6 +89,18 @@ def _fill(message: Any, value: Value) -> None:
         elif member:
             getattr(message, field.name).SetInParent()
             _fill(getattr(message, field.name), value)
+
+
+def _any(rng: random.Random, field: FieldDescriptor) -> Any:
+    choice = rng.random()
+    if choice < 0.1:
+        return None
+    if field.message_type is not None or choice < 0.5:
+        return _ordinary(rng, field)
+    if field.type in _BITS:
+        size, form = _BITS[field.type]
+        return struct.unpack(form, rng.randbytes(size))[0] if choice < 0.9 else rng.choice(_NOT_FINITE)
+    return rng.choice(_LIMITS[field.type])
 
 
 def _limit(turn: int, field: FieldDescriptor) -> Any:

@@ -39,8 +39,34 @@ FLOWS = {
     "manual_arm": Flow("basestation", ("arm_board",), "manual_arm", "BasestationManualArmMovement"),
 }
 
-OUTBOUND = ("arm_ctrl", "arm_target", "drive_motor", "detected_object", "rock_measure_result", "rover_localization")
-"""From ROS to UDP: not taken from UDP."""
+
+class Outflow(NamedTuple):
+    """One route from ROS. `route` is its label."""
+
+    route: str
+    destination: str
+    type: str
+
+
+OUTFLOWS = {
+    "arm_ctrl": Outflow("arm_ctrl", "arm_board", "ArmBoardControlSignals"),
+    "arm_target": Outflow("arm_target", "arm_board", "ArmBoardTargetMovement"),
+    "drive_motor": Outflow("drive_motor", "driving_board", "DrivingBoardMotorMessage"),
+    "detected_object": Outflow("detected_object_from_ros", "basestation", "BasestationDetectedObject"),
+    "rock_measure_result": Outflow("rock_measure_result", "basestation", "BasestationRockMeasureResult"),
+    "rover_localization": Outflow("rover_localization", "basestation", "BasestationRoverLocalization"),
+}
+"""From ROS to UDP, by case, which is the topic as well: not taken from UDP."""
+
+ARRAYS = "detected_objects"
+"""The topic of `comms/msg/DetectedObjectArray`, whose elements go to the basestation one by one."""
+
+ARRAY_ROUTE = "detected_object_from_ros_2"
+
+TOPICS_FROM_ROS = {
+    **{topic: f"comms/msg/{flow.type}" for topic, flow in OUTFLOWS.items()},
+    ARRAYS: "comms/msg/DetectedObjectArray",
+}
 
 STANDARD = {
     "sensor_diag": {"sensor_board/temperature": "sensor_msgs/msg/Temperature"},

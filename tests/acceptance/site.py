@@ -12,7 +12,7 @@ import subprocess
 import sys
 import urllib.request
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,14 +20,14 @@ from time import monotonic, sleep
 from typing import Any
 
 from tests.acceptance.ros_peer import PATIENCE
-from tests.acceptance.rover_map import HOSTS, ROUTER
+from tests.acceptance.rover_map import HOSTS, ROUTER, TOPICS_FROM_ROS
 from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent.parent
 
 ROVER = """\
 version: 1
-extends: {root}/routes/rover.yaml
+extends: {root}/tests/acceptance/patient.yaml
 metrics:
   address: 127.0.0.1:{metrics}
 listen:
@@ -133,23 +133,30 @@ class Site:
 
     def scrape(self) -> Counter[str]:
         """All counters of the router, without the prefix `router_` and the suffix `_total`."""
+        return Counter(
+            {
+                name.replace("_total{", "{"): int(value)
+                for name, value in self.samples().items()
+                if "_total{" in name or name.startswith(SERVED)
+            }
+        )
+
+    def samples(self) -> dict[str, float]:
+        """Everything that the router tells of itself, without the prefix `router_`."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.metrics}/metrics", timeout=PATIENCE) as answer:
             text = answer.read().decode()
         lines = (line.rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
-        return Counter(
-            {
-                name[len("router_") :].replace("_total{", "{"): int(float(value))
-                for name, _, value in lines
-                if "_total{" in name or name.startswith(f"router_{SERVED}")
-            }
-        )
+        return {name[len("router_") :]: float(value) for name, _, value in lines}
 
     def changes(self, before: Counter[str]) -> Counter[str]:
         """What was counted since `before`, without what stayed as it was."""
         return self.scrape() - before
 
-    def settle(self, before: Counter[str], datagrams: int) -> Counter[str]:
-        """Waits until the router is done with so many datagrams since `before`; what was counted meanwhile."""
+    def settle(self, before: Counter[str], datagrams: int, messages: int = 0) -> Counter[str]:
+        """Waits until the router is done with so much since `before`; what was counted meanwhile.
+
+        `messages` are those from ROS.
+        """
 
         now = Counter[str]()
 
@@ -158,7 +165,7 @@ class Site:
             now = self.changes(before)
             received, lost = total(now, "datagrams_received"), total(now, "kernel_drops")
             finished = total(now, "datagrams_rejected") + total(now, SERVED)
-            return received + lost >= datagrams and finished == received
+            return received + lost >= datagrams and finished == received + messages
 
         wait_until(done, "the last datagram")
         return Counter({name: count for name, count in now.items() if not name.startswith(SERVED)})
@@ -174,17 +181,18 @@ def total(counts: Mapping[str, int], metric: str, **labels: str) -> int:
     )
 
 
-def balance(counts: Mapping[str, int]) -> None:
-    """The identities of the books: nothing that was received is unaccounted for."""
+def balance(counts: Mapping[str, int], topics: Iterable[str] = TOPICS_FROM_ROS) -> None:
+    """The identities of the books: nothing that was received is unaccounted for. From `topics` messages come."""
     accepted = total(counts, "messages_received")
-    assert total(counts, "datagrams_received") == total(counts, "datagrams_rejected") + accepted
+    from_ros = sum(total(counts, "messages_received", source=topic) for topic in topics)
+    assert total(counts, "datagrams_received") == total(counts, "datagrams_rejected") + accepted - from_ros
     for route in labels_of(counts, "messages_received", "route"):
         taken = total(counts, "messages_received", route=route)
         for target in labels_of(counts, "messages_filtered", "target", route=route):
             delivered = total(counts, "datagrams_sent", route=route, destination=target)
             delivered += total(counts, "messages_published", route=route, topic=target)
-            withheld = total(counts, "messages_filtered", route=route, target=target)
-            assert taken == delivered + withheld + total(counts, "messages_dropped", route=route, target=target)
+            others = ("messages_filtered", "messages_dropped", "messages_collected")
+            assert taken == delivered + sum(total(counts, metric, route=route, target=target) for metric in others)
 
 
 def labels_of(counts: Mapping[str, int], metric: str, label: str, **labels: str) -> set[str]:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.acceptance.conftest import Rover
 from tests.acceptance.payloads import WIRE, generated, golden
-from tests.acceptance.rover_map import FLOWS, HOSTS, OUTBOUND
+from tests.acceptance.rover_map import FLOWS, HOSTS, OUTFLOWS
 from tests.acceptance.site import RouterProcess, Site, balance, key, site
 
 PH = bytes.fromhex("0a110d713dda401560e520401d333345412001")
@@ -117,7 +117,7 @@ def test_a_stranger_may_send_nothing(tmp_path: Path, rover: Rover) -> None:
         assert elsewhere.waiting() == rover.site.waiting() == {}
 
 
-@pytest.mark.parametrize("case", OUTBOUND)
+@pytest.mark.parametrize("case", OUTFLOWS)
 def test_what_goes_from_ros_to_udp_is_not_taken_from_udp(rover: Rover, case: str) -> None:
     datagram = next(generated(case)).datagram
     assert exchange(rover.site, datagram, "basestation") == unhandled(datagram, case)

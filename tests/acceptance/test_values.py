@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from time import time
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.acceptance.conftest import Rover
-from tests.acceptance.expected import expected_messages
+from tests.acceptance.expected import expected_messages, spelled
 from tests.acceptance.payloads import Sample, generated, golden
 from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.rover_map import FLOWS, topics_of
@@ -108,12 +107,3 @@ def without_stamp(message: dict[str, Any]) -> float | None:
     stamp = message["header"]["stamp"]
     message["header"]["stamp"] = None
     return float(stamp["sec"] + stamp["nanosec"] / 1e9)
-
-
-def spelled(value: Any) -> Any:
-    """Comparable to the last bit: -0.0 is not 0.0, and NaN is itself. An integer is no float."""
-    if isinstance(value, dict):
-        return {name: spelled(member) for name, member in value.items()}
-    if isinstance(value, list):
-        return [spelled(element) for element in value]
-    return "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
