@@ -82,6 +82,7 @@ def _deadman(entry: Entry) -> Deadman:
         fields=constants(payload),
         to=tuple(map(located, items(settings, "to"))),
         repeat=duration(settings, "repeat") or Located(DEFAULT_REPEAT, entry.key.span),
+        hands_over_to=tuple(map(located, items(settings, "hands_over_to"))),
     )
 
 

@@ -188,7 +188,7 @@ class Topic:
 class Deadman:
     """What is sent in place of commands that stopped coming: the payload `case` with `fields`, to `to`.
 
-    `span` is the key `deadman`. Durations in ns.
+    `span` is the key `deadman`. Durations in ns. `hands_over_to` are payload cases.
     """
 
     span: SourceSpan
@@ -197,6 +197,7 @@ class Deadman:
     fields: FieldMap
     to: tuple[Located[str], ...]
     repeat: Located[int]
+    hands_over_to: tuple[Located[str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

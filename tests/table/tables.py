@@ -49,7 +49,8 @@ routes:
     destinations: [{endpoint: sensor_board, max_rate: 20 Hz, keep: latest}]
     priority: command
     ttl: 200ms
-    deadman: {timeout: 300 ms, send: {manual_brake: {brake: true, by.who: "'router'"}}, to: [sensor_board, basestation]}
+    deadman: {timeout: 300 ms, send: {manual_brake: {brake: true, by.who: "'router'"}}, to: [sensor_board, basestation],
+      hands_over_to: [arm_target]}
   detected_object:
     - source: ros
       for_each: detections

@@ -45,7 +45,8 @@ routes:
     destinations: [{endpoint: driving_board, max_rate: 20 Hz, keep: latest}]
     priority: command
     ttl: 200ms
-    deadman: {timeout: 400ms, send: {manual_brake: {}}, to: [driving_board], repeat: 50ms}
+    deadman: {timeout: 400ms, send: {manual_brake: {}}, to: [driving_board], repeat: 50ms,
+      hands_over_to: [drive_motor]}
   detected_object:
     - source: ros
       for_each: detections
@@ -202,7 +203,7 @@ def test_completion_offers_the_keys_of_a_deadman(editor: LanguageServer) -> None
     text = GOOD + "  manual_arm:\n    source: basestation\n    deadman:\n      \n"
     table = new_table()
     editor.open(table, text)
-    assert {"timeout", "send", "to", "repeat"} <= editor.completions(table, text.count("\n") - 1, 6)
+    assert {"timeout", "send", "to", "repeat", "hands_over_to"} <= editor.completions(table, text.count("\n") - 1, 6)
 
 
 def test_completion_offers_the_words_of_the_quality_of_service(editor: LanguageServer) -> None:

@@ -79,6 +79,7 @@ def test_a_deadman_is_typed(table: RouteTable) -> None:
         "manual_brake",
     )
     assert [name.value for name in deadman.to] == ["sensor_board", "basestation"]
+    assert [case.value for case in deadman.hands_over_to] == ["arm_target"]
     assert not deadman.fields.auto
     fields = {entry.path: entry.value.text for entry in deadman.fields.entries}
     assert fields == {("brake",): "true", ("by", "who"): "'router'"}
@@ -88,12 +89,13 @@ def test_a_payload_of_defaults_and_a_repeat_of_its_own_are_taken(tmp_path: Path)
     text = GOOD.replace("{brake: true, by.who: \"'router'\"}", "{}").replace(
         "300 ms, send", "300 ms, repeat: 20ms, send"
     )
+    text = text.replace(",\n      hands_over_to: [arm_target]", "")
     table, findings = load(tmp_path, text)
     assert not findings
     assert table
     deadman = route(table, "manual_drive").deadman
     assert deadman
-    assert (deadman.repeat.value, deadman.fields.entries) == (20_000_000, ())
+    assert (deadman.repeat.value, deadman.fields.entries, deadman.hands_over_to) == (20_000_000, (), ())
 
 
 def test_a_case_may_have_several_routes_each_with_a_name(table: RouteTable) -> None:
