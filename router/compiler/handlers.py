@@ -7,24 +7,18 @@ whatever fails. It counts in a flat list. `router explain` prints it.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from router.compiler.books import DROP_REASONS, Books
-from router.compiler.cdr import write_message
+from router.compiler.books import Books
 from router.compiler.checked import CheckedCollect, CheckedFeed
 from router.compiler.expressions import Typed
-from router.compiler.payload import write_envelope
 from router.compiler.program import TargetPlan
+from router.compiler.serving import NamedTarget, ServingSource
 from router.compiler.source import Source, namespace_name
 from router.compiler.target import Target
-from router.errors import SourceSpan
-from router.table.model import Keep, Route
+from router.table.model import Route
 from router.types.protobuf import PayloadCase, ProtoSchema
-
-NamedTarget = tuple[str, Target]
-"""A target with its part of the Python names."""
 
 
 class HandlerSource:
@@ -36,85 +30,64 @@ class HandlerSource:
 
     def __init__(self, route: Route, case: PayloadCase, schema: ProtoSchema, books: Books) -> None:
         self.route = route
-        self.case = case
-        self.schema = schema
         self.books = books
         self.span = route.case.span
         self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
-        self.plans: list[TargetPlan] = []
+        self._serving = ServingSource(self.out, route, case, schema, books)
+
+    @property
+    def plans(self) -> tuple[TargetPlan, ...]:
+        """The targets that the function serves."""
+        return tuple(self._serving.plans)
 
     def inbound(self, targets: Sequence[Target], collect: CheckedCollect | None) -> None:
         """Destinations first: forwarding waits for no mapping. Topics get whole frames where there is a `collect`."""
-        named = [(self._plan(target), target) for target in targets]
+        named = [self._serving.named(target) for target in targets]
         with self._function("m", "datagram"):
             self._expires()
             if collect is None:
-                self._targets(named)
+                self._serving.serve(named)
             else:
-                self._targets([(name, target) for name, target in named if not target.is_topic])
+                self._serving.serve([(name, target) for name, target in named if not target.is_topic])
                 topics = [(name, target) for name, target in named if target.is_topic]
                 self._collect(collect, topics)
-                self._targets(topics)
+                self._serving.serve(topics)
             if not targets:
                 self.out.line("pass", self.span)
 
     def outbound(self, feed: CheckedFeed) -> None:
         """The message is read once for all destinations. With `for_each` each element is a message of its own."""
-        received, span = self.books.slot("messages_received", self.route.name, feed.topic.topic.value), feed.topic.span
-        named = [(self._plan(served.target), served.target) for served in feed.targets]
+        span, one_received = feed.topic.span, self._received(feed, "1")
+        named = [self._serving.named(served.target) for served in feed.targets]
         with self._function("cdr"):
             with self.out.block("try:", span):
                 feed.reads.write(self.out, span)
                 if feed.for_each is not None:
                     self.out.line(f"elements = {self.out.expression(feed.for_each.node)}", feed.for_each.span)
-            with self._all_lost(named, span):
-                self.out.line(f"counts[{received}] += 1  # messages_received", span)
+            self._serving.all_lost(named, span, one_received)
             if feed.stamp is not None:
                 self._born(feed.stamp)
             self._expires()
             if feed.for_each is None:
-                self.out.line(f"counts[{received}] += 1  # messages_received", span)
-                self._targets(named, feed.when)
+                self.out.line(one_received, span)
+                self._serving.serve(named, feed.when)
                 return
             self.out.line("count = len(elements)", feed.for_each.span)
-            self.out.line(f"counts[{received}] += count  # messages_received", span)
+            self.out.line(self._received(feed, "count"), span)
             with self.out.block("for index, item in enumerate(elements):", feed.for_each.span):
-                self._targets(named, feed.when)
+                self._serving.serve(named, feed.when)
+
+    def _received(self, feed: CheckedFeed, messages: str) -> str:
+        """The line that counts so many."""
+        slot = self.books.slot("messages_received", self.route.name, feed.topic.topic.value)
+        return f"counts[{slot}] += {messages}  # messages_received"
 
     @contextmanager
     def _function(self, *message: str) -> Iterator[None]:
         parameters = (*message, "received_at", "now", "source", *(["born"] if self.route.ttl else []))
         with self.out.block(f"def {self.function}({', '.join(parameters)}):", self.span):
             yield
-
-    def _plan(self, target: Target) -> str:
-        """The target's name in the code. Every series exists from the start."""
-        for reason in DROP_REASONS:
-            self.books.slot("messages_dropped", self.route.name, target.name, reason)
-        self.books.slot("messages_filtered", self.route.name, target.name)
-        delivered = ("messages_published",) if target.is_topic else ("datagrams_sent", "sent_bytes")
-        for metric in delivered:
-            self.books.slot(metric, self.route.name, target.name)
-        name = self._unique(namespace_name(target.name))
-        self.plans.append(
-            TargetPlan(
-                name=name,
-                target=target.name,
-                is_topic=target.is_topic,
-                max_rate=target.max_rate,
-                keep=target.keep,
-                priority=target.priority,
-                is_deferred=target.is_deferred,
-            )
-        )
-        return name
-
-    def _unique(self, base: str) -> str:
-        """`a/b` and `a_b` are different topics but would be one Python name."""
-        taken = {plan.name for plan in self.plans}
-        candidates = (f"{base}_{number}" if number > 1 else base for number in itertools.count(1))
-        return next(name for name in candidates if name not in taken)
 
     # the age of the message
 
@@ -140,104 +113,7 @@ class HandlerSource:
             collect.reads.write(self.out, span)
             by, count, order = (self.out.expression(typed.node) for typed in (collect.by, collect.count, collect.order))
             self.out.line(f"items = collect(now, (source, {by}), {count}, {order}, m)", span)
-        with self._all_lost(topics, span):
-            pass
+        self._serving.all_lost(topics, span)
         with self.out.block("if items is None:", span):
             self.out.line("return", span)
         self.out.line("m, count = items[0], len(items)", span)
-
-    # targets
-
-    def _targets(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:
-        """`when` holds for all of them, beside what each has."""
-        for name, target in targets:
-            self.out.line(f"# {'topic' if target.is_topic else 'destination'} {target.name}", target.span)
-            conditions = [condition for condition in (when, target.when) if condition is not None]
-            if not target.is_topic:
-                self._guarded(name, target, conditions, self._deliver if target.is_deferred else self._send)
-                continue
-            with self.out.block(f"if wanted_{name}[0]:", target.span):
-                self._guarded(name, target, conditions, self._deliver if target.is_deferred else self._publish)
-            with self.out.block("else:", target.span):
-                self._count("messages_filtered", target)
-
-    def _guarded(
-        self, name: str, target: Target, conditions: Sequence[Typed], serve: Callable[[str, Target], None]
-    ) -> None:
-        """What fails for one target is counted there and leaves the others alone."""
-        with self.out.block("try:", target.span):
-            if target.reads is not None:
-                target.reads.write(self.out, target.span)
-            self._conditional(name, target, conditions, serve)
-        with self.out.block("except FAILURES as error:", target.span):
-            self.out.line(f"lost_{name}(error)", target.span)
-
-    def _conditional(
-        self, name: str, target: Target, conditions: Sequence[Typed], serve: Callable[[str, Target], None]
-    ) -> None:
-        """Serves the target if each `when` is true, the message is fresh, and its `max_rate` is not used up."""
-        word = "if"
-        for condition in conditions:
-            with self.out.block(f"{word} not {self.out.expression(condition.node)}:", condition.span):
-                self._count("messages_filtered", target)
-            word = "elif"
-        if self.route.ttl:
-            with self.out.block(f"{word} clock_ns() > expires:", self.route.ttl.span):
-                self._count("messages_dropped", target, "stale")
-            word = "elif"
-        if target.max_rate is not None and target.keep is Keep.FIRST:
-            with self.out.block(f"{word} not limit_{name}(now):", target.span):
-                self._count("messages_dropped", target, "rate_limited")
-            word = "elif"
-        if word == "if":
-            serve(name, target)
-            return
-        with self.out.block("else:", target.span):
-            serve(name, target)
-
-    @contextmanager
-    def _all_lost(self, targets: Sequence[NamedTarget], span: SourceSpan) -> Iterator[None]:
-        """Ends a `try:` without which no target can be served. Lines appended inside come before the losses."""
-        with self.out.block("except FAILURES as error:", span):
-            yield
-            for name, _ in targets:
-                self.out.line(f"lost_{name}(error)", span)
-            self.out.line("return", span)
-
-    def _count(self, metric: str, target: Target, *reason: str) -> None:
-        slot = self.books.slot(metric, self.route.name, target.name, *reason)
-        self.out.line(f"counts[{slot}] += 1  # {' '.join((metric, *reason))}", target.span)
-
-    def _data(self, name: str, target: Target) -> str:
-        """Appends what makes the bytes for a target, and returns the expression that is them."""
-        if target.plan is None:
-            data = "datagram"
-        elif target.is_topic:
-            return write_message(self.out, target.plan, name)
-        else:
-            data = write_envelope(self.out, target.plan, self.case, self.schema, name)
-        return f"{data}.rstrip(ZERO)" if target.trim else data
-
-    def _send(self, name: str, target: Target) -> None:
-        data = self._data(name, target)
-        self._feed(target)
-        slot = self.books.slot("sent_bytes", self.route.name, target.name)
-        self.out.line(f"counts[{slot}] += send_{name}({data})  # sent_bytes", target.span)
-        self._count("datagrams_sent", target)
-
-    def _publish(self, name: str, target: Target) -> None:
-        self.out.line(f"publish_{name}({self._data(name, target)})", target.span)
-        self._count("messages_published", target)
-
-    def _deliver(self, name: str, target: Target) -> None:
-        """Sent or published now or later, and counted there."""
-        data = self._data(name, target)
-        if not target.is_topic:
-            self._feed(target)
-        expires = "expires" if self.route.ttl else "None"
-        self.out.line(f"deliver_{name}(now, {data}, {expires})", target.span)
-
-    def _feed(self, target: Target) -> None:
-        """Before the command is sent, so that nothing which the deadman sends can follow it."""
-        if self.route.deadman is not None:
-            self.out.line("feed(now)", target.span)

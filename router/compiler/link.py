@@ -135,12 +135,11 @@ def _handler(
         source=generator.out.text(),
         code=generator.out.compile(file),
         constants={**NAMESPACE, **generator.out.constants},
-        targets=tuple(generator.plans),
+        targets=generator.plans,
         sources=sources,
         topic=topic,
         ttl=route.ttl.value if route.ttl else None,
         collect_timeout=route.collect.timeout.value if route.collect else None,
-        has_deadman=route.deadman is not None,
     )
 
 
