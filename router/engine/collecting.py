@@ -8,15 +8,25 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 from router.engine.machine import Machine
-from router.engine.outcome import Outcome
 from router.errors import MappingError
 
 MOST_FRAMES = 64
 MOST_PARTS = 8192
 MOST_CLOSED = 1024
 """What is held at most, whatever the numbers say: open frames, parts of all of them, keys of closed frames."""
+
+
+class PartOutcome(Protocol):
+    """What becomes of a part at one target of frames. `engine.outcome` counts that in the books."""
+
+    def collected(self) -> None: ...
+
+    def filtered(self) -> None: ...
+
+    def dropped(self, reason: str, *, detail: str) -> None: ...
 
 
 @dataclass(slots=True)
@@ -38,7 +48,7 @@ class Collector(Machine):
     count: that one opens a new frame. A part of a frame that would never have room is dropped as `incomplete`.
     """
 
-    def __init__(self, timeout: int, outcomes: Sequence[Outcome]) -> None:
+    def __init__(self, timeout: int, outcomes: Sequence[PartOutcome]) -> None:
         self.next_due: int | None = None
         self._timeout = timeout
         self._outcomes = outcomes

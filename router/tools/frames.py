@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from router.compiler.books import Books
-from router.compiler.program import TargetPlan
-from router.engine.collecting import Collector
-from router.engine.outcome import Outcome, Report
+from router.engine.collecting import Collector, PartOutcome
 from router.errors import MappingError
 from router.types.model import MessageType
 
@@ -22,20 +19,14 @@ def is_part(kind: MessageType) -> bool:
     return all(kind.field(name) for name in PART)
 
 
-class Frames:
+class Frames(PartOutcome):
     """Counts the frames of one payload case. `astray` are parts whose numbers fit no frame."""
 
     def __init__(self) -> None:
         self.complete = 0
         self.incomplete = 0
         self.astray = 0
-        books = Books()
-        books.slot("messages_collected", "frames", "frames")
-        counts: list[int] = []
-        target = TargetPlan("frames", "frames", is_topic=False, max_rate=None)
-        outcome = Outcome(books, counts, "frames", target, self._lost)
-        counts.extend(books.fresh_counts())
-        self._collector = Collector(TIMEOUT, [outcome])
+        self._collector = Collector(TIMEOUT, [self])
 
     def take(self, now: int, part: Any) -> None:
         """A payload that `is_part`; monotonic ns."""
@@ -50,5 +41,13 @@ class Frames:
         """Time has passed."""
         self._collector.due(now)
 
-    def _lost(self, _: Report) -> None:
+    # what becomes of the parts, as the collector says
+
+    def collected(self) -> None:
+        """A part is no frame yet."""
+
+    def filtered(self) -> None:
+        """Nor is a copy of one."""
+
+    def dropped(self, reason: str, *, detail: str) -> None:
         self.incomplete += 1
