@@ -20,11 +20,10 @@ from router.tools.board import Change, boards
 from router.tools.inbox import Inbox
 from router.tools.models import moment
 from router.tools.payload_model import PayloadModel
-from router.tools.places import LOOPBACK, open_udp, reachable
+from router.tools.places import LARGEST_DATAGRAM, LOOPBACK, open_udp, reachable
 from router.tools.streams import STRANGER, Silence, check_silences, streams
 from router.tools.wire import Wire
 
-LARGEST_DATAGRAM = 65_507
 DRAIN = 256
 """Datagrams taken from one socket before the others, and the sending, have their turn."""
 

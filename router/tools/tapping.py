@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Any
 from google.protobuf.json_format import MessageToDict
 
 from router.errors import DecodeError
+from router.tools.places import LARGEST_DATAGRAM
 from router.tools.ros_show import ros_json, ros_words
 from router.tools.show import compact, one_line
 from router.tools.wire import Decoded, Wire
 
 if TYPE_CHECKING:
     from router.edges.ros_listen import TopicListener
-
-LARGEST_DATAGRAM = 65_507
 
 PATIENCE = 0.2
 """Seconds after which Ctrl-C is noticed at the latest, while no message comes."""
