@@ -182,8 +182,8 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
         wall_ns=time.time_ns,
         pacing=unguarded(counts),
         collecting=unguarded(counts),
+        feed=lambda *_: _forget_command,
         publish_errors=(PublishError,),
-        feed={plan.route: _forget_command for plan in program.deadmen},
     )
     listener = program.listeners[0].name
     return Engine(program, outlets, {listener: time.time_ns}).receiver(listener)

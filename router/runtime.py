@@ -22,7 +22,7 @@ from router.edges.timekeeper import Timekeeper
 from router.edges.udp import Listener, Sender
 from router.engine import MAX_DATAGRAM, Engine, OutboundEngine
 from router.engine.binding import Guarded, Outlets
-from router.engine.deadman import Deadman
+from router.engine.deadman import Deadman, feeder
 from router.engine.pacing import Pacer
 from router.errors import StartError
 from router.table.model import Address
@@ -115,8 +115,8 @@ class Router:
             wall_ns=wall_ns,
             pacing=Guarded(self._fresh_counts(), pacing.guard),
             collecting=Guarded(self._fresh_counts(), collecting.guard),
+            feed=feeder(self._deadmen(send, reporter), deadman.guard),
             publish_errors=ros.publish_errors if ros else (),
-            feed=self._deadmen(deadman, send, reporter),
             pacers=self._pacers(pacing, send),
         )
         inbound = Engine(program, outlets, {name: listener.arrived_at for name, listener in self.listeners.items()})
@@ -189,16 +189,13 @@ class Router:
         opening.callback(ros.close)
         return ros
 
-    def _deadmen(
-        self, keeper: Timekeeper, send: Mapping[str, Callable[[bytes], int]], reporter: Reporter
-    ) -> dict[str, Callable[[int], None]]:
-        """What the routes tell of their commands, by route."""
+    def _deadmen(self, send: Mapping[str, Callable[[bytes], int]], reporter: Reporter) -> dict[str, Deadman]:
+        """By route."""
         books, counts = self.program.books, self._fresh_counts()
-        deadmen = {
+        return {
             plan.route: Deadman(plan, books, counts, send, reporter.report, reporter.deadman_changed)
             for plan in self.program.deadmen
         }
-        return {route: keeper.guard(deadman, deadman.feed) for route, deadman in deadmen.items()}
 
     def _pacers(self, keeper: Timekeeper, send: Mapping[str, Callable[[bytes], int]]) -> dict[str, Pacer]:
         pacers = {

@@ -105,6 +105,8 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             f"  deadman: {deadman.case.name} to {', '.join(deadman.to)} when no command came for "
             f"{_milliseconds(deadman.timeout)}, again every {_milliseconds(deadman.repeat)}"
         )
+        if deadman.hands_over_to:
+            yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
     if route.no_deadman is not None:
         yield f"  no deadman: {route.no_deadman.value}"
 
@@ -128,6 +130,8 @@ def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: st
     yield f"  destination {target.name} ({endpoint.address.value}): {how}{trimmed}  ({target.span})"
     if endpoint.budget is not None:
         yield f"    {target.priority.value} within a budget of {endpoint.budget.value} bytes/s"
+    if others := [other for other in target.deadmen if other != route.name]:
+        yield f"    disarms the deadman of {', '.join(others)}"
     named = next(each for each in route.destinations if each.endpoint.value == target.name)
     yield from _served(served, named)
 

@@ -62,7 +62,7 @@ class CheckedCollect:
 class CheckedDeadman:
     """What is sent when commands stop coming: the envelope, with its zeros, of a `case`.
 
-    `to` are endpoint names, `timeout` and `repeat` in ns.
+    `to` are endpoint names, `timeout` and `repeat` in ns. `hands_over_to` are routes, not the cases of the table.
     """
 
     timeout: int
@@ -70,6 +70,7 @@ class CheckedDeadman:
     case: PayloadCase
     datagram: bytes
     to: tuple[str, ...]
+    hands_over_to: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

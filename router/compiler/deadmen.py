@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
-from router.compiler.destinations import keep, recipient
+from router.compiler.destinations import keep, recipient, takes_over
 from router.compiler.expressions import ParsedReads
 from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.lookup import Lookup
@@ -35,11 +35,12 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
         return None
     for name in deadman.to:
         recipient(lookup, case, name, sources=frozenset())
+    hands_over_to = _successors(lookup, route, deadman)
     datagram = _datagram(lookup, deadman, case)
     if datagram is None:
         return None
     to = tuple(name.value for name in deadman.to)
-    return CheckedDeadman(deadman.timeout.value, deadman.repeat.value, case, datagram, to)
+    return CheckedDeadman(deadman.timeout.value, deadman.repeat.value, case, datagram, to, hands_over_to)
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
@@ -85,6 +86,24 @@ def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> No
             span = route.ttl.span if route.ttl else destination.endpoint.span
             lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
             return
+
+
+def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...]:
+    """The routes whose commands disarm it. Of each case that it names there must be one."""
+    table = lookup.table
+    found = [
+        each for each in table.routes if any(takes_over(each, to.endpoint.value, route) for to in each.destinations)
+    ]
+    served = {each.case.value for each in found}
+    served |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
+    are_known = all(to.value in table.endpoints for to in deadman.to)  # else that is the mistake
+    for name in deadman.hands_over_to:
+        if lookup.case(name) is not None and name.value not in served and are_known:
+            to = " or ".join(f"'{to.value}'" for to in deadman.to)
+            message = f"no other route sends '{name.value}' to {to}, so it cannot take over"
+            hint = "name a payload case that commands what the deadman stops"
+            lookup.report(name.span, Code.BAD_VALUE, message, hint)
+    return tuple(each.name for each in found)
 
 
 def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | None:

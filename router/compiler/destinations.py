@@ -40,7 +40,19 @@ def recipient(lookup: Lookup, case: PayloadCase, name: Located[str], sources: Ab
     return endpoint
 
 
+def takes_over(route: Route, endpoint: str, other: Route) -> bool:
+    """Whether a command of `route` to `endpoint` disarms the deadman of the `other` route."""
+    deadman = other.deadman
+    return (
+        deadman is not None
+        and other.name != route.name
+        and route.case.value in [case.value for case in deadman.hands_over_to]
+        and endpoint in [to.value for to in deadman.to]
+    )
+
+
 def target_to(
+    lookup: Lookup,
     route: Route,
     destination: Destination,
     endpoint: Endpoint | None,
@@ -50,8 +62,10 @@ def target_to(
 ) -> Target:
     """The target that a destination becomes. Whatever goes to a board is a command where the route says nothing."""
     to_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
+    name = destination.endpoint.value
+    others = [other.name for other in lookup.table.routes if takes_over(route, name, other)]
     return Target(
-        name=destination.endpoint.value,
+        name=name,
         span=destination.span,
         is_topic=False,
         reads=reads,
@@ -62,6 +76,7 @@ def target_to(
         has_budget=endpoint is not None and endpoint.budget is not None,
         trim=endpoint is not None and endpoint.trim_trailing_zeros,
         plan=plan,
+        deadmen=(*([route.name] if route.deadman else []), *others),
     )
 
 

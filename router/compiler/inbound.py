@@ -38,7 +38,7 @@ def _forward(
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, "a datagram is forwarded unchanged", hint)
     reads = ParsedReads()
     when = lookup.when(destination.when, lookup.scope(case.type, reads))
-    return CheckedTarget(target_to(route, destination, endpoint, when, reads))
+    return CheckedTarget(target_to(lookup, route, destination, endpoint, when, reads))
 
 
 def _publish(

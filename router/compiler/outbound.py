@@ -73,7 +73,7 @@ def _feed(
         whole = scope.variable("item", route.case.span) if for_each else None
         mapping = build(fields, case.type, scope, route.case.span, whole)
         lookup.findings += mapping.findings
-        target = target_to(route, destination, endpoint, condition, plan=mapping.plan)
+        target = target_to(lookup, route, destination, endpoint, condition, plan=mapping.plan)
         targets.append(CheckedTarget(target, rows=tuple(mapping.rows)))
     return CheckedFeed(topic, ros_type, reads, when, for_each, stamp, tuple(targets))
 

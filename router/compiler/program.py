@@ -78,7 +78,8 @@ class TargetPlan:
     """A target of a generated function: `name` is its part of the Python names, `target` its label.
 
     `is_deferred` says that it may be served later and by another thread: it has `keep: latest`, or its
-    endpoint has a budget.
+    endpoint has a budget. `deadmen` are the routes whose deadmen hear of each command to it: it feeds that of its own
+    route, and relieves others, which hand over to it.
     """
 
     name: str
@@ -88,6 +89,7 @@ class TargetPlan:
     keep: Keep = Keep.FIRST
     priority: Priority = Priority.TELEMETRY
     is_deferred: bool = False
+    deadmen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,6 @@ class Handler:
     topic: str | None = None
     ttl: int | None = None
     collect_timeout: int | None = None
-    has_deadman: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,7 @@ class ServingSource:
                 keep=target.keep,
                 priority=target.priority,
                 is_deferred=target.is_deferred,
+                deadmen=target.deadmen,
             )
         )
         return name, target
@@ -135,7 +136,7 @@ class ServingSource:
 
     def _send(self, name: str, target: Target) -> None:
         data = self._data(name, target)
-        self._feed(target)
+        self._feed(name, target)
         slot = self.books.slot("sent_bytes", self.route.name, target.name)
         self.out.line(f"counts[{slot}] += send_{name}({data})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
@@ -147,12 +148,11 @@ class ServingSource:
     def _deliver(self, name: str, target: Target) -> None:
         """Sent or published now or later, and counted there."""
         data = self._data(name, target)
-        if not target.is_topic:
-            self._feed(target)
+        self._feed(name, target)
         expires = "expires" if self.route.ttl else "None"
         self.out.line(f"deliver_{name}(now, {data}, {expires})", target.span)
 
-    def _feed(self, target: Target) -> None:
-        """Before the command is sent, so that nothing which the deadman sends can follow it."""
-        if self.route.deadman is not None:
-            self.out.line("feed(now)", target.span)
+    def _feed(self, name: str, target: Target) -> None:
+        """Before the command is sent, so that nothing which a deadman sends can follow it."""
+        if target.deadmen:
+            self.out.line(f"feed_{name}(now)", target.span)

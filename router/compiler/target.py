@@ -15,6 +15,7 @@ class Target:
     """A destination or a topic. `name` is its label in the books. Without a `plan` the datagram is forwarded.
 
     `reads` makes the variables of its expressions; None where they are made once for all targets of the route.
+    `deadmen` are the routes whose deadmen hear of each command to it.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Target:
     has_budget: bool = False
     trim: bool = False
     plan: Record | None = None
+    deadmen: tuple[str, ...] = ()
 
     @property
     def is_deferred(self) -> bool:

@@ -63,7 +63,7 @@ class Reporter:
         if active:
             logger.warning("commands stopped coming: the deadman sends in their place", route=route)
         else:
-            logger.warning("commands are back: the deadman is released", route=route)
+            logger.warning("commands come again: the deadman is released", route=route)
 
     def _summarise(self) -> None:
         while not self._stopped.wait(SUMMARY_INTERVAL_NS / 1e9):

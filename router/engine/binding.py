@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from router.compiler.books import Books
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
+from router.engine.deadman import Feed
 from router.engine.delivery import Deliver, immediately
 from router.engine.freshness import Freshness
 from router.engine.latest import Latest
@@ -42,8 +43,8 @@ class Outlets:
     `send` takes a datagram, by endpoint name, and may raise OSError. `publish` takes CDR bytes, by topic,
     and may raise `publish_errors`. `wanted` says by topic whether anybody listens, in a list of one that
     its owner keeps up to date. `report` hears of every loss; it is called only for those. `counts` belong to the
-    thread that calls the handlers. `feed` tells a route's deadman of a command that is about to be sent. `pacers` are
-    those of the endpoints with a budget, served by `pacing`; `collecting` serves frames. Clocks in ns.
+    thread that calls the handlers. `feed` makes what tells deadmen of a route's commands (see engine.deadman).
+    `pacers` are those of the endpoints with a budget, served by `pacing`; `collecting` serves frames. Clocks in ns.
     """
 
     counts: list[int]
@@ -55,8 +56,8 @@ class Outlets:
     wall_ns: Callable[[], int]
     pacing: Guarded
     collecting: Guarded
+    feed: Callable[[str, Sequence[str]], Feed]
     publish_errors: tuple[type[Exception], ...] = ()
-    feed: Mapping[str, Callable[[int], None]] = field(default_factory=dict)
     pacers: Mapping[str, Pacer] = field(default_factory=dict)
 
 
@@ -68,8 +69,6 @@ def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness)
         "clock_ns": outlets.clock_ns,
         "monotonic": freshness.born,
     }
-    if handler.has_deadman:
-        namespace["feed"] = outlets.feed[handler.route]
     if handler.collect_timeout is not None:
         namespace["collect"] = _collect(handler, handler.collect_timeout, books, outlets)
     for target in handler.targets:
@@ -91,6 +90,8 @@ def _bound(target: TargetPlan, route: str, books: Books, outlets: Outlets) -> di
         bound[f"publish_{name}"] = outlets.publish[target.target]
     else:
         bound[f"send_{name}"] = outlets.send[target.target]
+    if target.deadmen:
+        bound[f"feed_{name}"] = outlets.feed(route, target.deadmen)
     if target.max_rate is not None and target.keep is Keep.FIRST:
         bound[f"limit_{name}"] = RateLimit(target.max_rate).may_pass
     return bound

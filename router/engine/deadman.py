@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from router.compiler.books import Books
 from router.compiler.program import DeadmanPlan
+from router.engine.machine import Guard
 from router.engine.outcome import Report
+
+Feed = Callable[[int], None]
+"""Hears of a command that is about to be sent, at a time of the monotonic clock in ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +28,12 @@ class _Destination:
 class Deadman:
     """A machine with three states.
 
-    unarmed: no command came yet, and nothing is due.
+    unarmed: no command came yet, or others have taken over since, and nothing is due.
     armed:   the next thing due is `timeout` after the last fresh command. Then it trips.
-    tripped: sends at once, then on the grid of the time at which it was due to trip. A fresh command arms it again.
+    tripped: sends at once, then on the grid of the time at which it was due to trip.
 
-    `feed` is to be called before the command is sent, so that nothing the deadman sends comes behind the
+    A fresh command arms it, whatever its state (`feed`); one of a route that it hands over to disarms it
+    (`relieve`). Both are to be called before the command is sent, so that nothing the deadman sends comes behind the
     command. `send` is by endpoint and may raise OSError, which ends nothing. `changed` hears the route's name and
     whether the deadman is active now. All times in ns of the monotonic clock.
     """
@@ -64,10 +69,12 @@ class Deadman:
     def feed(self, now: int) -> None:
         """A fresh command is about to be sent."""
         self.next_due = now + self._plan.timeout
-        if self._tripped:
-            self._tripped = False
-            self._counts[self._active] = 0
-            self._changed(self._plan.route, False)
+        self._release()
+
+    def relieve(self, now: int) -> None:
+        """A fresh command of a route that it hands over to is about to be sent."""
+        self.next_due = None
+        self._release()
 
     def due(self, now: int) -> None:
         due, repeat = self.next_due, self._plan.repeat
@@ -90,6 +97,12 @@ class Deadman:
             self.next_due = None
             self._send()
 
+    def _release(self) -> None:
+        if self._tripped:
+            self._tripped = False
+            self._counts[self._active] = 0
+            self._changed(self._plan.route, False)
+
     def _send(self) -> None:
         for destination in self._destinations:
             try:
@@ -99,3 +112,22 @@ class Deadman:
                 self._report(Report("deadman", self._plan.route, destination.endpoint, "send_error", error))
             else:
                 self._counts[destination.sent] += 1
+
+
+def feeder(deadmen: Mapping[str, Deadman], guard: Guard) -> Callable[[str, Sequence[str]], Feed]:
+    """Makes of a route's name, and of the names in TargetPlan.deadmen, the call that tells all these deadmen at once.
+
+    `deadmen` are by route. `guard` makes the call safe: it has one lock for all of them.
+    """
+
+    def feed(route: str, told: Sequence[str]) -> Feed:
+        calls = [deadmen[name].feed if name == route else deadmen[name].relieve for name in told]
+        first, *others = calls
+
+        def tell(now: int) -> None:
+            for call in calls:
+                call(now)
+
+        return guard(deadmen[told[0]], tell if others else first)
+
+    return feed

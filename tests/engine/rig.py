@@ -13,7 +13,7 @@ from router.compiler.definitions import Definitions
 from router.compiler.program import Program
 from router.engine import Engine, OutboundEngine, Report
 from router.engine.binding import Guarded, Outlets
-from router.engine.deadman import Deadman
+from router.engine.deadman import Deadman, feeder
 from router.engine.machine import Machine
 from router.engine.pacing import Pacer
 from tests.engine.ledger import Ledger
@@ -89,7 +89,7 @@ class Rig:
             plan.route: Deadman(plan, made.books, self.counts, send, self.reports.append, self._changed)
             for plan in made.deadmen
         }
-        self.machines += [*pacers.values(), *deadmen.values()]
+        self.machines += pacers.values()
         self.outlets = Outlets(
             counts=self.counts,
             send=send,
@@ -100,8 +100,8 @@ class Rig:
             wall_ns=lambda: self.WALL + self.now,
             pacing=guarded,
             collecting=guarded,
+            feed=feeder(deadmen, self._guard),
             publish_errors=(PublishError,),
-            feed={route: deadman.feed for route, deadman in deadmen.items()},
             pacers=pacers,
         )
         self.arrived_before = 0
