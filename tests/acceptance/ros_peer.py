@@ -75,6 +75,8 @@ def _plain(value: Any) -> Any:
     """A message as what JSON can say; NaN and infinity in Python's way."""
     if hasattr(value, "get_fields_and_field_types"):
         return {name: _plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+    if isinstance(value, list):
+        return [_plain(element) for element in value]
     return value.tolist() if hasattr(value, "tolist") else value
 
 
