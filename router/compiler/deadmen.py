@@ -115,7 +115,7 @@ def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | No
     if findings:
         return None
     try:
-        return constant_envelope(mapping.plan, case, lookup.schema)
+        return constant_envelope(mapping.plan, case)
     except (MappingError, ValueError) as error:
         lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None

@@ -18,7 +18,7 @@ from router.compiler.serving import NamedTarget, ServingSource
 from router.compiler.source import Source, namespace_name
 from router.compiler.target import Target
 from router.table.model import Route
-from router.types.protobuf import PayloadCase, ProtoSchema
+from router.types.protobuf import PayloadCase
 
 
 class HandlerSource:
@@ -28,13 +28,13 @@ class HandlerSource:
     `born`, the arrival by the monotonic clock (ns).
     """
 
-    def __init__(self, route: Route, case: PayloadCase, schema: ProtoSchema, books: Books) -> None:
+    def __init__(self, route: Route, case: PayloadCase, books: Books) -> None:
         self.route = route
         self.books = books
         self.span = route.case.span
         self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
-        self._serving = ServingSource(self.out, route, case, schema, books)
+        self._serving = ServingSource(self.out, route, case, books)
 
     @property
     def plans(self) -> tuple[TargetPlan, ...]:

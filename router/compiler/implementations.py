@@ -6,8 +6,8 @@ Called with plain Python values; knows neither kinds nor syntax. A value without
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sized
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sized
+from typing import Any, NamedTuple, TypeVar
 
 from router.errors import MappingError, NonFiniteError
 
@@ -68,6 +68,21 @@ def time_from_seconds(x: float) -> int:
 
 def time_from_milliseconds(x: float) -> int:
     return _to_int(round, x * NS_PER_MILLISECOND)
+
+
+# what fields are read through
+
+
+class Entry(NamedTuple):
+    """One entry of a protobuf map, with the names that its declaration gives both parts."""
+
+    key: Any
+    value: Any
+
+
+def entries(values: Mapping[Any, object]) -> tuple[Entry, ...]:
+    """A protobuf map as the list that it is on the wire, in the order of its keys: its own differs from run to run."""
+    return tuple(Entry(key, values[key]) for key in sorted(values))
 
 
 # what fields ask of the values that fill them; tables cannot call these

@@ -36,7 +36,7 @@ def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Seq
     inbound: dict[int, tuple[Handler, ...]] = {}
     outbound: dict[str, tuple[Handler, ...]] = {}
     for checked in served:
-        for handler in compile_handlers(checked, table, schema, books):
+        for handler in compile_handlers(checked, table, books):
             if handler.topic is None:
                 number = handler.case.number
                 inbound[number] = (*inbound.get(number, ()), handler)
@@ -96,7 +96,7 @@ def _open_books(books: Books, table: RouteTable, envelope: Envelope) -> None:
         books.slot("endpoint_last_seen_timestamp_seconds", endpoint)
 
 
-def compile_handlers(checked: CheckedRoute, table: RouteTable, schema: ProtoSchema, books: Books) -> Iterator[Handler]:
+def compile_handlers(checked: CheckedRoute, table: RouteTable, books: Books) -> Iterator[Handler]:
     """Generates and compiles the functions of one route, and opens its series in the books.
 
     A route from UDP has one, a route from ROS one for each of its topics.
@@ -108,7 +108,7 @@ def compile_handlers(checked: CheckedRoute, table: RouteTable, schema: ProtoSche
         for policy in QOS_POLICIES:
             books.slot("qos_incompatible", route.name, topic.topic.value, policy)
     if not route.is_outbound:
-        generator = HandlerSource(route, case, schema, books)
+        generator = HandlerSource(route, case, books)
         generator.inbound([served.target for served in checked.targets], checked.collect)
         sources: list[str | None] = [source.value for source in route.sources]
         if ANY in sources:
@@ -118,7 +118,7 @@ def compile_handlers(checked: CheckedRoute, table: RouteTable, schema: ProtoSche
         spans = [served.target.span for served in checked.targets if served.topic]
         yield _handler(generator, checked, (spans or [route.case.span])[0].file, frozenset(sources), None)
     for feed in checked.feeds:
-        generator = HandlerSource(route, case, schema, books)
+        generator = HandlerSource(route, case, books)
         generator.outbound(feed)
         yield _handler(generator, checked, feed.topic.span.file, frozenset(), feed.topic.topic.value)
 

@@ -8,10 +8,11 @@ from router.compiler.cdr.readers import cut_off, numbers, refuse, text, texts, w
 from router.compiler.cdr.steps import CDR_LE, HEADER
 from router.compiler.cdr.writers import put_length, put_numbers, put_text, put_wide_text, want_length
 from router.compiler.functions import FUNCTIONS
-from router.compiler.implementations import fit, fit_length, fit_text, fit_wide_text
+from router.compiler.implementations import entries, fit, fit_length, fit_text, fit_wide_text
 
 NAMESPACE: Mapping[str, object] = {
     **{name: function.implementation for name, function in FUNCTIONS.items()},
+    "entries": entries,
     "fit": fit,
     "fit_length": fit_length,
     "fit_text": fit_text,

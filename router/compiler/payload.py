@@ -17,14 +17,14 @@ from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.source import Source
 from router.compiler.syntax import attribute, call, load, placed
 from router.errors import MappingError
-from router.types.model import Field, Float, MessageType
-from router.types.protobuf import PayloadCase, ProtoSchema
+from router.types.model import Field, Float
+from router.types.protobuf import PayloadCase
 
 _ONE_BYTE = 128
 """Lengths below this are varints of one byte."""
 
 
-def write_envelope(out: Source, plan: Record, case: PayloadCase, schema: ProtoSchema, name: str) -> str:
+def write_envelope(out: Source, plan: Record, case: PayloadCase, name: str) -> str:
     """Appends the code that builds a payload. Returns the expression that is the bytes of the envelope with it.
 
     `name` goes into the names of what the code calls; payloads of one function have different ones.
@@ -36,18 +36,18 @@ def write_envelope(out: Source, plan: Record, case: PayloadCase, schema: ProtoSc
     clear = out.constant(f"clear_{name}", methods.Clear)
     envelope = out.constant(f"envelope_{name}", _envelope(case.number))
     out.line(f"payload = {make}()", plan.span)
-    _Writer(out, schema, present, clear).fill("payload", plan)
+    _Writer(out, present, clear).fill("payload", plan)
     return f"{envelope}({serialize}(payload))"
 
 
-def constant_envelope(plan: Record, case: PayloadCase, schema: ProtoSchema) -> bytes:
+def constant_envelope(plan: Record, case: PayloadCase) -> bytes:
     """The envelope of a plan whose expressions have no message to look at.
 
     Raises MappingError or ValueError when it cannot be built.
     """
     out = Source()
     with out.block("def build():", plan.span):
-        out.line(f"return {write_envelope(out, plan, case, schema, case.name)}", plan.span)
+        out.line(f"return {write_envelope(out, plan, case, case.name)}", plan.span)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile(plan.span.file), namespace)  # noqa: S102 - code that we made of a checked plan
     try:
@@ -87,7 +87,6 @@ class _Writer:
     """
 
     out: Source
-    schema: ProtoSchema
     present: str
     clear: str
     computed: set[str] = field(default_factory=lambda: {"item"})
@@ -124,7 +123,7 @@ class _Writer:
         match element:
             case Leaf():
                 self.out.line(f"{where}.append({self._value(element)})", element.span)
-            case Record() if self._is_map_entry(element.type):
+            case Record() if element.type.is_map_entry:
                 self._put(where, inner, element)
             case Record():
                 self.out.line(f"{inner} = {where}.add()", element.span)
@@ -155,9 +154,6 @@ class _Writer:
             self.out.line(f"{inner} = {place}", entry.span)
             self.out.line(f"{self.clear}({inner})", entry.span)
             self.fill(inner, value)
-
-    def _is_map_entry(self, declared: MessageType) -> bool:
-        return self.schema.descriptor(declared.name).GetOptions().map_entry
 
     # values
 

@@ -9,6 +9,7 @@ import ast
 import operator
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 from router.compiler.functions import FUNCTIONS
@@ -52,6 +53,8 @@ def _seen(raw: Any, declared: Type) -> object:
             return View(raw, declared)
         case Enum():
             return EnumNumber(raw)
+        case List(MessageType(is_map_entry=True) as entry):
+            return [View(SimpleNamespace(key=key, value=raw[key]), entry) for key in sorted(raw)]
         case List():
             return [_seen(element, declared.element) for element in raw]
         case _:

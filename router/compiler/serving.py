@@ -18,7 +18,7 @@ from router.compiler.source import Source, namespace_name
 from router.compiler.target import Target
 from router.errors import SourceSpan
 from router.table.model import Keep, Route
-from router.types.protobuf import PayloadCase, ProtoSchema
+from router.types.protobuf import PayloadCase
 
 NamedTarget = tuple[str, Target]
 """A target with its part of the Python names."""
@@ -31,7 +31,6 @@ class ServingSource:
     out: Source
     route: Route
     case: PayloadCase
-    schema: ProtoSchema
     books: Books
     plans: list[TargetPlan] = field(default_factory=list)
 
@@ -131,7 +130,7 @@ class ServingSource:
         elif target.is_topic:
             return write_message(self.out, target.plan, name)
         else:
-            data = write_envelope(self.out, target.plan, self.case, self.schema, name)
+            data = write_envelope(self.out, target.plan, self.case, name)
         return f"{data}.rstrip(ZERO)" if target.trim else data
 
     def _send(self, name: str, target: Target) -> None:

@@ -121,12 +121,14 @@ class MessageType:
 
     Compared by identity: a name has one MessageType per schema. Fields keep their declared order,
     which for ROS decides the bytes. Protobuf messages may contain themselves, so `fields` is filled
-    by whoever builds the type, once, and not changed afterwards.
+    by whoever builds the type, once, and not changed afterwards. With `is_map_entry` a list of it is a
+    protobuf map.
     """
 
     name: str
     fields: tuple[Field, ...] = ()
     constants: Mapping[str, object] = field(default_factory=dict)
+    is_map_entry: bool = False
 
     def field(self, name: str) -> Field | None:
         return next((member for member in self.fields if member.name == name), None)

@@ -1,7 +1,7 @@
 """Protobuf descriptors as our type model.
 
-A map becomes a list of its entry messages and a group a message: the model knows neither. Extensions are
-left out. Knows no files; where things stand and what comment they carry comes from `proto_source`.
+A map becomes a list of its entry messages and a group a message. Extensions are left out. Knows no files; where
+things stand and what comment they carry comes from `proto_source`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescript
 from google.protobuf.descriptor_pool import DescriptorPool
 
 from router.types.board_options import BoardOptions
-from router.types.descriptors import container, enum_of, message_of
+from router.types.descriptors import enum_of, message_of
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.proto_source import ProtoSources
 
@@ -47,7 +47,10 @@ def build_types(
     declared = [enum for file in files for enum in file.enum_types_by_name.values()]
     declared += [enum for message in descriptors for enum in message.enum_types]
     enums = {enum.full_name: _enum(enum) for enum in declared}
-    messages = {message.full_name: MessageType(message.full_name) for message in descriptors}
+    messages = {
+        message.full_name: MessageType(message.full_name, is_map_entry=message.GetOptions().map_entry)
+        for message in descriptors
+    }
     for message in descriptors:
         messages[message.full_name].fields = tuple(
             Field(
@@ -55,7 +58,7 @@ def build_types(
                 type=_type(field, options_of(field), messages, enums),
                 number=field.number,
                 has_presence=field.has_presence,
-                is_required=field.is_required or container(field).GetOptions().map_entry,
+                is_required=field.is_required or messages[message.full_name].is_map_entry,
                 oneof=field.containing_oneof.name if field.containing_oneof else None,
                 comment=sources.comment(f"{message.full_name}.{field.name}"),
             )

@@ -55,7 +55,7 @@ def compiled_envelope(
     out = Source()
     with out.block(f"def envelope({'cdr' if isinstance(reads, CdrReads) else 'm'}, source, received_at):", SPAN):
         scope.reads.write(out, SPAN)
-        out.line(f"return {write_envelope(out, mapping.plan, case, schema, 'it')}", SPAN)
+        out.line(f"return {write_envelope(out, mapping.plan, case, 'it')}", SPAN)
     namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
     exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
     function = namespace["envelope"]

@@ -91,7 +91,7 @@ def constant(case: str, fields: FieldMap) -> bytes:
     scope = scope_of(MessageType("nothing"), tuple(schema.enums.values()))
     mapping = build(fields, declared.type, scope, SPAN)
     assert mapping.findings == []
-    return constant_envelope(mapping.plan, declared, schema)
+    return constant_envelope(mapping.plan, declared)
 
 
 def test_an_envelope_of_constants_is_that_of_the_reference() -> None:
@@ -106,13 +106,10 @@ def test_an_envelope_of_constants_is_that_of_the_reference() -> None:
 
 
 def test_the_rover_brakes() -> None:
-    schema, envelope = rover_wire()
+    _, envelope = rover_wire()
     case = envelope.cases["manual_brake"]
     plan = build(field_map(brake="true"), case.type, scope_of(MessageType("nothing")), SPAN).plan
-    assert (
-        constant_envelope(plan, case, schema)
-        == envelope.message_class(manual_brake={"brake": True}).SerializeToString()
-    )
+    assert constant_envelope(plan, case) == envelope.message_class(manual_brake={"brake": True}).SerializeToString()
 
 
 @pytest.mark.parametrize(

@@ -22,15 +22,14 @@ SPAN = SourceSpan("table.yaml", 3, 5, 9)
 
 def generated(checked: Checked) -> list[Source]:
     """The code of all routes of a table."""
-    assert checked.schema is not None
     made = []
     for route in checked.routes:
-        generator = HandlerSource(route.route, route.case, checked.schema, Books())
+        generator = HandlerSource(route.route, route.case, Books())
         if not route.route.is_outbound:
             generator.inbound([served.target for served in route.targets], route.collect)
             made.append(generator.out)
         for feed in route.feeds:
-            generator = HandlerSource(route.route, route.case, checked.schema, Books())
+            generator = HandlerSource(route.route, route.case, Books())
             generator.outbound(feed)
             made.append(generator.out)
     assert made

@@ -9,12 +9,19 @@ import ast
 from abc import ABC, abstractmethod
 
 from router.compiler.source import Source
-from router.compiler.syntax import attribute, load, placed
+from router.compiler.syntax import attribute, call, load, placed
 from router.errors import SourceSpan
-from router.types.model import Field
+from router.types.model import Field, List, MessageType
 
 Path = tuple[str, ...]
 """The names that lead from the source message to a field of it; the empty path is the message."""
+
+
+def value_of(message: ast.expr, member: Field) -> ast.expr:
+    """A field of a message that is there as an object. A protobuf map is read as the list of its entries."""
+    value = attribute(message, member.name)
+    element = member.type.element if isinstance(member.type, List) else None
+    return call("entries", value) if isinstance(element, MessageType) and element.is_map_entry else value
 
 
 class Reads(ABC):
@@ -59,7 +66,7 @@ class ParsedReads(Reads):
     """A parsed protobuf message `m`: each submessage that expressions look into is bound once."""
 
     def field(self, holder: Path, member: Field) -> ast.expr:
-        return attribute(self.message(holder), member.name)
+        return value_of(self.message(holder), member)
 
     def message(self, path: Path) -> ast.expr:
         if path:

@@ -10,10 +10,10 @@ import copy
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
-from router.compiler.expressions.reads import Path, Reads
+from router.compiler.expressions.reads import Path, Reads, value_of
 from router.compiler.expressions.typed import Typed
 from router.compiler.kinds import MessageKind, kind_of
-from router.compiler.syntax import attribute, place
+from router.compiler.syntax import place
 from router.errors import SourceSpan
 from router.types.model import Enum, Field, MessageType
 
@@ -68,7 +68,7 @@ class Scope:
     def field_of(self, holder: Typed, member: Field, span: SourceSpan) -> Typed:
         """A field of a message that an expression gave; through a local variable where a path leads to it."""
         if holder.path is None:
-            return Typed.at(span, kind_of(member.type), attribute(holder.node, member.name))
+            return Typed.at(span, kind_of(member.type), value_of(holder.node, member))
         return self.read(holder.path, member, span)
 
     def read(self, holder: Path, member: Field, span: SourceSpan) -> Typed:
