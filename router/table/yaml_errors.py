@@ -56,6 +56,7 @@ _SENTENCES = {
     ),
     "found incompatible YAML document": _Sentence("this is a YAML version that is not understood", "remove the line"),
 }
+_NOT_CLOSED = ("did not find expected ',' or ']'", "did not find expected ',' or '}'")
 _FOLLOW_A_BARE_WORD = ("mapping values are not allowed in this context", "did not find expected key")
 _COMMENT = re.compile(r"(?:^|\s)#.*")
 
@@ -89,6 +90,8 @@ def _sentence(error: yaml.MarkedYAMLError, source: Source, line: int, column: in
     if character == "\t":
         return _TAB
     problem = error.problem or str(error)
+    if problem in _NOT_CLOSED and character in ("[", "{") and source.lines[line][:column][-1:].strip():
+        return _Sentence(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
     if problem == "found character that cannot start any token":
         return _Sentence(f"a value cannot begin with '{character}'", "put quotes around it")
     passed_on = _Sentence(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
