@@ -10,18 +10,14 @@ from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 
 from router.compiler import STRANGER, source_label
-from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, REJECT_REASONS, UNKNOWN_CASE
+from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, REJECT_REASONS
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
 from router.engine.binding import Handle, Outlets, bind
-from router.engine.framing import LEN, restored
+from router.engine.framing import LEN
 from router.engine.freshness import Freshness
 from router.engine.outcome import Report
-from router.engine.payloadless import why_no_payload
-from router.table.model import Framing
-
-MAX_DATAGRAM = 16 * 1024
-"""The longest datagram, in bytes, that is looked at; a longer one is rejected as `truncated`."""
+from router.engine.settling import MAX_DATAGRAM, Rejected, Settler
 
 Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]
@@ -49,12 +45,6 @@ class _Case:
     stranger: _Route | None
 
 
-class _Rejected(Exception):
-    def __init__(self, reason: str, detail: str = "") -> None:
-        super().__init__(detail)
-        self.reason = reason
-
-
 class Engine:
     """A program's routes from UDP, bound to the outside world.
 
@@ -67,7 +57,6 @@ class Engine:
         self._counts = outlets.counts
         self._arrived_at = arrived_at
         self._freshness = Freshness()
-        self._case_numbers = frozenset(case.number for case in program.envelope.cases.values())
         self._by_host, self._by_address = recognisers(program.table.endpoints)
         self._handles = {
             handler.route: bind(handler, program.books, outlets, self._freshness)
@@ -125,7 +114,7 @@ class Engine:
         received, received_bytes = books.slot("datagrams_received", listener), books.slot("received_bytes", listener)
         seen = self._seen_slots()
         by_address = self._by_address
-        settle, reject = self._settler(listener, cases), self._rejecter(listener)
+        settle, reject = Settler(self._program, counts, listener, cases).settle, self._rejecter(listener)
 
         def receive(data: bytes, peer: Peer) -> None:
             now = clock_ns()
@@ -150,7 +139,7 @@ class Engine:
             except (LookupError, ProtobufError):  # not the usual datagram
                 try:
                     case, message = settle(data)
-                except _Rejected as rejected:
+                except Rejected as rejected:
                     reject(rejected.reason, peer, str(rejected))
                     return
             route = case.routes.get(sender_key, case.stranger)
@@ -170,50 +159,6 @@ class Engine:
         addresses: list[tuple[object, str]] = [*self._by_host.items(), *self._by_address.items()]
         metric = "endpoint_last_seen_timestamp_seconds"
         return {key: self._program.books.slot(metric, name) for key, name in addresses}
-
-    def _settler(self, listener: str, cases: Mapping[int, _Case]) -> Callable[[bytes], tuple[_Case, Message]]:
-        """The unusual datagram: repaired if the listener's framing says so, then read by the protobuf library."""
-        plan = next(plan for plan in self._program.listeners if plan.name == listener)
-        repairs = plan.framing is Framing.ZERO_TRIMMED
-        padded = self._program.books.slot("datagrams_padded", listener)
-        counts, parse = self._counts, self._program.envelope.message_class.FromString
-
-        def settle(data: bytes) -> tuple[_Case, Message]:
-            if len(data) > MAX_DATAGRAM:
-                raise _Rejected("truncated", f"{len(data)} bytes")
-            if not data:
-                raise _Rejected("empty")
-            whole = restored(data, MAX_DATAGRAM) if repairs else data
-            try:
-                envelope = parse(whole)
-            except ProtobufError as error:
-                raise _Rejected("malformed", str(error)) from error
-            if len(whole) != len(data):
-                counts[padded] += 1
-            return self._find(envelope, cases)
-
-        return settle
-
-    def _find(self, message: Message, cases: Mapping[int, _Case]) -> tuple[_Case, Message]:
-        """The payload case and the payload of a parsed envelope, whatever else is in it. Raises _Rejected."""
-        envelope = self._program.envelope
-        name = message.WhichOneof(envelope.oneof)
-        if name is None:
-            reason, detail = why_no_payload(message, self._case_numbers)
-            if reason == "unknown_case":
-                self._count_unhandled(UNKNOWN_CASE)
-            raise _Rejected(reason, detail)
-        number = envelope.cases[name].number
-        case = cases.get(number)
-        if case is not None:
-            return case, getattr(message, name)
-        if number in self._program.ignored:
-            raise _Rejected("ignored", name)
-        self._count_unhandled(name)
-        raise _Rejected("unhandled", name)
-
-    def _count_unhandled(self, case: str) -> None:
-        self._counts[self._program.books.slot("unhandled", case)] += 1
 
     def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
         books, counts, report = self._program.books, self._counts, self._outlets.report

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine.dispatch import MAX_DATAGRAM
+from router.engine import MAX_DATAGRAM
 from router.engine.limiter import NS
 from router.engine.pacing import BURST, LEAST_QUEUE, Pacer
 from router.table.model import Priority
