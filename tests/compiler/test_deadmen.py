@@ -61,6 +61,68 @@ def test_payload_is_known_before_the_start(check_text: CheckText, send: str, env
     assert route.deadman.datagram.hex() == envelope
 
 
+TURNS = """
+routes:
+  manual_drive:
+    source: base
+    destinations: [board]
+    deadman: {{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}, to: [{to}], hands_over_to: [{cases}]}}
+  drive_motor:
+    source: ros
+    topics: [{{topic: drive, type: comms/msg/DrivingBoardMotorMessage}}]
+    fields: auto
+    destinations: [tool, board]
+    deadman: it stops by itself
+  manual_brake: {{source: base, destinations: [tool], deadman: it stops by itself}}
+  arm_ctrl: {{ignore: not part of this test}}
+"""
+THREE = (
+    "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation},"
+    " tool: {address: 127.0.0.4:9000, kind: tool}}"
+)
+
+
+def test_hand_over_concerns_what_goes_to_the_endpoints_of_the_deadman(check_text: CheckText) -> None:
+    checked = check_text(TURNS.format(to="board", cases="drive_motor"), endpoints=THREE)
+    assert not checked.has_errors
+    routes = {checked.route.name: checked for checked in checked.routes}
+    deadman, (feed,) = routes["manual_drive"].deadman, routes["drive_motor"].feeds
+    assert deadman is not None
+    assert deadman.hands_over_to == ("drive_motor",)
+    assert [served.target.deadmen for served in routes["manual_drive"].targets] == [("manual_drive",)]
+    assert {served.target.name: served.target.deadmen for served in feed.targets} == {
+        "tool": (),
+        "board": ("manual_drive",),
+    }
+
+
+@pytest.mark.parametrize(
+    ("to", "cases", "codes"),
+    [
+        ("board", "drive_motor", []),
+        ("base", "drive_motor", [Code.BAD_VALUE]),
+        ("base, tool", "drive_motor, manual_brake", []),
+        ("board", "manual_brake", [Code.BAD_VALUE]),
+        ("board", "manual_drive", [Code.BAD_VALUE]),
+        ("board", "arm_ctrl", [Code.BAD_VALUE]),
+        ("board", "arm_target", [Code.BAD_VALUE]),
+        ("board", "drive_moto", [Code.UNKNOWN_PAYLOAD_CASE]),
+        ("bord", "drive_motor", [Code.UNKNOWN_ENDPOINT]),
+    ],
+)
+def test_only_who_commands_the_same_endpoint_can_take_over(
+    check_text: CheckText, to: str, cases: str, codes: list[Code]
+) -> None:
+    found = check_text(TURNS.format(to=to, cases=cases), endpoints=THREE).diagnostics
+    assert [finding.code for finding in found if finding.code is not Code.UNCOVERED_PAYLOAD_CASE] == codes
+
+
+def test_a_broken_route_is_not_blamed_for_what_it_would_take_over(check_text: CheckText) -> None:
+    table = TURNS.format(to="board", cases="drive_motor").replace("[tool, board]", "[tool, 5]")
+    found = check_text(table, endpoints=THREE).diagnostics
+    assert Code.BAD_VALUE not in {finding.code for finding in found}
+
+
 @pytest.mark.parametrize("value", ["brake", "message", "source == 'base'", "received_at > 0", "turn > 0", "has(turn)"])
 def test_payload_is_made_of_constants(check_text: CheckText, value: str) -> None:
     deadman = f'{{timeout: 500ms, send: {{manual_brake: {{brake: "{value}"}}}}, to: [board]}}'

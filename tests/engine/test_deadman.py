@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
 import pytest
 from hypothesis import given
@@ -11,8 +12,12 @@ from hypothesis import strategies as st
 
 from router.compiler.books import Books
 from router.compiler.program import DeadmanPlan
-from router.engine.deadman import Deadman
+from router.engine.deadman import Deadman, feeder
+from router.engine.machine import Machine
 from router.engine.outcome import Report
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 TIMEOUT = 500
 REPEAT = 100
@@ -160,6 +165,45 @@ def test_at_the_end_it_sends_once_more_and_then_nothing(now: int) -> None:
     watched.deadman.end(0)
     watched.run(10**6)
     assert [endpoint for _, endpoint, _ in watched.sent] == ["driving_board", "arm_board"]
+
+
+def test_who_takes_over_disarms_it_until_its_own_next_command() -> None:
+    watched = Watched()
+    watched.feed(0)
+    watched.deadman.relieve(TIMEOUT - 1)
+    watched.due(10 * TIMEOUT)
+    watched.deadman.end(0)
+    assert (watched.deadman.next_due, watched.sent, watched.told) == (None, [], [])
+    watched.feed(20 * TIMEOUT)
+    watched.run(21 * TIMEOUT)
+    assert watched.times() == [21 * TIMEOUT]
+
+
+def test_who_takes_over_releases_it_when_it_has_tripped() -> None:
+    watched = Watched()
+    watched.feed(0)
+    watched.run(TIMEOUT + REPEAT)
+    watched.deadman.relieve(TIMEOUT + REPEAT + 1)
+    watched.run(10**6)
+    assert watched.times() == [TIMEOUT, TIMEOUT + REPEAT]
+    assert [told[:2] for told in watched.told] == [("drive", True), ("drive", False)]
+    assert (watched.count("deadman_active"), watched.count("deadman_trips")) == (0, 1)
+
+
+@pytest.mark.parametrize(("told", "armed"), [(["a"], {"a"}), (["a", "b", "c"], {"a"}), (["b", "c"], set())])
+def test_one_call_feeds_the_own_deadman_and_relieves_the_others(told: list[str], armed: set[str]) -> None:
+    deadmen = {name: Watched().deadman for name in "abc"}
+    for name in "bc":
+        deadmen[name].feed(0)
+    served: list[Machine] = []
+
+    def guard(machine: Machine, call: Callable[P, R], /) -> Callable[P, R]:
+        served.append(machine)
+        return call
+
+    feeder(deadmen, guard)("a", told)(TIMEOUT)
+    assert served == [deadmen[told[0]]]
+    assert {name for name in told if deadmen[name].next_due is not None} == armed
 
 
 gaps = st.lists(st.integers(0, 5 * TIMEOUT), min_size=1, max_size=30)
