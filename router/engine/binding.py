@@ -15,7 +15,7 @@ from router.engine.freshness import Freshness
 from router.engine.latest import Latest
 from router.engine.limiter import RateLimit
 from router.engine.machine import Guard
-from router.engine.outcome import MAPPING_FAILURES, Outcome, Report
+from router.engine.outcome import MAPPING_FAILURES, FrameOutcome, Outcome, Report
 from router.engine.pacing import Pacer
 from router.table.model import Keep
 
@@ -100,7 +100,9 @@ def _bound(target: TargetPlan, route: str, books: Books, outlets: Outlets) -> di
 def _collect(handler: Handler, timeout: int, books: Books, outlets: Outlets) -> Callable[..., list[object] | None]:
     counts = outlets.collecting.counts
     outcomes = [
-        Outcome(books, counts, handler.route, target, outlets.report) for target in handler.targets if target.is_topic
+        FrameOutcome(books, counts, handler.route, target, outlets.report)
+        for target in handler.targets
+        if target.is_topic
     ]
     collector = Collector(timeout, outcomes)
     return outlets.collecting.guard(collector, collector.offer)

@@ -41,7 +41,6 @@ class Outcome:
     def __init__(
         self, books: Books, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
     ) -> None:
-        self._books = books
         self._counts = counts
         self._route = route
         self._target = target.target
@@ -75,9 +74,19 @@ class Outcome:
     def filtered(self) -> None:
         self._counts[self._filtered] += 1
 
+
+class FrameOutcome(Outcome):
+    """Of a target that gets frames: it counts parts, which no other target has a series for."""
+
+    def __init__(
+        self, books: Books, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
+    ) -> None:
+        super().__init__(books, counts, route, target, report)
+        self._collected = books.slot("messages_collected", route, target.target)
+
     def collected(self) -> None:
-        """Joined a frame. Only a target of a route that collects has this series, so the slot is looked up."""
-        self._counts[self._books.slot("messages_collected", self._route, self._target)] += 1
+        """Joined a frame."""
+        self._counts[self._collected] += 1
 
 
 def _reason(error: Exception, is_topic: bool) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from router.compiler.books import DROP_REASONS, Books
 from router.compiler.program import TargetPlan
-from router.engine.outcome import Outcome, Report
+from router.engine.outcome import FrameOutcome, Outcome, Report
 
 
 class _Target:
@@ -21,8 +21,7 @@ class _Target:
         for reason in DROP_REASONS:
             self._books.slot("messages_dropped", self.route, name, reason)
         self._counts = self._books.fresh_counts()
-        plan = TargetPlan(name, name, is_topic, None)
-        self.outcome = Outcome(self._books, self._counts, self.route, plan, self.reports.append)
+        self._plan = TargetPlan(name, name, is_topic, None)
 
     def counted(self) -> Mapping[str, int]:
         """What is not zero, by metric, of what was dropped by reason."""
@@ -33,8 +32,12 @@ class _Target:
 class Destination(_Target):
     def __init__(self, name: str = "a_board") -> None:
         super().__init__(name, False, ("datagrams_sent", "sent_bytes", "messages_filtered"))
+        self.outcome = Outcome(self._books, self._counts, self.route, self._plan, self.reports.append)
 
 
 class Topic(_Target):
+    """Of a route that collects."""
+
     def __init__(self, name: str = "a_topic") -> None:
         super().__init__(name, True, ("messages_published", "messages_filtered", "messages_collected"))
+        self.outcome = FrameOutcome(self._books, self._counts, self.route, self._plan, self.reports.append)
