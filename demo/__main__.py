@@ -1,6 +1,7 @@
 """`python -m demo`: simulated rover, router and real ROS nodes for some seconds; exit 0 when everything arrived.
 
-In the middle the basestation is cut off, and a deadman has to halt the rover.
+At first operator and software both command the boards, then the operator alone. In the middle the basestation is cut
+off, and a deadman has to halt the rover.
 """
 
 from __future__ import annotations

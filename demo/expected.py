@@ -1,8 +1,8 @@
-"""What must arrive for the demo to pass, read from the route table."""
+"""What the demo's processes say, and what must arrive for it to pass, read from the route table."""
 
 from __future__ import annotations
 
-from router.table.model import Route, RouteTable
+from router.table.model import EndpointKind, Route, RouteTable
 
 SILENT = "basestation"
 """The endpoint whose link is lost for a while."""
@@ -24,6 +24,17 @@ def inbound_topics(table: RouteTable) -> dict[str, str]:
 def outbound_topics(table: RouteTable) -> dict[str, str]:
     """ROS type by topic of what the router subscribes to."""
     return _topics([route for route in active_routes(table) if route.is_outbound])
+
+
+def command_topics(table: RouteTable) -> set[str]:
+    """Those of outbound topics that command a board. While they do, no deadman of the operator's commands trips."""
+    boards = {name for name, endpoint in table.endpoints.items() if endpoint.kind is EndpointKind.BOARD}
+    return {
+        topic.topic.value
+        for route in active_routes(table)
+        if route.is_outbound and any(destination.endpoint.value in boards for destination in route.destinations)
+        for topic in route.topics
+    }
 
 
 def _topics(routes: list[Route]) -> dict[str, str]:

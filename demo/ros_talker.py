@@ -1,5 +1,7 @@
 """The rover's software, as far as the router can tell: publishes every topic that the table takes from ROS.
 
+It commands the boards for some seconds, then leaves them to the operator.
+
 `python -m demo.ros_talker TABLE`
 """
 
@@ -15,19 +17,22 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from demo.expected import outbound_topics
+from demo.expected import command_topics, outbound_topics
 from demo.ros_messages import filled, message_class
 from router.tools.wire import read_table
 
 INTERVAL = 0.1
 """Seconds."""
 
+COMMANDING = 3.0
+"""Seconds after the start, in which it commands the boards: less than until the operator is cut off."""
+
 ANY_SUBSCRIBER = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Reliable and kept: what a subscriber may ask for at most."""
 
 
-def talk(node: Node, topics: dict[str, str]) -> None:
-    """From now on one message on each topic in every INTERVAL."""
+def talk(node: Node, topics: dict[str, str], commands: set[str]) -> None:
+    """From now on one message on each topic in every INTERVAL, on those of `commands` while COMMANDING."""
     classes = {topic: message_class(name) for topic, name in topics.items()}
     publishers = {topic: node.create_publisher(kind, topic, ANY_SUBSCRIBER) for topic, kind in classes.items()}
     numbers = itertools.count()
@@ -35,7 +40,8 @@ def talk(node: Node, topics: dict[str, str]) -> None:
     def publish() -> None:
         number, stamp = next(numbers), node.get_clock().now().to_msg()
         for topic, publisher in publishers.items():
-            publisher.publish(filled(classes[topic], number, stamp))
+            if topic not in commands or number * INTERVAL < COMMANDING:
+                publisher.publish(filled(classes[topic], number, stamp))
 
     node.create_timer(INTERVAL, publish)
 
@@ -44,7 +50,7 @@ def main() -> int:
     table = read_table(Path(sys.argv[1]))
     rclpy.init()
     node = rclpy.create_node("demo_talker", namespace=table.node.namespace)
-    talk(node, outbound_topics(table))
+    talk(node, outbound_topics(table), command_topics(table))
     with contextlib.suppress(ExternalShutdownException):  # which is how SIGTERM ends it
         rclpy.spin(node)
     return 0

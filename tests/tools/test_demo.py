@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from demo.children import Child
-from demo.expected import FOUND, LOST, expected_arrivals, inbound_topics, outbound_topics
+from demo.expected import FOUND, LOST, command_topics, expected_arrivals, inbound_topics, outbound_topics
 from demo.places import free_ros_domain, taken_places
 from demo.verdict import judge
 from router.table.model import RouteTable
@@ -70,6 +70,11 @@ def test_both_directions_are_expected(sim_table: RouteTable) -> None:
     from_ros = {route.case.value for route in sim_table.routes if route.is_outbound}
     assert from_ros <= {case for _, case in expected_arrivals(sim_table)}
     assert not outbound_topics(sim_table).keys() & inbound_topics(sim_table).keys()
+
+
+def test_the_software_knows_what_it_must_leave_to_the_operator(sim_table: RouteTable) -> None:
+    """What takes over from the operator would keep the deadmen from tripping."""
+    assert command_topics(sim_table) == {"drive_motor", "arm_ctrl", "arm_target"}
 
 
 def test_one_silent_topic_fails(sim_table: RouteTable) -> None:
