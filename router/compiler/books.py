@@ -66,7 +66,7 @@ DROP_REASONS: Mapping[str, str] = {
     "send_error": "the network refused it; `Connection refused`: nobody listens there",
     "publish_error": "the ROS middleware refused it",
     "incomplete": "a frame that was not complete when its time was up, or had no room",
-    "loop": "it came from this router",
+    "loop": "it came from this router: stays 0, because tables with loops are refused",
 }
 """Why a target did not get a message, with what each means."""
 
