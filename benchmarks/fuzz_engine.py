@@ -16,14 +16,14 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM, Engine, Report
-from router.engine.binding import Outlets, unguarded
 from tests.engine.ledger import Ledger
+from tests.engine.plain import plain_outlets
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = 500_000
@@ -172,25 +172,17 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
         if noise.random() < 0.01:
             raise PublishError
 
-    outlets = Outlets(
+    outlets = plain_outlets(
+        program.books,
+        {plan.endpoint: send for plan in program.senders},
+        {plan.topic: publish for plan in program.publishers},
+        _forget,
         counts=counts,
-        send={plan.endpoint: send for plan in program.senders},
-        publish={plan.topic: publish for plan in program.publishers},
-        wanted={plan.topic: [True] for plan in program.publishers},
-        report=_forget,
-        clock_ns=time.monotonic_ns,
-        wall_ns=time.time_ns,
-        pacing=unguarded(counts),
-        collecting=unguarded(counts),
-        feed=lambda *_: _forget_command,
         publish_errors=(PublishError,),
     )
+    timed = replace(outlets, clock_ns=time.monotonic_ns, wall_ns=time.time_ns)
     listener = program.listeners[0].name
-    return Engine(program, outlets, {listener: time.time_ns}).receiver(listener)
-
-
-def _forget_command(_: int) -> None:
-    """No time passes here in which a deadman could trip."""
+    return Engine(program, timed, {listener: time.time_ns}).receiver(listener)
 
 
 def _forget(report: Report) -> None:

@@ -31,11 +31,6 @@ class Guarded:
     guard: Guard
 
 
-def unguarded(counts: list[int]) -> Guarded:
-    """For one thread that serves its machines itself."""
-    return Guarded(counts, lambda _, call: call)
-
-
 @dataclass(frozen=True, slots=True)
 class Outlets:
     """What an engine hands to its handlers.

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 from router.compiler.books import Books
 from router.engine import Report
-from router.engine.binding import Outlets, unguarded
+from router.engine.binding import Guarded, Outlets
 
 
 def plain_outlets(
@@ -20,6 +20,7 @@ def plain_outlets(
 ) -> Outlets:
     """Everybody listens on every topic, the clocks stand still, and no deadman ever trips."""
     counts = books.fresh_counts() if counts is None else counts
+    unguarded = Guarded(counts, lambda _, call: call)
     return Outlets(
         counts=counts,
         send=send,
@@ -28,8 +29,8 @@ def plain_outlets(
         report=report,
         clock_ns=lambda: 0,
         wall_ns=lambda: wall_ns,
-        pacing=unguarded(counts),
-        collecting=unguarded(counts),
+        pacing=unguarded,
+        collecting=unguarded,
         feed=lambda *_: lambda _: None,
         publish_errors=publish_errors,
     )
