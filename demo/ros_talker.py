@@ -7,15 +7,16 @@ It commands the boards for some seconds, then leaves them to the operator.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
+import signal
 import sys
+import threading
 from pathlib import Path
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
 
 from demo.expected import command_topics, outbound_topics
 from demo.ros_messages import filled, message_class
@@ -31,28 +32,27 @@ ANY_SUBSCRIBER = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCA
 """Reliable and kept: what a subscriber may ask for at most."""
 
 
-def talk(node: Node, topics: dict[str, str], commands: set[str]) -> None:
-    """From now on one message on each topic in every INTERVAL, on those of `commands` while COMMANDING."""
+def talk(node: Node, topics: dict[str, str], commands: set[str], ended: threading.Event) -> None:
+    """One message on each topic in every INTERVAL, on those of `commands` while COMMANDING."""
     classes = {topic: message_class(name) for topic, name in topics.items()}
     publishers = {topic: node.create_publisher(kind, topic, ANY_SUBSCRIBER) for topic, kind in classes.items()}
-    numbers = itertools.count()
-
-    def publish() -> None:
-        number, stamp = next(numbers), node.get_clock().now().to_msg()
+    for number in itertools.count():
+        stamp = node.get_clock().now().to_msg()
         for topic, publisher in publishers.items():
             if topic not in commands or number * INTERVAL < COMMANDING:
                 publisher.publish(filled(classes[topic], number, stamp))
-
-    node.create_timer(INTERVAL, publish)
+        if ended.wait(INTERVAL):
+            return
 
 
 def main() -> int:
     table = read_table(Path(sys.argv[1]))
-    rclpy.init()
+    ended = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ended.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # which would end ROS between two publishers
     node = rclpy.create_node("demo_talker", namespace=table.node.namespace)
-    talk(node, outbound_topics(table), command_topics(table))
-    with contextlib.suppress(ExternalShutdownException):  # which is how SIGTERM ends it
-        rclpy.spin(node)
+    talk(node, outbound_topics(table), command_topics(table), ended)
+    rclpy.shutdown()
     return 0
 
 
