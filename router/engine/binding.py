@@ -105,14 +105,14 @@ def _collect(handler: Handler, timeout: int, books: Books, outlets: Outlets) -> 
 
 def _deliver(target: TargetPlan, outcome: Outcome, outlets: Outlets) -> Deliver:
     """Through what holds the target's messages back, to where they go and are counted."""
-    guard, pacer = outlets.pacing.guard, None if target.is_topic else outlets.pacers.get(target.target)
+    guard = outlets.pacing.guard
+    pacer = None if target.is_topic else outlets.pacers.get(target.target)
     if pacer is not None:
         deliver = pacer.queue(target.priority, outcome)
+    elif target.is_topic:
+        deliver = immediately(outlets.publish[target.target], outcome, outlets.publish_errors)
     else:
-        hand_over: Callable[[bytes], object] = (
-            outlets.publish[target.target] if target.is_topic else outlets.send[target.target]
-        )
-        deliver = immediately(hand_over, outcome, (OSError, *outlets.publish_errors))
+        deliver = immediately(outlets.send[target.target], outcome)
     if target.keep is Keep.LATEST and target.max_rate is not None:
         latest = Latest(target.max_rate, deliver, outcome)
         return guard(latest, latest.offer)
