@@ -17,6 +17,7 @@ from router.compiler import Checked, check_table
 from router.compiler.books import Books
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
+from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.link import compile_handlers
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
@@ -63,7 +64,7 @@ def _explained(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
     route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
     assert table is not None  # noqa: S101 - a table without errors is one
     assert envelope is not None  # noqa: S101 - and has one
-    yield f"{route.name}: {case.type.name}, field {case.number} of {envelope.name}  ({route.case.span})"
+    yield f"{route.name}: {case.type.name}, field {case.number} of {envelope.name}  ({route.span})"
     if case.max_size is not None:
         datagram = framed_size(case.number, case.max_size)
         yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
@@ -90,19 +91,19 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
     """What holds for the whole route."""
     route, deadman = checked.route, checked.deadman
     if route.ttl is not None:
-        yield f"  dropped when older than {_milliseconds(route.ttl.value)}"
+        yield f"  dropped when older than {_duration(route.ttl.value)}"
     if route.for_each is not None:
         yield f"  one datagram for each of {route.for_each.text}"
     if route.collect is not None:
         collect = route.collect
         yield (
             f"  frames by {collect.by.text}, of {collect.count.text} datagrams in the order of {collect.order.text}, "
-            f"complete within {_milliseconds(collect.timeout.value)}"
+            f"complete within {_duration(collect.timeout.value)}"
         )
     if deadman is not None:
         yield (
             f"  deadman: {deadman.case.name} to {', '.join(deadman.to)} when no command came for "
-            f"{_milliseconds(deadman.timeout)}, again every {_milliseconds(deadman.repeat)}"
+            f"{_duration(deadman.timeout)}, again every {_duration(deadman.repeat)}"
         )
         if deadman.hands_over_to:
             yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
@@ -118,8 +119,8 @@ def _source(name: str, table: RouteTable) -> str:
     return f"{name} ({endpoint.address.value.host}{port})"
 
 
-def _milliseconds(ns: int) -> str:
-    return f"{ns / 1e6:g} ms"
+def _duration(ns: int) -> str:
+    return f"{ns / 1e9:g} s" if ns >= NS_PER_SECOND else f"{ns / 1e6:g} ms"
 
 
 def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:

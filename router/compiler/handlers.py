@@ -31,7 +31,7 @@ class HandlerSource:
     def __init__(self, route: Route, case: PayloadCase, books: Books) -> None:
         self.route = route
         self.books = books
-        self.span = route.case.span
+        self.span = route.span
         self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
         self._serving = ServingSource(self.out, route, case, books)

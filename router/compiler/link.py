@@ -116,7 +116,7 @@ def compile_handlers(checked: CheckedRoute, table: RouteTable, books: Books) -> 
         for source in sources:
             books.slot("messages_received", route.name, source_label(source))
         spans = [served.target.span for served in checked.targets if served.topic]
-        yield _handler(generator, checked, (spans or [route.case.span])[0].file, frozenset(sources), None)
+        yield _handler(generator, checked, (spans or [route.span])[0].file, frozenset(sources), None)
     for feed in checked.feeds:
         generator = HandlerSource(route, case, books)
         generator.outbound(feed)

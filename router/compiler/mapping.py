@@ -54,7 +54,7 @@ def build(
 
     `auto` takes fields of `whole`, of the source message where that is None.
     """
-    builder = _Builder(scope, fields.span if fields else span)
+    builder = _Builder(scope, fields.span if fields else span, "item." if whole else "")
     given = builder.sort(fields.entries if fields else (), target)
     automatic = (whole or scope.whole_message(span)) if fields and fields.auto else None
     plan = builder.record(given, automatic, "")
@@ -68,11 +68,15 @@ def build(
 
 
 class _Builder:
-    """One mapping. `automatic` is everywhere the message whose fields fill those of the same name, if one does."""
+    """One mapping. `automatic` is everywhere the message whose fields fill those of the same name, if one does.
 
-    def __init__(self, scope: Scope, span: SourceSpan) -> None:
+    `origin` leads to these fields in what a person reads: `item.`, or nothing where they are the source message's.
+    """
+
+    def __init__(self, scope: Scope, span: SourceSpan, origin: str) -> None:
         self.scope = scope
         self.span = span
+        self.origin = origin
         self.rows: list[Row] = []
         self.findings: list[Diagnostic] = []
 
@@ -157,7 +161,7 @@ class _Builder:
             message = f"auto cannot fill '{path}': {found.message}"
             self.findings.append(Diagnostic(self.span, found.code, message, f"map '{path}' by hand: {found.hint}"))
             return unset(member, self.span)
-        self.rows.append(Row(path, str(member.type), path, str(source.kind), automatic=True))
+        self.rows.append(Row(path, str(member.type), self.origin + path, str(source.kind), automatic=True))
         return plan
 
 

@@ -25,10 +25,10 @@ def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRo
     name = route.name
     if not route.topics:
         message = f"'{name}' comes from ROS, but from no topic"
-        lookup.report(route.case.span, Code.NO_TARGET, message, "name it under 'topics'")
+        lookup.report(route.span, Code.NO_TARGET, message, "name it under 'topics'")
     if route.topics and not route.destinations:
         message = f"'{name}' goes to no destination"
-        lookup.report(route.case.span, Code.NO_TARGET, message, "name it under 'destinations'")
+        lookup.report(route.span, Code.NO_TARGET, message, "name it under 'destinations'")
     found = destinations(lookup, route, case)
     feeds = []
     for topic in route.topics:
@@ -66,12 +66,13 @@ def _feed(
             return None
         scope = lookup.scope(ros_type, reads, ros_type, _element_names(for_each))
     when = lookup.when(topic.when, scope)
+    own = any(destination.fields for destination, _ in found)  # then the route need not have any
     targets = []
     for destination, endpoint in found:
         condition = lookup.when(destination.when, scope)
-        fields = destination.fields or route.fields
-        whole = scope.variable("item", route.case.span) if for_each else None
-        mapping = build(fields, case.type, scope, route.case.span, whole)
+        fields = destination.fields or route.fields or topic.fields  # the last are misplaced, but meant
+        whole = scope.variable("item", route.span) if for_each else None
+        mapping = build(fields, case.type, scope, destination.span if own else route.span, whole)
         lookup.findings += mapping.findings
         target = target_to(lookup, route, destination, endpoint, condition, plan=mapping.plan)
         targets.append(CheckedTarget(target, rows=tuple(mapping.rows)))

@@ -58,7 +58,7 @@ class RouteChecker:
         self._sources(route)
         if not route.destinations and not route.topics:
             message, hint = f"'{route.name}' goes nowhere", "name destinations or topics, or say `ignore: reason`"
-            self.lookup.report(route.case.span, Code.NO_TARGET, message, hint)
+            self.lookup.report(route.span, Code.NO_TARGET, message, hint)
         for topic in route.topics:
             found = (topic_name_finding(topic), *qos_findings(topic, publishes=not route.is_outbound))
             self.lookup.findings += [finding for finding in found if finding]

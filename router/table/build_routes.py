@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+from router.errors import SourceSpan
 from router.table.build_fields import constants, expression, fields, optional_expression
-from router.table.build_targets import destination, topic
+from router.table.build_targets import destination, item_span, topic
 from router.table.model import Collect, Deadman, Located, Priority, Route
 from router.table.nodes import Entry, MappingNode, ScalarNode, SequenceNode
 from router.table.reading import duration, items, located, mapping, needed_duration, optional_text
@@ -20,8 +21,10 @@ DEFAULT_REPEAT = 100_000_000
 
 def build_case(entry: Entry) -> tuple[Route, ...]:
     """The routes of one payload case, all named after the case so far."""
-    written = entry.value.items if isinstance(entry.value, SequenceNode) else (entry.value,)
-    return tuple(_route(entry.key, mapping(node)) for node in written)
+    if not isinstance(entry.value, SequenceNode):
+        return (_route(entry.key, mapping(entry.value), entry.key.span),)
+    listed = map(mapping, entry.value.items)
+    return tuple(_route(entry.key, settings, item_span(settings)) for settings in listed)
 
 
 def named(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
@@ -49,7 +52,7 @@ def _free(name: str, taken: set[str]) -> str:
     return free
 
 
-def _route(case: ScalarNode, settings: MappingNode) -> Route:
+def _route(case: ScalarNode, settings: MappingNode, span: SourceSpan) -> Route:
     source = settings.get("source")
     names = source.items if isinstance(source, SequenceNode) else (source,) if source else ()
     deadman = settings.entries.get("deadman")
@@ -57,6 +60,7 @@ def _route(case: ScalarNode, settings: MappingNode) -> Route:
     is_reason = deadman is not None and isinstance(deadman.value, ScalarNode)
     return Route(
         name=case.text,
+        span=span,
         case=Located(case.text, case.span),
         sources=tuple(map(located, names)),
         destinations=tuple(map(destination, items(settings, "destinations"))),

@@ -19,7 +19,7 @@ def destination(node: Node) -> Destination:
     settings = mapping(node)
     return Destination(
         endpoint=text(settings, "endpoint"),
-        span=_item_span(settings),
+        span=item_span(settings),
         when=optional_expression(settings, "when"),
         max_rate=_max_rate(settings),
         keep=_keep(settings),
@@ -32,7 +32,7 @@ def topic(node: Node) -> Topic:
     return Topic(
         topic=text(settings, "topic"),
         type=text(settings, "type"),
-        span=_item_span(settings),
+        span=item_span(settings),
         queue_depth=integer(settings, "queue_depth"),
         qos=_qos(settings.entries.get("qos")),
         when=optional_expression(settings, "when"),
@@ -42,7 +42,7 @@ def topic(node: Node) -> Topic:
     )
 
 
-def _item_span(settings: MappingNode) -> SourceSpan:
+def item_span(settings: MappingNode) -> SourceSpan:
     """A mapping in a list has no key of its own; its first key stands for it."""
     return next(iter(settings.entries.values())).key.span
 

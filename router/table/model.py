@@ -219,6 +219,7 @@ ROS = "ros"
 class Route:
     """What happens to one payload case, or to that part of it that comes from certain sources.
 
+    `span` is the payload case in the table, of a route in a list its first key.
     `name` tells the routes of a table apart, in metrics and log: the payload case, or where a case has
     several routes `imu_info_from_ros`. `ignore` holds the reason of a case that goes nowhere. `sources` are endpoint
     names, or just `any`, or just `ros`. `fields` and `for_each` belong to `source: ros`, `collect` to others.
@@ -226,6 +227,7 @@ class Route:
     """
 
     name: str
+    span: SourceSpan
     case: Located[str]
     sources: tuple[Located[str], ...]
     destinations: tuple[Destination, ...]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from router.assets import asset
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 
 BASE = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
@@ -54,6 +56,18 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
         "    data  float32  <-  accel_x * 2  : float32\n"
         "\n"
     )
+
+
+def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_element(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rover = asset("routes/rover.yaml")
+    told = explained(capsys, rover, "detected_object", "--no-code")
+    places = re.findall(r"^detected_object_from_ros\w*: .*:(\d+):7\)$", told, re.MULTILINE)
+    written = rover.read_text(encoding="utf-8").splitlines()
+    assert [written[int(line) - 1].strip() for line in places] == ["- source: ros"] * 2
+    assert re.search(r"^    id +uint32 +<-  item\.id +: uint32 +auto$", told, re.MULTILINE)
+    assert re.search(r"^    index +uint32 +<-  index +: uint32$", told, re.MULTILINE)
 
 
 def test_the_code_that_runs_is_shown(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
