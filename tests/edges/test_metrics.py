@@ -29,6 +29,7 @@ LABELS = {
     "topic": "imu_data",
     "target": "imu_data",
     "endpoint": "sensor_board",
+    "policy": "reliability",
 }
 BUILD = {"version": "1", "table_sha256": "aa", "protos_sha256": "bb"}
 
@@ -90,6 +91,15 @@ def test_a_gauge_is_the_latest_of_all_threads_in_seconds(scraped: Scraped) -> No
     for counts, value in zip(scraped.threads, (1_500_000_000, 2_500_000_000), strict=True):
         counts[scraped.slots["endpoint_last_seen_timestamp_seconds"]] = value
     assert scraped.value("router_endpoint_last_seen_timestamp_seconds") == 2.5
+
+
+def test_a_number_is_exported_as_the_thread_that_knows_it_left_it(scraped: Scraped) -> None:
+    scraped.threads[1][scraped.slots["qos_incompatible"]] = 2
+    assert scraped.value("router_qos_incompatible") == 2
+    scraped.threads[0][scraped.slots["deadman_active"]] = 1
+    assert scraped.value("router_deadman_active") == 1
+    scraped.threads[0][scraped.slots["deadman_active"]] = 0
+    assert scraped.value("router_deadman_active") == 0
 
 
 def test_kernel_drops_are_asked_for_at_each_scrape(scraped: Scraped) -> None:
