@@ -37,6 +37,9 @@ endpoints:
 {endpoints}"""
 """The rover's table with loopback addresses, to be filled in by `Site.table`."""
 
+IMPATIENT_ROVER = ROVER.replace("tests/acceptance/patient.yaml", "routes/rover.yaml")
+"""With the rover's own times for what is stale, and for its deadmen."""
+
 
 SO_MEMINFO = 55
 """Of Linux; word 8 of what it tells are the datagrams dropped."""
