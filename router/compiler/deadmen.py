@@ -60,8 +60,9 @@ def _want_deadman(lookup: Lookup, route: Route) -> None:
 
 def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
     if not route.destinations:
-        message = f"'{route.case.value}' goes to no destination, so there are no commands that could stop coming"
-        lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "a deadman belongs to a route with destinations")
+        if route.topics:
+            message = f"'{route.case.value}' goes to no destination, so there are no commands that could stop coming"
+            lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "a deadman belongs to a route with destinations")
         return
     rates = [destination.max_rate for destination in route.destinations]
     limited = [rate.value for rate in rates if rate is not None]

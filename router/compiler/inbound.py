@@ -61,7 +61,7 @@ def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Typed]:
 
 
 def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) -> CheckedCollect | None:
-    if not route.topics:
+    if not route.topics and route.destinations:
         message = "'collect' puts frames together for topics, and there are none"
         lookup.report(collect.span, Code.UNKNOWN_KEY, message, "destinations get each datagram as it came")
     reads = ParsedReads()

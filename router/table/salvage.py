@@ -17,7 +17,7 @@ _INDISPENSABLE = frozenset(
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"})
 """Keys with which it says something, whatever else it lacks or has too much."""
 
-_USES_NAMES_OF = {"for_each": ("fields", "destinations"), "collect": ("topics",)}
+_USES_NAMES_OF = {"for_each": ("fields", "destinations", "topics"), "collect": ("topics",)}
 """Where a route's expressions use names (`item`, `items`) that there are only with this key."""
 
 
