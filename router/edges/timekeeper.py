@@ -39,7 +39,7 @@ class Timekeeper:
                 self._machines.append(machine)
 
     def guard(self, machine: Machine, call: Callable[P, R], /) -> Callable[P, R]:
-        """Adds `machine`, and returns `call`, one of its methods, as other threads may call it."""
+        """Adds `machine`, and returns `call`, which uses it, as other threads may call it."""
         self.add(machine)
         lock, machines = self._lock, self._machines
 

@@ -117,7 +117,8 @@ class Deadman:
 def feeder(deadmen: Mapping[str, Deadman], guard: Guard) -> Callable[[str, Sequence[str]], Feed]:
     """Makes of a route's name, and of the names in TargetPlan.deadmen, the call that tells all these deadmen at once.
 
-    `deadmen` are by route. `guard` makes the call safe: it has one lock for all of them.
+    `deadmen` are by route. `guard` makes the call safe: it has one lock for all of them. Each is served from when its
+    own route's call was made.
     """
 
     def feed(route: str, told: Sequence[str]) -> Feed:

@@ -29,6 +29,6 @@ class Machine(Protocol):
 
 
 class Guard(Protocol):
-    """Has `machine` served from now on, and returns `call`, one of its methods, as others may call it meanwhile."""
+    """Has `machine` served from now on, and returns `call`, which uses it, as others may call it meanwhile."""
 
     def __call__(self, machine: Machine, call: Callable[P, R], /) -> Callable[P, R]: ...
