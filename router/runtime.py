@@ -166,17 +166,6 @@ class Router:
         except ImportError as error:
             remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
             raise StartError(f"{table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
-        routes: dict[str, list[str]] = {}
-        for route in table.routes:
-            for topic in route.topics:
-                routes.setdefault(topic.topic.value, []).append(route.name)
-
-        counts = self._fresh_counts()
-
-        def incompatible(topic: str, policy: str, peers: int) -> None:
-            for route in routes[topic]:
-                counts[program.books.slot("qos_incompatible", route, topic, policy)] = peers
-
         spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
         ros = RosEdge(
             table.node,
@@ -184,10 +173,24 @@ class Router:
             program.subscriptions,
             spans,
             self._ros_args,
-            incompatible,
+            self._incompatible(),
         )
         opening.callback(ros.close)
         return ros
+
+    def _incompatible(self) -> Callable[[str, str, int], None]:
+        """What counts the peers on a topic that one policy keeps away, for each route that names the topic."""
+        books, counts = self.program.books, self._fresh_counts()
+        routes: dict[str, list[str]] = {}
+        for route in self.program.table.routes:
+            for topic in route.topics:
+                routes.setdefault(topic.topic.value, []).append(route.name)
+
+        def incompatible(topic: str, policy: str, peers: int) -> None:
+            for route in routes[topic]:
+                counts[books.slot("qos_incompatible", route, topic, policy)] = peers
+
+        return incompatible
 
     def _deadmen(self, send: Mapping[str, Callable[[bytes], int]], reporter: Reporter) -> dict[str, Deadman]:
         """By route."""
@@ -202,7 +205,7 @@ class Router:
             plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in self.program.senders if plan.budget
         }
         for pacer in pacers.values():
-            keeper.add(pacer)
+            keeper.add(pacer)  # before what hands on to it, so that it is ended after that
         return pacers
 
     def _open_metrics(self, opening: ExitStack) -> None:
