@@ -6,6 +6,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
@@ -39,6 +40,15 @@ routes:
     source: sensor_board
     destinations: [basestation]
 """
+TURNS = """\
+  manual_drive:
+    source: sensor_board
+    destinations: [basestation]
+    deadman:
+      {timeout: 20ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 10ms, hands_over_to: [ph_info]}
+"""
+DRIVE = bytes.fromhex("c201021005")  # turn 5
+BRAKE = bytes.fromhex("ca01020801")
 TOPIC = """\
     topics:
       - {topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}
@@ -120,6 +130,25 @@ def test_what_has_arrived_is_routed_before_the_router_stops(site: Site) -> None:
         site.send(*[PH] * 100)
     assert router.totals()["datagrams_sent"] == 100
     assert [site.basestation.recv(1000) for _ in range(100)] == [PH] * 100
+
+
+def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> None:
+    with capture_logs() as logged, Router(site.program(TURNS)) as router:
+        site.send(DRIVE)
+        while (received := site.basestation.recv(1000)) != BRAKE:
+            assert received == DRIVE
+        site.send(PH)
+        while (received := site.basestation.recv(1000)) != PH:
+            assert received == BRAKE
+        time.sleep(0.1)  # ten repeats, had it gone on
+        site.send(PH)
+        assert site.basestation.recv(1000) == PH
+        assert (router.total("deadman_active"), router.total("deadman_trips")) == (0, 1)
+    told = [entry["event"] for entry in logged if entry.get("route") == "manual_drive"]
+    assert told == [
+        "commands stopped coming: the deadman sends in their place",
+        "commands come again: the deadman is released",
+    ]
 
 
 def test_metrics_are_served_while_it_runs(site: Site) -> None:
