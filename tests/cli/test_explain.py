@@ -70,6 +70,20 @@ def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_ele
     assert re.search(r"^    index +uint32 +<-  index +: uint32$", told, re.MULTILINE)
 
 
+def test_a_hand_over_is_told_on_both_sides(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    says = "deadman: {timeout: 500ms, send: {arm_ctrl: {}}, to: [laptop], hands_over_to: [imu_info]}"
+    with table.open("a") as more:
+        more.write(f"  arm_ctrl:\n    source: basestation\n    destinations: [laptop]\n    {says}\n")
+    assert (
+        "  deadman: arm_ctrl to laptop when no command came for 500 ms, again every 100 ms\n"
+        "    disarmed by commands of imu_info\n"
+    ) in explained(capsys, table, "arm_ctrl")
+    code = explained(capsys, table, "imu_info")
+    assert f"({table}:6:34)\n    disarms the deadman of arm_ctrl\n" in code
+    assert code.count("feed_laptop(now)") == 1
+    assert "feed_basestation" not in code
+
+
 def test_the_code_that_runs_is_shown(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "\ndef route_imu_info(" in explained(capsys, table, "imu_info")
 
