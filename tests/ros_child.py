@@ -13,8 +13,8 @@ from collections.abc import Callable
 from typing import TextIO
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.task import Future
 
 
 class RosProcess:
@@ -53,13 +53,14 @@ def own_stdout() -> TextIO:
 def spin_until_stdin_ends(node: Node, heard: Callable[[str], None] = lambda _: None) -> None:
     """Each line from standard input goes to `heard`, on a thread of its own."""
 
+    ended: Future[None] = Future()
+
     def listen() -> None:
         for line in sys.stdin:
             heard(line.strip())
-        rclpy.shutdown()
+        ended.set_result(None)  # not rclpy.shutdown(): it would pull the context from under the thread that spins
 
     threading.Thread(target=listen, daemon=True).start()
-    try:
-        rclpy.spin(node)
-    except ExternalShutdownException:
-        node.destroy_node()
+    rclpy.spin_until_future_complete(node, ended)
+    node.destroy_node()
+    rclpy.shutdown()
