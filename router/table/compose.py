@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import yaml
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, cut_off
 from router.table.places import TextPlace, locate
 from router.table.scalars import resolve, surprise
 from router.table.source import Source, unusable_character
@@ -157,11 +157,15 @@ class _Composer:
             return SequenceNode(collection.span, tuple(collection.children), collection.broken)
         entries: dict[str, Entry] = {}
         broken = collection.broken
-        for key, value in zip(collection.children[::2], collection.children[1::2], strict=True):
+        pairs = list(zip(collection.children[::2], collection.children[1::2], strict=True))
+        rests = set(cut_off((key.text, value) for key, value in pairs if isinstance(key, ScalarNode)))
+        for key, value in pairs:
             if not isinstance(key, ScalarNode):
                 broken = self._report(key.span, "a key must be a word, not a mapping or a sequence", "")
             elif key.text == "<<" and key.value == "<<":
                 broken = self._report(key.span, "merge keys ('<<') have no place in a table", "write the keys out")
+            elif key.text in entries and key.text in rests:
+                continue  # what the comma cut off has a finding already
             elif key.text in entries:
                 first = entries[key.text].key.span
                 what = f"the key '{key.text}' is already in this mapping, at line {first.line}"

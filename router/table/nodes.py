@@ -5,7 +5,7 @@ Knows no key and no meaning. `broken` marks what already has a finding, so that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Union
 
@@ -59,6 +59,21 @@ class MappingNode:
 
 
 Node = Union[ScalarNode, SequenceNode, MappingNode]
+
+
+def cut_off(pairs: Iterable[tuple[str, Node]]) -> Iterator[str]:
+    """The keys that are none: `b)` of `{x: max(a, b)}`, where the comma ends the value of `x`."""
+    opened = 0
+    rests: list[str] = []
+    for key, value in pairs:
+        if not isinstance(value, ScalarNode) or value.text:
+            text = value.text if isinstance(value, ScalarNode) else ""
+            opened, rests = text.count("(") - text.count(")"), []
+        elif opened > 0:
+            opened += key.count("(") - key.count(")")
+            rests.append(key)
+            if opened == 0:
+                yield from rests
 
 
 def to_data(node: Node) -> object:

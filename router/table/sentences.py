@@ -26,7 +26,8 @@ _TYPES = {
 }
 _LONGEST = 60
 _NAME_DEPTH = len(("endpoints", "name"))
-_NAME_FIELDS = ("fields", "send")
+NAME_FIELDS = ("fields", "send")
+"""Keys under which the names of fields stand, each with an expression."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +121,7 @@ def _bad_name(misfit: Misfit, span: SourceSpan) -> Diagnostic:
 
 def _is_chosen(path: Path) -> bool:
     """The key at the path is a name that a person gave, not one of the keys that others of their mapping rule out."""
-    return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in _NAME_FIELDS)
+    return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in NAME_FIELDS)
 
 
 def _missing_key(misfit: Misfit, tree: Node) -> Diagnostic:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
 from router.errors import Code, Diagnostic, did_you_mean, nearest
-from router.table.nodes import Entry, MappingNode, Node, Path, key_at, node_at, rewritten, to_data
-from router.table.sentences import Misfit, finding, subject
+from router.table.nodes import Entry, MappingNode, Node, Path, cut_off, key_at, node_at, rewritten, to_data
+from router.table.sentences import NAME_FIELDS, Misfit, finding, subject
 
 if TYPE_CHECKING:
     from jsonschema.protocols import Validator
@@ -43,8 +43,11 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
             repairs[misfit.path] = functools.partial(_with_known_keys, known=known)
         tree = rewritten(tree, repairs)
         misfits = _misfits(tree)
+    rests = {misfit.path for misfit in misfits if _is_rest(tree, misfit.path)}
+    misfits = [misfit for misfit in misfits if misfit.path not in rests]
     findings.extend(finding(misfit, tree) for misfit in misfits if not _is_broken(tree, misfit.path))
     tree = rewritten(tree, {misfit.path: _as_broken for misfit in misfits})
+    tree = rewritten(tree, {path[:-1]: _without_rests for path in rests})
     if not isinstance(tree, MappingNode):
         raise TypeError("a table's root stays a mapping")
     return tree
@@ -83,6 +86,23 @@ def _as_broken(node: Node) -> Node:
 def _is_broken(tree: Node, path: Path) -> bool:
     key = key_at(tree, path)
     return node_at(tree, path).broken or (key is not None and key.broken)
+
+
+def _is_rest(tree: Node, path: Path) -> bool:
+    """There is no value because there is no key: a comma cut it off an expression, which will have a finding."""
+    siblings = node_at(tree, path[:-1]) if any(name in path[:-1] for name in NAME_FIELDS) else None
+    return isinstance(siblings, MappingNode) and path[-1] in _rests(siblings)
+
+
+def _without_rests(node: Node) -> Node:
+    if not isinstance(node, MappingNode):
+        raise TypeError("only a mapping has keys")
+    rests = _rests(node)
+    return replace(node, entries={name: entry for name, entry in node.entries.items() if name not in rests})
+
+
+def _rests(node: MappingNode) -> set[str]:
+    return set(cut_off((name, entry.value) for name, entry in node.entries.items()))
 
 
 def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnostic]:

@@ -276,6 +276,6 @@ def test_expressions_are_left_out_with_what_gives_them_their_names(tmp_path: Pat
     assert len(findings) == 2
     assert table
     each = route(table, "detected_object_from_ros")
-    assert (each.for_each, each.fields, each.destinations, len(each.topics)) == (None, None, (), 1)
+    assert (each.for_each, each.fields, each.destinations, each.topics) == (None, None, (), ())
     together = route(table, "detected_object_from_basestation")
     assert (together.collect, together.topics) == (None, ())
