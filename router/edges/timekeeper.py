@@ -2,14 +2,44 @@
 
 from __future__ import annotations
 
+import os
+import select
+import sys
 import threading
 from collections.abc import Callable
 
 from router.engine.machine import Machine, P, R
 
-_NEVER = int(threading.TIMEOUT_MAX * 1e9)
+_NEVER = 1 << 63
+_LONGEST_WAIT_MS = 3_600_000
 _RETRY = 100_000_000
 """ns from a machine's failure until it is called again, lest a fault that stays keeps a processor busy."""
+
+
+class _Alarm:
+    """What a thread waits for: that another one rings, or that some time has passed.
+
+    As threading.Condition, but the time is monotonic for certain. Python's locks count it by the wall clock where
+    Python was built for a C library older than glibc 2.30, as many portable builds are; with a clock that is set back
+    by an hour, a deadman that waits for one would be silent for an hour.
+    """
+
+    def __init__(self) -> None:
+        self._rung = os.fdopen(os.eventfd(0), "r+b", buffering=0)
+        self._poll = select.poll()
+        self._poll.register(self._rung, select.POLLIN)
+
+    def wait(self, nanoseconds: int) -> None:
+        """Never ends early unless somebody rings, or has rung since the last wait; or after an hour."""
+        if self._poll.poll(min(max(0, nanoseconds) / 1e6, _LONGEST_WAIT_MS)):
+            self._rung.read(8)
+
+    def ring(self) -> None:
+        self._rung.write((1).to_bytes(8, sys.byteorder))
+
+    def close(self) -> None:
+        """Nobody may wait or ring any more; closing again changes nothing."""
+        self._rung.close()
 
 
 class Timekeeper:
@@ -27,8 +57,8 @@ class Timekeeper:
         self._failed = failed
         self._machines: list[Machine] = []
         self._lock = threading.Lock()
-        self._sooner = threading.Condition(self._lock)
-        self._waits_until = _NEVER
+        self._alarm = _Alarm()
+        self._waits_until = 0  # while nobody waits
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=name)
 
@@ -52,7 +82,7 @@ class Timekeeper:
                         due = each.next_due
                         if due is not None and due < self._waits_until:
                             self._waits_until = due
-                            self._sooner.notify()
+                            self._alarm.ring()
 
         return guarded
 
@@ -63,8 +93,9 @@ class Timekeeper:
     def stop(self) -> None:
         """Ends the thread, and then the machines: those first that were added last and may hand on to earlier ones."""
         with self._lock:
-            self._stopping = True
-            self._sooner.notify()
+            if not self._stopping:
+                self._alarm.ring()
+            self._stopping, self._waits_until = True, 0
         if self._thread.ident is not None:  # it was started
             self._thread.join()
         with self._lock:
@@ -73,13 +104,16 @@ class Timekeeper:
                     machine.end(self._clock_ns())
                 except Exception as error:  # noqa: BLE001 nor may it keep another deadman from its last word
                     self._failed(error)
+        self._alarm.close()
 
     def _run(self) -> None:
-        with self._lock:
-            while not self._stopping:
+        while True:
+            with self._lock:
+                if self._stopping:
+                    return
                 # The last that was added first: it may hand on to earlier ones.
                 self._waits_until = min(map(self._serve, reversed(self._machines)), default=_NEVER)
-                self._sooner.wait((self._waits_until - self._clock_ns()) / 1e9)
+            self._alarm.wait(self._waits_until - self._clock_ns())
 
     def _serve(self, machine: Machine) -> int:
         """Calls the machine if it is due. Returns when to look at it again."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import queue
+import shutil
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from time import monotonic_ns
 
 import pytest
@@ -223,3 +227,39 @@ def test_stopping_ends_all_machines_whatever_one_of_them_raises(keeping: Keeping
     keeping.keeper.stop()
     assert [keeping.heard() for _ in range(3)] == ["latest ends", "broken ends", "pacer ends"]
     assert isinstance(keeping.failures.get_nowait(), LookupError)
+
+
+SET_BACK = """\
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <semaphore.h>
+#include <time.h>
+int sem_clockwait(sem_t *semaphore, clockid_t clock, const struct timespec *until) {
+    struct timespec later = {until->tv_sec + 3600, until->tv_nsec};
+    return ((int (*)(sem_t *, clockid_t, const struct timespec *))dlsym(RTLD_NEXT, __func__))(semaphore, clock, &later);
+}
+"""
+"""Python's locks as they are where they count by the wall clock, and that is set back by an hour while they wait."""
+
+
+def test_a_wall_clock_that_is_set_back_delays_nothing(tmp_path: Path) -> None:
+    """Nobody may set the clock of the machine for a test, so Python's locks are made to believe it."""
+    compiler, library = shutil.which("cc"), tmp_path / "set_back.so"
+    assert compiler
+    subprocess.run([compiler, "-shared", "-fPIC", "-x", "c", "-", "-o", library], input=SET_BACK, text=True, check=True)
+    waits = f"import {__name__} as tests; tests.wait_for_a_bell()"
+    environment = {**os.environ, "LD_PRELOAD": str(library), "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", waits], env=environment, timeout=2 * PATIENCE, check=True)
+
+
+def wait_for_a_bell() -> None:
+    """In a process of its own, without queues: they wait as locks do."""
+    with ExitStack() as stack:
+        keeping = Keeping(stack)
+        bell = Bell(keeping.rung)
+        bell.next_due = monotonic_ns() + 10 * MS
+        keeping.keeper.add(bell)
+        keeping.start()
+        deadline = monotonic_ns() + PATIENCE * 1000 * MS
+        while keeping.rung.empty():
+            assert monotonic_ns() < deadline, "it never rang"
