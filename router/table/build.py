@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar, Union
 
@@ -24,7 +25,7 @@ from router.table.model import (
     NodeSettings,
     RouteTable,
 )
-from router.table.nodes import Entry, MappingNode, is_sound
+from router.table.nodes import Entry, MappingNode, is_sound, marked_broken
 from router.table.reading import UnsoundError, boolean, integer, mapping, optional_text, text, text_or
 from router.table.salvage import sound_part
 from router.table.source import Source
@@ -111,11 +112,14 @@ class _Builder:
         if not (is_sound(entry.key) and is_sound(entry.value)):
             self.broken.add(name)
             sound = salvage(entry)
-        try:
-            return build(sound) if sound else None
-        except UnsoundError as error:
-            self._findings.append(error.diagnostic)
-            self.broken.add(name)
+        while sound:
+            try:
+                return build(sound)
+            except UnsoundError as error:
+                self._findings.append(error.diagnostic)
+                self.broken.add(name)
+                marked = replace(sound, value=marked_broken(sound.value, error.diagnostic.span))
+                sound = salvage(marked) if marked != sound else None
         return None
 
 

@@ -94,6 +94,18 @@ def is_sound(node: Node) -> bool:
     return not isinstance(node, SequenceNode) or all(map(is_sound, node.items))
 
 
+def marked_broken(node: Node, span: SourceSpan) -> Node:
+    """A copy of the tree in which what stands at `span` is broken."""
+    if node.span == span:
+        return replace(node, broken=True)
+    if isinstance(node, MappingNode):
+        marked = {key: replace(entry, value=marked_broken(entry.value, span)) for key, entry in node.entries.items()}
+        return replace(node, entries=marked)
+    if isinstance(node, SequenceNode):
+        return replace(node, items=tuple(marked_broken(item, span) for item in node.items))
+    return node
+
+
 def node_at(root: Node, path: Sequence[str | int]) -> Node:
     """The node at a path that exists."""
     for step in path:
