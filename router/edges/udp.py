@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import os
 import socket
 import struct
 from collections.abc import Callable
@@ -25,6 +26,10 @@ SIOCGSTAMPNS = 0x8907
 _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
 _MEMINFO_DROPS = 8
+
+_NETWORK_CHANGED = (errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL)
+"""What sending says: there was no network when the router started, there is none now, or this computer has no longer
+the address that the socket sends from."""
 
 
 class Listener:
@@ -141,6 +146,8 @@ def _careful_send(connected: socket.socket, address: Address) -> Callable[[bytes
     "Connection refused" is news about an earlier datagram, which was taken for sent. The kernel gives it
     instead of sending this one, so this one is sent now, and the error still raised: it stands for the
     loss of the earlier one. So one is counted as lost for one that is, and the books balance.
+
+    Where the network has changed, a socket of today is made of `connected` first.
     """
     send = connected.send
 
@@ -151,9 +158,17 @@ def _careful_send(connected: socket.socket, address: Address) -> Callable[[bytes
             send(data)
             raise
         except OSError as error:
-            if error.errno != errno.EDESTADDRREQ:
+            if error.errno not in _NETWORK_CHANGED:
                 raise
-            connected.connect(address)  # there was no network when the router started
+            _connect_anew(connected, address)
             return send(data)
 
     return careful_send
+
+
+def _connect_anew(connected: socket.socket, address: Address) -> None:
+    """As if it were opened now. Connecting alone would keep the local address that it has, which may have gone."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as fresh:
+        fresh.setblocking(False)
+        fresh.connect(address)
+        os.dup2(fresh.fileno(), connected.fileno(), inheritable=False)

@@ -273,6 +273,32 @@ def test_losses_are_counted_one_for_one(stack: ExitStack) -> None:
     assert outcomes == [4] + 9 * [0]  # the loss of the tenth would be told by an eleventh
 
 
+class _Displaced(socket.socket):
+    """A socket whose computer has lost the address that it sends from, or the network that it sent to."""
+
+    old_address: tuple[str, int] | None = None
+    error = errno.EINVAL
+
+    def send(self, data: bytes, flags: int = 0) -> int:  # type: ignore[override]
+        if self.getsockname() == self.old_address:
+            raise OSError(self.error, os.strerror(self.error))
+        return super().send(data, flags)
+
+
+@pytest.mark.parametrize("error", [errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL])
+def test_a_sender_gets_over_a_change_of_the_network(
+    stack: ExitStack, peer: socket.socket, monkeypatch: pytest.MonkeyPatch, error: int
+) -> None:
+    monkeypatch.setattr(socket, "socket", _Displaced)
+    sender = send_to(stack, Address(*peer.getsockname()))
+    assert isinstance(sender.socket, _Displaced)
+    sender.socket.old_address, sender.socket.error = sender.socket.getsockname(), error
+    for datagram in (b"first", b"second"):
+        assert sender.send(datagram) == len(datagram)
+        assert peer.recv(LIMIT) == datagram
+    assert not os.get_blocking(sender.socket.fileno())
+
+
 def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, peer: socket.socket) -> None:
     with pytest.raises(OSError, match="too long"):
         send_to(stack, Address(*peer.getsockname())).send(bytes(70000))
