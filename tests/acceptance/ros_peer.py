@@ -63,8 +63,9 @@ class RosPeer:
                 self._lines.put(json.loads(line))
 
     def receive(self) -> Arrival:
-        """The next message, whatever its topic; waits for it."""
-        line = self._lines.get(timeout=PATIENCE)
+        """The next message, whatever its topic; waits for it. That a topic has another publisher is no message."""
+        while "matched" in (line := self._lines.get(timeout=PATIENCE)):
+            pass
         return line["topic"], line["message"]
 
     def nothing_left(self) -> bool:
