@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
-from router.compiler.destinations import keep, recipient, takes_over
+from router.compiler.destinations import feeding, keep, recipient, takes_over
 from router.compiler.expressions import ParsedReads
 from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.lookup import Lookup
@@ -64,7 +64,7 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
             message = f"'{route.case.value}' goes to no destination, so there are no commands that could stop coming"
             lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "a deadman belongs to a route with destinations")
         return
-    rates = [destination.max_rate for destination in route.destinations]
+    rates = [destination.max_rate for destination in feeding(route, deadman)]
     limited = [rate.value for rate in rates if rate is not None]
     if len(limited) == len(rates) and deadman.timeout.value * max(limited) <= NS_PER_SECOND:
         message = f"it would trip between commands that `max_rate` holds down to {max(limited):g} Hz"

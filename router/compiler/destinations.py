@@ -10,7 +10,7 @@ from router.compiler.network import loop_finding
 from router.compiler.plan import Record
 from router.compiler.target import Target
 from router.errors import Code
-from router.table.model import Destination, Endpoint, EndpointKind, Keep, Located, Priority, Route, Topic
+from router.table.model import Deadman, Destination, Endpoint, EndpointKind, Keep, Located, Priority, Route, Topic
 from router.types.boards import board_findings
 from router.types.protobuf import PayloadCase
 
@@ -40,6 +40,15 @@ def recipient(lookup: Lookup, case: PayloadCase, name: Located[str], sources: Ab
     return endpoint
 
 
+def feeding(route: Route, deadman: Deadman) -> list[Destination]:
+    """The destinations that commands have to reach for a route's own deadman: those that it stops.
+
+    Where it stops others than the route commands, all of the route's.
+    """
+    stopped = {to.value for to in deadman.to}
+    return [each for each in route.destinations if each.endpoint.value in stopped] or list(route.destinations)
+
+
 def takes_over(route: Route, endpoint: str, other: Route) -> bool:
     """Whether a command of `route` to `endpoint` disarms the deadman of the `other` route."""
     deadman = other.deadman
@@ -63,7 +72,9 @@ def target_to(
     """The target that a destination becomes. Whatever goes to a board is a command where the route says nothing."""
     to_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
     name = destination.endpoint.value
-    others = [other.name for other in lookup.table.routes if takes_over(route, name, other)]
+    deadmen = [other.name for other in lookup.table.routes if takes_over(route, name, other)]
+    if route.deadman is not None and destination in feeding(route, route.deadman):
+        deadmen.insert(0, route.name)
     return Target(
         name=name,
         span=destination.span,
@@ -76,7 +87,7 @@ def target_to(
         has_budget=endpoint is not None and endpoint.budget is not None,
         trim=endpoint is not None and endpoint.trim_trailing_zeros,
         plan=plan,
-        deadmen=(*([route.name] if route.deadman else []), *others),
+        deadmen=tuple(deadmen),
     )
 
 

@@ -137,7 +137,8 @@ def test_payload_is_made_of_constants(check_text: CheckText, value: str) -> None
         ("{endpoint: board, max_rate: 10 Hz}", "100ms", True),
         ("{endpoint: board, max_rate: 10 Hz}", "101ms", False),
         ("{endpoint: board, max_rate: 10 Hz}, {endpoint: tool, max_rate: 2 Hz}", "101ms", False),
-        ("{endpoint: board, max_rate: 10 Hz}, tool", "10ms", False),
+        ("{endpoint: board, max_rate: 10 Hz}, tool", "10ms", True),  # what the tool gets is no command
+        ("board, {endpoint: tool, max_rate: 10 Hz}", "10ms", False),
     ],
 )
 def test_deadman_does_not_trip_by_itself(check_text: CheckText, destinations: str, timeout: str, trips: bool) -> None:

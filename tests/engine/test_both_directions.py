@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -347,3 +348,20 @@ def test_a_budget_holds_back_and_in_the_end_drops(rig: Rig) -> None:
     assert set(rig.dropped("ph_info", "slow")) == {"queue_full"}
     rig.pass_time(HOUR)
     rig.assert_books_balance()
+
+
+def test_a_command_that_reaches_only_others_than_the_deadman_stops_does_not_feed_it(tmp_path: Path) -> None:
+    routes = """\
+  manual_drive:
+    source: basestation
+    destinations: [{endpoint: driving_board, when: turn < 10}, recorder]
+    deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board]}
+"""
+    rig = Rig(program(tmp_path, routes))
+    rig.receive(enveloped(manual_drive={"turn": 1}), BASESTATION)
+    for _ in range(10):
+        rig.pass_time(50 * MS)
+        rig.receive(enveloped(manual_drive={"turn": 11}), BASESTATION)
+
+    assert rig.changes == [("manual_drive", True)]
+    assert rig.sent[-2:] == [("driving_board", BRAKE), ("recorder", enveloped(manual_drive={"turn": 11}))]
