@@ -50,17 +50,18 @@ class RosEdge:
             for plan in (*publishers, *subscriptions)
         }
         peers = PeerEvents(incompatible)
-        events: list[EventHandler] = []
+        of_publishers: list[EventHandler] = []
+        of_subscriptions: list[EventHandler] = []
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
             opening.callback(close_node, self._node)
             for plan in publishers:
                 with _refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be published"):
-                    events += self._open_publisher(plan, classes[plan.topic], peers, opening)
+                    of_publishers += self._open_publisher(plan, classes[plan.topic], peers, opening)
             for plan in subscriptions:
                 with _refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be subscribed to"):
-                    events += self._open_subscription(plan, classes[plan.topic], peers)
-            thread = EventThread(self._node, events)
+                    of_subscriptions += self._open_subscription(plan, classes[plan.topic], peers)
+            thread = EventThread(self._node, of_publishers, of_subscriptions)
             thread.start()
             opening.callback(thread.stop)
             self._open = opening.pop_all()

@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from rclpy.event_handler import EventHandler
 from rclpy.node import Node
 
+from router.edges.clock import monotonic_ns
 from router.edges.log import logger
 from router.edges.ros_wait import RawSubscription, WaitSet
 
 Receive = Callable[[bytes, int], None]
 
 LOOK_INTERVAL_NS = 1_000_000_000
-"""How long ROS may have been shut down by somebody else before that is noticed."""
+"""How long something may go unnoticed that ends no wait: events of subscriptions, and a shutdown by somebody else."""
 
 TURN = 32
 """Messages of one topic that are served before others have their turn."""
@@ -45,23 +46,42 @@ class _WaitThread(ABC):
 
 
 class EventThread(_WaitThread):
-    """Calls the callbacks of events when they happen."""
+    """Calls the callbacks of events: those of publishers when they happen, those of subscriptions at most 1 s later.
 
-    def __init__(self, node: Node, events: Sequence[EventHandler]) -> None:
-        super().__init__("ros events", WaitSet(node, events=events))
+    Nobody waits for the latter, because Fast DDS would end the wait for each message, and at once while one is there
+    that the other thread has not taken yet: two threads would fight for the interpreter just when there is no time.
+    """
+
+    def __init__(
+        self, node: Node, of_publishers: Sequence[EventHandler], of_subscriptions: Sequence[EventHandler]
+    ) -> None:
+        super().__init__("ros events", WaitSet(node, events=of_publishers))
+        self._looked_at = WaitSet(node, events=of_subscriptions)
         self._context = node.context
 
+    def stop(self) -> None:
+        super().stop()
+        self._looked_at.close()
+
     def _run(self) -> None:
+        look_at = 0
         while not self._stopping:
-            self._wait_set.wait(LOOK_INTERVAL_NS)  # nothing ends a wait when ROS is shut down
+            self._wait_set.wait(max(0, look_at - monotonic_ns()))
             if not self._context.ok():
                 logger.critical("ROS was shut down from outside the router: nothing can be published any more")
                 return
-            for event, status in self._wait_set.happened():
-                try:
-                    event.callback(status)
-                except Exception as error:  # noqa: BLE001 told loudly; the next event matters as much
-                    logger.critical("a fault in the router itself lost an event; please report it", exc_info=error)
+            self._serve(self._wait_set)
+            if (now := monotonic_ns()) >= look_at:
+                look_at = now + LOOK_INTERVAL_NS
+                self._looked_at.wait(0)
+                self._serve(self._looked_at)
+
+    def _serve(self, wait_set: WaitSet) -> None:
+        for event, status in wait_set.happened():
+            try:
+                event.callback(status)
+            except Exception as error:  # noqa: BLE001 told loudly; the next event matters as much
+                logger.critical("a fault in the router itself lost an event; please report it", exc_info=error)
 
 
 class MessageThread(_WaitThread):

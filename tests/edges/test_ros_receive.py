@@ -5,16 +5,19 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from time import sleep
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from rclpy.event_handler import EventHandler
 from structlog.testing import capture_logs
 
 from router.compiler.program import QosPlan, TopicPlan
 from router.edges.clock import wall_ns
 from router.edges.ros_threads import TURN
+from router.edges.ros_wait import WaitSet
 from router.errors import StartError
 from tests.edges.ros_opening import HELLO, RELIABLE, STRING, cdr, open_ros, string_topic
 from tests.edges.ros_publisher import Publisher
@@ -104,6 +107,26 @@ def test_late_joining_gets_what_was_kept_and_it_is_as_old_as_it_is() -> None:
             receiver.start()
             wait_until(lambda: receiver.of("greeting") == [HELLO])
         assert receiver.stamps[0] < sent_before
+
+
+def test_messages_that_nobody_has_taken_yet_leave_the_thread_of_events_asleep(
+    publisher: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Awake, it would fight for the interpreter with the thread that is behind with taking them."""
+    turns, happened = 0, WaitSet.happened
+
+    def counted(wait_set: WaitSet) -> Iterator[tuple[EventHandler, object]]:
+        nonlocal turns
+        turns += 1
+        return happened(wait_set)
+
+    with Receiver(string_topic()):  # which is not started
+        peer = publisher("greeting")
+        peer.publish([HELLO])
+        peer.await_receipt()
+        monkeypatch.setattr(WaitSet, "happened", counted)
+        sleep(0.5)
+    assert turns < 10
 
 
 def test_nothing_is_received_before_the_start_and_nothing_is_lost(publisher: Publish) -> None:
