@@ -34,10 +34,18 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> T
     if scope.holders(text):
         raise Finding(span, Code.TYPE_MISMATCH, f"'{text}' is an enum, not a value", f"name one: {text}.VALUE")
     known = [*scope.field_names(), *scope.given, *values]
-    hint = did_you_mean(text, known) or "only constants can stand here"
+    hint = _of_an_enum(text, scope) or did_you_mean(text, known) or "only constants can stand here"
     if isinstance(expected, String) and not nearest(text, known):
         hint = f"text has quotes of its own: \"'{text}'\""
     raise Finding(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
+
+
+def _of_an_enum(text: str, scope: Scope) -> str:
+    """A hint for an enum's value that stands without its enum; one of the message's own fields comes first."""
+    homes = [enum for enum in scope.enums if text in dict(enum.values)]
+    types = [member.type for member in scope.message.fields]
+    own = [home for home in homes if home in types] or homes
+    return f"did you mean '{own[0]}.{text}'?" if own else ""
 
 
 def _given(text: str, span: SourceSpan, scope: Scope) -> Typed:

@@ -16,6 +16,7 @@ from router.compiler.expressions.typed import Finding, Typed
 from router.compiler.kinds import (
     ANY_INT,
     BoolKind,
+    EnumKind,
     FloatKind,
     IntKind,
     Kind,
@@ -149,6 +150,14 @@ def comparison(ops: list[ast.cmpop], operands: Sequence[Typed], span: SourceSpan
     return Typed.at(span, BoolKind(), ast.Compare(first, ops, others))
 
 
+def _comparable_value(held: Typed, written: Typed) -> str:
+    """A hint where an enum meets the name of one of its values in quotes, else nothing."""
+    if not isinstance(held.kind, EnumKind) or not isinstance(written.node, ast.Constant):
+        return ""
+    enum, value = held.kind.enum, written.node.value
+    return f"did you mean {enum}.{value} without quotes?" if value in dict(enum.values) else ""
+
+
 def _want_comparable(op: ast.cmpop, left: Typed, right: Typed, span: SourceSpan) -> None:
     if isinstance(op, (ast.Is, ast.IsNot)):
         raise forbidden(op, span)
@@ -158,7 +167,9 @@ def _want_comparable(op: ast.cmpop, left: Typed, right: Typed, span: SourceSpan)
             raise Finding(right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}")
         other = right.kind.element
     if other is None or isinstance(left.kind, (MessageKind, ListKind)) or join(left.kind, other) is None:
-        raise Finding(span, Code.TYPE_MISMATCH, f"{left.kind} cannot be compared with {right.kind}")
+        message = f"{left.kind} cannot be compared with {right.kind}"
+        hint = _comparable_value(left, right) or _comparable_value(right, left)
+        raise Finding(span, Code.TYPE_MISMATCH, message, hint)
     if isinstance(op, (ast.Lt, ast.LtE, ast.Gt, ast.GtE)) and isinstance(left.kind, BoolKind):
         raise Finding(span, Code.TYPE_MISMATCH, "bools have no order", "use == or !=")
 
