@@ -5,7 +5,7 @@ Collects what is wrong with it. Knows neither which way a route goes nor what be
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from router.compiler.definitions import Definitions
@@ -64,7 +64,7 @@ class Lookup:
             self.findings += error.diagnostics
             return None
         if found is None:
-            hint = did_you_mean(name, self.definitions.interfaces.names())
+            hint = _ros_type_hint(name, self.definitions.interfaces.names())
             self.report(topic.type.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name}'", hint)
         return found
 
@@ -111,3 +111,12 @@ def nested_types(declared: Type) -> Iterable[MessageType]:
             found[current.name] = current
             waiting += [member.type for member in current.fields]
     return found.values()
+
+
+def _ros_type_hint(name: str, known: Collection[str]) -> str:
+    """Types of that name in whatever package, else what its package has, else where types come from."""
+    package, short = name.partition("/")[0], name.rpartition("/")[2]
+    namesakes = [full for full in known if full.rpartition("/")[2] == short]
+    siblings = [full for full in known if full.partition("/")[0] == package]
+    general = "neither schemas/ nor an installed package has it; types are written as in sensor_msgs/msg/Imu"
+    return did_you_mean(name, namesakes or siblings) or general
