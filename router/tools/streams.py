@@ -46,7 +46,7 @@ def parse_silence(text: str) -> Silence:
     """`basestation:5-8`, `manual_drive:5-` (for ever). Raises UsageError."""
     found = _SILENCE.fullmatch(text)
     if found is None:
-        raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8")
+        raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")
     return Silence(found["name"], float(found["start"]), float(found["end"] or "inf"))
 
 

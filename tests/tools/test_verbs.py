@@ -234,7 +234,7 @@ def test_sim_tells_when_a_board_stops_and_what_it_cannot_read(table_path: Callab
 
 def test_sim_explains_a_silence_that_it_does_not_understand(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--silent", "basestation"]) == 2
-    complaint = "'basestation' is not NAME:FROM-TO with seconds, such as basestation:5-8"
+    complaint = "'basestation' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-"
     assert capsys.readouterr().err == f"router sim: {complaint}\n"
 
 
