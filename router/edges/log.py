@@ -102,7 +102,7 @@ class _Flood:
 
 @dataclass(slots=True)
 class FloodLog:
-    """Writes the first event of a kind at once, then at most one line per 10 s with how many there were.
+    """Writes the first event of a kind at once, then at most one line per 10 s: the last one, and how many there were.
 
     Thread-safe. `flush()` has to be called now and then, so that the end of a flood is told as well.
     Beyond `MOST_KEYS` kinds, further ones share a summary.
@@ -121,6 +121,7 @@ class FloodLog:
                 flood = self._floods.get(None)
                 key, event, values = None, "events of many further kinds", {}
             if flood is not None:
+                flood.values = values
                 flood.pending += 1
                 if now - flood.last_line_ns >= SUMMARY_INTERVAL_NS:
                     _summarise(flood, now)

@@ -49,6 +49,13 @@ def test_a_flood_becomes_one_line_per_interval_with_a_count(lines: Lines) -> Non
     assert lines.written[1:] == [("drop", {"more": 1000, "in_seconds": 10.0, "route": "imu_info"})]
 
 
+def test_the_line_with_the_count_tells_of_the_last_event(lines: Lines) -> None:
+    for part in range(3):
+        lines.floods.note("drop", lines.emit, "drop", part=part)
+    lines.floods.flush(final=True)
+    assert [values["part"] for _, values in lines.written] == [0, 2]
+
+
 def test_kinds_are_told_apart(lines: Lines) -> None:
     lines.note("drop")
     lines.note("reject")
