@@ -21,6 +21,10 @@ Every series exists at 0 from the start. The books balance. Per listener, receiv
 target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames, the queue of a
 budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element is a message. What a
 deadman sends is in its own metrics alone, and its bytes in none."""
+_LOG = """\
+The log writes the first drop of a kind (route, target, reason) at once, then at most a line in 10 s. That line shows
+the last one, and how many there were: `more`, in the `in_seconds` before the line. So a flood may have ended when its
+last line comes; metrics are up to date."""
 
 
 def functions_page() -> str:
@@ -52,6 +56,8 @@ def metrics_page() -> str:
         "",
         *_reasons("router_datagrams_rejected_total", REJECT_REASONS),
         *_reasons("router_messages_dropped_total", DROP_REASONS),
+        fill(_LOG, WIDTH),
+        "",
         fill(f"Upper bounds of `router_route_seconds`, in microseconds: {bounds}.", WIDTH),
         "",
     ]
