@@ -38,18 +38,18 @@ class Listener:
     def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
         self.name = plan.name
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._stamp = bytearray(_TIMESPEC.size)
         try:
             # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
             self.socket.bind(plan.address)
             _ask_for_receive_buffer(self.socket, plan)
+            with suppress(FileNotFoundError):  # nothing was received yet, but now that it was asked the kernel stamps
+                self.arrived_at()
         except OSError as error:
             self.socket.close()
             raise StartError(f"{span}: {_why_not_bound(plan, error)}") from error
         self.address = Address(*self.socket.getsockname())
         self._drops_at_close = 0
-        self._stamp = bytearray(_TIMESPEC.size)
-        with suppress(FileNotFoundError):  # nothing was received yet; but from the first question on the kernel stamps
-            self.arrived_at()
 
     def kernel_drops(self) -> int:
         """Datagrams that the kernel threw away before anybody received them, since the socket was opened."""
