@@ -57,7 +57,8 @@ class Engine:
         self._counts = outlets.counts
         self._arrived_at = arrived_at
         self._freshness = Freshness()
-        self._by_host, self._by_address = recognisers(program.table.endpoints)
+        by_host, self._by_address = recognisers(program.table.endpoints)
+        self._addresses: list[tuple[object, str]] = [*by_host.items(), *self._by_address.items()]
         self._handles = {
             handler.route: bind(handler, program.books, outlets, self._freshness)
             for handlers in program.inbound.values()
@@ -72,11 +73,10 @@ class Engine:
         by_source = {
             source: self._route(handler, source, listener) for handler in handlers for source in handler.sources
         }
-        addresses: list[tuple[object, str]] = [*self._by_host.items(), *self._by_address.items()]
         return _Case(
             name=handlers[0].case.name,
             parse=handlers[0].case.message_class.FromString,
-            routes={key: by_source[name] for key, name in addresses if name in by_source},
+            routes={key: by_source[name] for key, name in self._addresses if name in by_source},
             stranger=by_source.get(STRANGER),
         )
 
@@ -156,9 +156,8 @@ class Engine:
         return receive
 
     def _seen_slots(self) -> dict[object, int]:
-        addresses: list[tuple[object, str]] = [*self._by_host.items(), *self._by_address.items()]
         metric = "endpoint_last_seen_timestamp_seconds"
-        return {key: self._program.books.slot(metric, name) for key, name in addresses}
+        return {key: self._program.books.slot(metric, name) for key, name in self._addresses}
 
     def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
         books, counts, report = self._program.books, self._counts, self._outlets.report
