@@ -87,7 +87,7 @@ class Pacer(Machine):
                 self._send_first(lane, now)
 
     def end(self, now: int) -> None:
-        """Sends what waits, whatever the budget: the longest queue is a second of it."""
+        """Sends what waits, whatever the budget: that is no more than the queue holds."""
         self.next_due = None
         for lane in self._lanes.values():
             while lane.waiting:

@@ -65,7 +65,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """`body` once for each of `values`; `element` is set when the body is a single scalar."""
+    """`body` once for each of `values`, which it finds in `variable`."""
 
     type: List
     values: ast.expr
