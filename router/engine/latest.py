@@ -33,25 +33,19 @@ class Latest(Machine):
             self.next_due = self._limit.next_pass
 
     def due(self, now: int) -> None:
+        if self._held is not None and (is_stale(now, self._held[1]) or self._limit.may_pass(now)):
+            self.end(now)
+
+    def end(self, now: int) -> None:
+        """Delivers what is held, ahead of its time, unless that has passed."""
         if self._held is None:
             return
         data, expires = self._held
+        self._release()
         if is_stale(now, expires):
-            self._release()
             self._outcome.dropped("stale")
-        elif self._limit.may_pass(now):
-            self._release()
+        else:
             self._deliver(now, data, expires)
-
-    def end(self, now: int) -> None:
-        """Delivers what is held, ahead of its time."""
-        if self._held is not None:
-            data, expires = self._held
-            self._release()
-            if is_stale(now, expires):
-                self._outcome.dropped("stale")
-            else:
-                self._deliver(now, data, expires)
 
     def _release(self) -> None:
         self._held = self.next_due = None
