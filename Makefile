@@ -11,7 +11,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Says what must be sourced; nothing at all unless ROS comes from outside .venv.
 ENV := . .venv/env.sh &&
 
-.PHONY: help setup test demo validate lint clean
+.PHONY: help setup test demo bench validate lint clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -24,6 +24,9 @@ test: setup  ## run the tests; TESTS=tests/wire for some of them
 
 demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost link halts the rover
 	@$(ENV) .venv/bin/python -m demo
+
+bench: setup  ## measure the router beside the C++ node, about an hour; ARGS="--only own_table --repeat 3" for less
+	@$(ENV) .venv/bin/python -m benchmarks.versus $(ARGS)
 
 validate: setup  ## say what is wrong with the tables in routes/
 	@$(ENV) .venv/bin/router validate routes/

@@ -1,0 +1,78 @@
+"""Who is measured, as data, and how each is started. Knows no scenario and measures nothing."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.versus.building import PROGRAMS
+from tests.ports import free_port
+
+TABLES = Path(__file__).parent.parent / "tables"
+LISTENERS = 8
+
+
+@dataclass(frozen=True)
+class Ports:
+    """All that a contender may bind or send to, on the loopback interface."""
+
+    listen: tuple[int, ...]
+    first: int
+    second: int
+    metrics: int
+
+    @staticmethod
+    def free() -> Ports:
+        found: set[int] = set()
+        while len(found) < LISTENERS + 3:
+            found.add(free_port())
+        first, second, metrics, *listen = found
+        return Ports(tuple(listen), first, second, metrics)
+
+    def variables(self) -> dict[str, str]:
+        """As the tables name them."""
+        named = {"FIRST_PORT": self.first, "SECOND_PORT": self.second, "METRICS_PORT": self.metrics}
+        named |= {f"LISTEN_PORT_{number}" if number else "LISTEN_PORT": port for number, port in enumerate(self.listen)}
+        return {name: str(port) for name, port in named.items()}
+
+
+@dataclass(frozen=True)
+class Router:
+    """`copies`: how many datagrams leave for each that comes. `listens`: whether it takes any."""
+
+    name: str
+    table: Path
+    copies: int = 1
+    listens: bool = True
+
+    def words(self, _: Ports) -> list[object]:
+        return [sys.executable, "-m", "router", "run", self.table, "--log-level", "error"]
+
+    def environment(self, ports: Ports) -> dict[str, str]:
+        """Without what the wheels set in ours, so that it starts as from a shell."""
+        inherited = {name: value for name, value in os.environ.items() if name != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+        return inherited | ports.variables()
+
+
+@dataclass(frozen=True)
+class Native:
+    """One of our C and C++ programs, with further `options`."""
+
+    name: str
+    program: str
+    options: tuple[str, ...] = ()
+    copies: int = 1
+    listens: bool = True
+
+    def words(self, ports: Ports) -> list[object]:
+        to = [word for port in (ports.first, ports.second)[: self.copies] for word in ("--to", f"127.0.0.1:{port}")]
+        return [PROGRAMS / self.program, "--listen", f"127.0.0.1:{ports.listen[0]}", *to, *self.options]
+
+    def environment(self, _: Ports) -> dict[str, str]:
+        """With what the wheels set in ours: it finds ROS's libraries by it."""
+        return dict(os.environ)
+
+
+Contender = Router | Native

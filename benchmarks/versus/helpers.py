@@ -1,0 +1,127 @@
+"""The programs around the one under test: generator, sinks, ROS subscriber and publisher. All share one core.
+
+Each answers in lines of JSON. They know nothing of the router; what their answers mean is said where they are used.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, cast
+
+from benchmarks.versus.building import PROGRAMS
+from benchmarks.versus.processes import cores, spawn
+
+POLL_US = 1000
+"""How often a sink looks that costs the sender no wake-ups, as if the receiver were another machine."""
+
+PAYLOADS = Path(__file__).parent.parent / "peer" / "payloads.txt"
+SENSOR_BOARD = "127.0.0.30:0"
+STAMPED_CASE = "gps_info"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Which payload case it carries, its name and its ROS type."""
+
+    case: str
+    name: str
+    kind: str
+
+
+IMU = Topic("imu_info", "imu_data", "comms/msg/ImuSensorInformation")
+GPS = Topic("gps_info", "gps_data", "comms/msg/SensorBoardGPSInfo")
+ALL_TOPICS = (
+    IMU,
+    GPS,
+    Topic("ph_info", "ph_data", "comms/msg/SensorBoardPHInfo"),
+    Topic("sensor_diag", "sensor_board_diagnostics", "comms/msg/SensorBoardDiagnostics"),
+)
+
+
+class Helper(AbstractContextManager["Helper"]):
+    """A program on the helpers' core, gone at the latest when its context ends."""
+
+    def __init__(self, *words: object, priority: int = 0) -> None:
+        self._process = spawn(words, cores().helpers, priority, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._in, self._out = cast("IO[str]", self._process.stdin), cast("IO[str]", self._process.stdout)
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def result(self) -> dict[str, Any]:
+        """Its next line."""
+        if not (line := self._out.readline()):
+            sys.exit(f"{self._process.args!r} ended without a result")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def go(self) -> None:
+        """Lets a helper begin that waits for it."""
+        self._in.write("go\n")
+        self._in.flush()
+
+    def ask(self, number: signal.Signals = signal.SIGUSR1) -> dict[str, Any]:
+        self._process.send_signal(number)
+        return self.result()
+
+    def stop(self) -> dict[str, Any]:
+        """Ends it; what it has to say at the end."""
+        return self.ask(signal.SIGTERM)
+
+
+def load(
+    ports: Sequence[int],
+    rate: float,
+    seconds: float,
+    burst: int = 1,
+    payloads: Path = PAYLOADS,
+    case: str = "",
+    stamped: bool = False,
+    source: str = SENSOR_BOARD,
+    priority: int = -10,
+) -> Helper:
+    """Sends the payloads in turn, to the ports in turn, at most `burst` at once; tells at the end what it sent."""
+    words = ["--from", source, "--payloads", payloads, "--rate", rate, "--seconds", seconds, "--burst", burst]
+    words += [word for port in ports for word in ("--to", f"127.0.0.1:{port}")]
+    words += ["--case", case] if case else []
+    words += ["--stamp"] if stamped else []
+    return Helper(PROGRAMS / "load", *words, priority=priority)
+
+
+def sink(*ports: int, wakes: bool = False, from_ros: bool = False) -> Helper:
+    """Drains ports and counts. With `wakes` each datagram wakes it, as latency needs it.
+
+    `from_ros`: stamps are those of our publisher, not of our generator.
+    """
+    words = [word for port in ports for word in ("--listen", f"127.0.0.1:{port}")]
+    words += [] if wakes else ["--poll-us", str(POLL_US)]
+    words += ["--float-stamps"] if from_ros else []
+    helper = Helper(PROGRAMS / "sink", *words, priority=-5)
+    time.sleep(0.2)
+    return helper
+
+
+def _probe(*words: object) -> Helper:
+    """One that has found the other side."""
+    helper = Helper(sys.executable, "-m", "benchmarks.versus.probe", *words, priority=-10)
+    helper.result()
+    time.sleep(0.5)  # found in the graph is not yet matched on the wire
+    return helper
+
+
+def subscriber(topics: Sequence[Topic]) -> Helper:
+    return _probe("subscribe", *(f"{topic.name}:{topic.kind}" for topic in topics))
+
+
+def publisher(rate: float, seconds: float) -> Helper:
+    """Publishes on `arm_target`, once it is told to go."""
+    return _probe("publish", "--rate", rate, "--seconds", seconds)

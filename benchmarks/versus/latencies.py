@@ -1,0 +1,30 @@
+"""One-way latency, from the generator to a destination and to a ROS subscriber. Knows no aims."""
+
+from __future__ import annotations
+
+from benchmarks.versus.helpers import GPS
+from benchmarks.versus.runs import Subscriber, Traffic, run, warm_up
+from benchmarks.versus.trial import Metrics, Trial
+
+QUANTILES = ("p50", "p99", "p999")
+RATE = 1000
+
+
+def latency(trial: Trial, seconds: float) -> Metrics:
+    """In microseconds: `udp_*` to the first destination, without a subscriber; `ros_*` to a subscriber's hands.
+
+    `udp_subscribed_*` is the first again, while that subscriber listens.
+    """
+    metrics: Metrics = {}
+    traffic = Traffic(RATE, min(seconds, trial.pace.longest), stamped=True)
+    with trial.started() as subject:
+        warm_up(subject, trial.pace)
+        alone = run(subject, traffic, trial.pace)
+        with Subscriber([GPS]) as listening:
+            subscribed = run(subject, traffic, trial.pace, listening)
+            found = {"udp": alone.latency_us, "udp_subscribed": subscribed.latency_us, "ros": listening.stop()}
+    for result in (alone, subscribed):
+        result.add_to(metrics, "")
+    for name, latencies in found.items():
+        metrics |= {f"{name}_{quantile}_us": latencies[quantile] for quantile in QUANTILES if latencies}
+    return metrics

@@ -1,0 +1,161 @@
+"""One run: traffic through a process for some seconds, what came out, and what that cost. Knows no aims.
+
+A run that others disturbed, or in which something got lost, is repeated, and the best one counts. What is lost then
+stays in the figures: `lost` are datagrams that should have reached a destination and did not, `ros_lost` messages that
+a subscriber should have got. A figure counts only where both are 0.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.versus.helpers import PAYLOADS, STAMPED_CASE, Topic, load, publisher, sink, subscriber
+from benchmarks.versus.subject import Meter, Subject
+from benchmarks.versus.trial import Metrics, Pace
+
+NOISE_LIMIT = 0.05
+"""Of a core, used by processes that are not ours."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """`asked` and `achieved` are per second; `drops` those of the subject's socket, `latency_us` of the first sink."""
+
+    asked: float
+    achieved: float
+    sent: int
+    drops: int
+    lost: int
+    ros_lost: int
+    cpu_us: float
+    noise: float
+    latency_us: dict[str, float] | None
+
+    @property
+    def is_sound(self) -> bool:
+        return self.noise <= NOISE_LIMIT and not self.lost and not self.ros_lost
+
+    def add_to(self, metrics: Metrics, suffix: str) -> None:
+        """Adds what says whether figures with this suffix count."""
+        metrics["noise"] = max(metrics.get("noise", 0), round(self.noise, 3))
+        for name, value in (("lost", self.lost), ("ros_lost", self.ros_lost)):
+            metrics[f"{name}{suffix}"] = metrics.get(f"{name}{suffix}", 0) + value
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """Datagrams to the subject. `stamped`: only those that carry the time of sending, and sinks wake for each."""
+
+    rate: float
+    seconds: float
+    burst: int = 1
+    payloads: Path = PAYLOADS
+    stamped: bool = False
+
+    def cases(self) -> list[str]:
+        """Payload cases in the order in which they are sent, again and again."""
+        lines = (line.split() for line in self.payloads.read_text().splitlines())
+        cases = [words[0] for words in lines if words and words[0] != "#"]
+        return [case for case in cases if case == STAMPED_CASE] if self.stamped else cases
+
+
+class Subscriber(AbstractContextManager["Subscriber"]):
+    """One process that subscribes to some of a subject's topics."""
+
+    def __init__(self, topics: Sequence[Topic]) -> None:
+        self._helper = subscriber(topics)
+        self._cases = {topic.case for topic in topics}
+
+    def __exit__(self, *reason: object) -> None:
+        self._helper.__exit__(*reason)
+
+    def received(self) -> int:
+        return int(self._helper.ask()["received"])
+
+    def expected(self, sent: int, cases: Sequence[str]) -> int:
+        """How many messages so many datagrams should have become."""
+        rounds, rest = divmod(sent, len(cases))
+        return rounds * sum(case in self._cases for case in cases) + sum(case in self._cases for case in cases[:rest])
+
+    def stop(self) -> dict[str, float]:
+        """Latencies in microseconds, of all stamped messages since the start."""
+        latencies: dict[str, float] = self._helper.stop()["latency_us"]
+        return latencies
+
+
+def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Run:
+    with sink(*_destinations(subject), wakes=traffic.stamped) as receiver:
+        seen = listening.received() if listening else 0
+        meter = Meter(subject)
+        with load(
+            subject.ports.listen[:1],
+            traffic.rate,
+            traffic.seconds,
+            burst=traffic.burst,
+            payloads=traffic.payloads,
+            case=STAMPED_CASE if traffic.stamped else "",
+            stamped=traffic.stamped,
+        ) as generator:
+            sent = generator.result()
+        time.sleep(0.1)
+        meter.read()
+        arrived = receiver.stop()["ports"]
+    missing = listening.expected(sent["sent"], traffic.cases()) - (listening.received() - seen) if listening else 0
+    return _result(subject, traffic.rate, sent, meter, arrived, max(0, missing))
+
+
+def _run_outbound(subject: Subject, rate: float, seconds: float) -> Run:
+    with sink(subject.ports.first, from_ros=True) as receiver, publisher(rate, seconds) as source:
+        meter = Meter(subject)
+        source.go()
+        sent = source.result()
+        meter.read()
+        return _result(subject, rate, sent, meter, receiver.stop()["ports"], 0)
+
+
+def _destinations(subject: Subject) -> tuple[int, ...]:
+    return (subject.ports.first, subject.ports.second)[: subject.contender.copies]
+
+
+def _result(
+    subject: Subject, rate: float, sent: dict[str, Any], meter: Meter, arrived: list[dict[str, Any]], ros_lost: int
+) -> Run:
+    return Run(
+        asked=rate,
+        achieved=sent["rate"],
+        sent=sent["sent"],
+        drops=meter.drops,
+        lost=max(0, sent["sent"] * subject.contender.copies - sum(port["datagrams"] for port in arrived)),
+        ros_lost=ros_lost,
+        cpu_us=round(meter.cpu_ns / 1e3 / max(1, sent["sent"] - meter.drops), 2),
+        noise=meter.noise,
+        latency_us=arrived[0]["latency_us"],
+    )
+
+
+def _best(attempt: Callable[[], Run], retries: int) -> Run:
+    best = attempt()
+    for _ in range(retries):
+        if best.is_sound:
+            break
+        best = min(best, attempt(), key=lambda run: (run.lost + run.ros_lost, run.noise))
+    return best
+
+
+def run(subject: Subject, traffic: Traffic, pace: Pace, listening: Subscriber | None = None) -> Run:
+    return _best(lambda: _run(subject, traffic, listening), pace.retries)
+
+
+def run_outbound(subject: Subject, rate: float, pace: Pace) -> Run:
+    """ROS messages, which the subject makes datagrams of."""
+    return _best(lambda: _run_outbound(subject, rate, pace.seconds), pace.retries)
+
+
+def warm_up(subject: Subject, pace: Pace) -> None:
+    """What runs for the first time is slow, and no figure."""
+    _run(subject, Traffic(1000, min(pace.seconds, 1)), None)
