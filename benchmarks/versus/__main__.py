@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.versus import report, results
+from benchmarks.versus import report, results, sized
 from benchmarks.versus.building import build
 from benchmarks.versus.figures import judge
 from benchmarks.versus.processes import cores
@@ -55,6 +55,8 @@ def main() -> None:
     output = args.output or (None if args.quick else results.DEFAULT)
     known = results.load(output) if output else {"scenarios": {}}
     build()
+    for routes in (sized.SMALL, sized.LARGE):
+        sized.write(routes, sized.folder(routes))
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.sched_setaffinity(0, {cores().helpers})

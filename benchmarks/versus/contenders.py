@@ -7,11 +7,18 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.versus.building import PROGRAMS
+from benchmarks.versus.building import PEER, PROGRAMS
 from tests.ports import free_port
 
 TABLES = Path(__file__).parent.parent / "tables"
+PAYLOADS = PEER / "payloads.txt"
 LISTENERS = 8
+
+
+def datagrams(payloads: Path) -> list[tuple[str, bytes]]:
+    """What a file of datagrams holds, each with its payload case, in the order in which they are sent in turns."""
+    lines = (line.split() for line in payloads.read_text().splitlines())
+    return [(words[0], bytes.fromhex(words[1])) for words in lines if words and words[0] != "#"]
 
 
 @dataclass(frozen=True)
@@ -40,12 +47,13 @@ class Ports:
 
 @dataclass(frozen=True)
 class Router:
-    """`copies`: how many datagrams leave for each that comes. `listens`: whether it takes any."""
+    """`copies`: how many datagrams leave for each that comes. `listens`: whether it takes any. `payloads`: which."""
 
     name: str
     table: Path
     copies: int = 1
     listens: bool = True
+    payloads: Path = PAYLOADS
 
     def words(self, _: Ports) -> list[object]:
         return [sys.executable, "-m", "router", "run", self.table, "--log-level", "error"]
@@ -65,6 +73,7 @@ class Native:
     options: tuple[str, ...] = ()
     copies: int = 1
     listens: bool = True
+    payloads: Path = PAYLOADS
 
     def words(self, ports: Ports) -> list[object]:
         to = [word for port in (ports.first, ports.second)[: self.copies] for word in ("--to", f"127.0.0.1:{port}")]

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 from benchmarks.versus.helpers import Topic
-from benchmarks.versus.runs import Subscriber, Traffic, run, run_outbound, warm_up
+from benchmarks.versus.runs import Traffic, run, run_outbound, warm_up
+from benchmarks.versus.subscriber import subscribed
 from benchmarks.versus.trial import Metrics, Trial
-
-
-@contextmanager
-def maybe_subscribed(topics: Sequence[Topic]) -> Iterator[Subscriber | None]:
-    if not topics:
-        yield None
-        return
-    with Subscriber(topics) as listening:
-        yield listening
 
 
 def inbound_cost(trial: Trial, rates: Sequence[float], topics: Sequence[Topic]) -> Metrics:
     """`cpu_us@RATE`: CPU microseconds per datagram, of all threads; one process subscribes to the topics."""
     metrics: Metrics = {}
-    with trial.started() as subject, maybe_subscribed(topics) as listening:
+    with trial.started() as subject, subscribed(topics) as listening:
         warm_up(subject, trial.pace)
         for rate in trial.pace.rates(rates):
             result = run(subject, Traffic(rate, trial.pace.seconds), trial.pace, listening)

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import IO, Any, cast
 
 from benchmarks.versus.building import PROGRAMS
+from benchmarks.versus.contenders import PAYLOADS
 from benchmarks.versus.processes import cores, spawn
 
 POLL_US = 1000
 """How often a sink looks that costs the sender no wake-ups, as if the receiver were another machine."""
 
-PAYLOADS = Path(__file__).parent.parent / "peer" / "payloads.txt"
 SENSOR_BOARD = "127.0.0.30:0"
 STAMPED_CASE = "gps_info"
 
@@ -49,7 +49,7 @@ ALL_TOPICS = (
 class Helper(AbstractContextManager["Helper"]):
     """A program on the helpers' core, gone at the latest when its context ends."""
 
-    def __init__(self, *words: object, priority: int = 0) -> None:
+    def __init__(self, *words: object, priority: int | None = 0) -> None:
         self._process = spawn(words, cores().helpers, priority, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._in, self._out = cast("IO[str]", self._process.stdin), cast("IO[str]", self._process.stdout)
 
@@ -87,7 +87,7 @@ def load(
     case: str = "",
     stamped: bool = False,
     source: str = SENSOR_BOARD,
-    priority: int = -10,
+    priority: int | None = -10,
 ) -> Helper:
     """Sends the payloads in turn, to the ports in turn, at most `burst` at once; tells at the end what it sent."""
     words = ["--from", source, "--payloads", payloads, "--rate", rate, "--seconds", seconds, "--burst", burst]
@@ -97,7 +97,7 @@ def load(
     return Helper(PROGRAMS / "load", *words, priority=priority)
 
 
-def sink(*ports: int, wakes: bool = False, from_ros: bool = False) -> Helper:
+def sink(*ports: int, wakes: bool = False, from_ros: bool = False, priority: int | None = -5) -> Helper:
     """Drains ports and counts. With `wakes` each datagram wakes it, as latency needs it.
 
     `from_ros`: stamps are those of our publisher, not of our generator.
@@ -105,7 +105,7 @@ def sink(*ports: int, wakes: bool = False, from_ros: bool = False) -> Helper:
     words = [word for port in ports for word in ("--listen", f"127.0.0.1:{port}")]
     words += [] if wakes else ["--poll-us", str(POLL_US)]
     words += ["--float-stamps"] if from_ros else []
-    helper = Helper(PROGRAMS / "sink", *words, priority=-5)
+    helper = Helper(PROGRAMS / "sink", *words, priority=priority)
     time.sleep(0.2)
     return helper
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from benchmarks.versus.helpers import GPS
-from benchmarks.versus.runs import Subscriber, Traffic, run, warm_up
+from benchmarks.versus.helpers import GPS, subscriber
+from benchmarks.versus.runs import Traffic, run, warm_up
+from benchmarks.versus.subscriber import Subscriber
 from benchmarks.versus.trial import Metrics, Trial
 
 QUANTILES = ("p50", "p99", "p999")
@@ -20,7 +21,8 @@ def latency(trial: Trial, seconds: float) -> Metrics:
     with trial.started() as subject:
         warm_up(subject, trial.pace)
         alone = run(subject, traffic, trial.pace)
-        with Subscriber([GPS]) as listening:
+        with subscriber([GPS]) as helper:
+            listening = Subscriber(helper, [GPS])
             subscribed = run(subject, traffic, trial.pace, listening)
             found = {"udp": alone.latency_us, "udp_subscribed": subscribed.latency_us, "ros": listening.stop()}
     for result in (alone, subscribed):

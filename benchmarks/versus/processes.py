@@ -32,14 +32,22 @@ def cores() -> Cores:
 def spawn(
     words: Sequence[object],
     core: int,
-    priority: int = 0,
+    priority: int | None = 0,
     environment: Mapping[str, str] | None = None,
     stdin: int | None = subprocess.DEVNULL,
     stdout: int | IO[str] | None = subprocess.DEVNULL,
     stderr: int | IO[str] | None = None,
 ) -> subprocess.Popen[str]:
-    """Starts a program on one core. A `priority` below 0 takes a privilege; without it, it runs as any other."""
-    prefix = ("taskset", "-c", core, *(("nice", "-n", priority) if priority else ()))
+    """Starts a program on one core.
+
+    A `priority` below 0 takes a privilege, without which the program runs as any other. None is the lowest there is:
+    it runs while nothing else wants to.
+    """
+    prefix = ["taskset", "-c", core]
+    if priority is None:
+        prefix += ["chrt", "--idle", 0]
+    elif priority:
+        prefix += ["nice", "-n", priority]
     return subprocess.Popen(
         [*map(str, (*prefix, *words))], text=True, env=environment, stdin=stdin, stdout=stdout, stderr=stderr
     )

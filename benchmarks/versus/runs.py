@@ -8,14 +8,14 @@ a subscriber should have got. A figure counts only where both are 0.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from benchmarks.versus.helpers import PAYLOADS, STAMPED_CASE, Topic, load, publisher, sink, subscriber
+from benchmarks.versus.contenders import datagrams
+from benchmarks.versus.helpers import STAMPED_CASE, load, publisher, sink
 from benchmarks.versus.subject import Meter, Subject
+from benchmarks.versus.subscriber import Subscriber
 from benchmarks.versus.trial import Metrics, Pace
 
 NOISE_LIMIT = 0.05
@@ -49,47 +49,19 @@ class Run:
 
 @dataclass(frozen=True)
 class Traffic:
-    """Datagrams to the subject. `stamped`: only those that carry the time of sending, and sinks wake for each."""
+    """Datagrams to the subject, of those meant for it.
+
+    `stamped`: only those that can carry the time of sending, and sinks wake for each.
+    """
 
     rate: float
     seconds: float
     burst: int = 1
-    payloads: Path = PAYLOADS
     stamped: bool = False
-
-    def cases(self) -> list[str]:
-        """Payload cases in the order in which they are sent, again and again."""
-        lines = (line.split() for line in self.payloads.read_text().splitlines())
-        cases = [words[0] for words in lines if words and words[0] != "#"]
-        return [case for case in cases if case == STAMPED_CASE] if self.stamped else cases
-
-
-class Subscriber(AbstractContextManager["Subscriber"]):
-    """One process that subscribes to some of a subject's topics."""
-
-    def __init__(self, topics: Sequence[Topic]) -> None:
-        self._helper = subscriber(topics)
-        self._cases = {topic.case for topic in topics}
-
-    def __exit__(self, *reason: object) -> None:
-        self._helper.__exit__(*reason)
-
-    def received(self) -> int:
-        return int(self._helper.ask()["received"])
-
-    def expected(self, sent: int, cases: Sequence[str]) -> int:
-        """How many messages so many datagrams should have become."""
-        rounds, rest = divmod(sent, len(cases))
-        return rounds * sum(case in self._cases for case in cases) + sum(case in self._cases for case in cases[:rest])
-
-    def stop(self) -> dict[str, float]:
-        """Latencies in microseconds, of all stamped messages since the start."""
-        latencies: dict[str, float] = self._helper.stop()["latency_us"]
-        return latencies
 
 
 def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Run:
-    with sink(*_destinations(subject), wakes=traffic.stamped) as receiver:
+    with sink(*subject.destinations(), wakes=traffic.stamped) as receiver:
         seen = listening.received() if listening else 0
         meter = Meter(subject)
         with load(
@@ -97,7 +69,7 @@ def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Ru
             traffic.rate,
             traffic.seconds,
             burst=traffic.burst,
-            payloads=traffic.payloads,
+            payloads=subject.contender.payloads,
             case=STAMPED_CASE if traffic.stamped else "",
             stamped=traffic.stamped,
         ) as generator:
@@ -105,7 +77,10 @@ def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Ru
         time.sleep(0.1)
         meter.read()
         arrived = receiver.stop()["ports"]
-    missing = listening.expected(sent["sent"], traffic.cases()) - (listening.received() - seen) if listening else 0
+    missing = 0
+    if listening:
+        cases = [STAMPED_CASE] if traffic.stamped else [case for case, _ in datagrams(subject.contender.payloads)]
+        missing = listening.expected(sent["sent"], cases) - (listening.received() - seen)
     return _result(subject, traffic.rate, sent, meter, arrived, max(0, missing))
 
 
@@ -116,10 +91,6 @@ def _run_outbound(subject: Subject, rate: float, seconds: float) -> Run:
         sent = source.result()
         meter.read()
         return _result(subject, rate, sent, meter, receiver.stop()["ports"], 0)
-
-
-def _destinations(subject: Subject) -> tuple[int, ...]:
-    return (subject.ports.first, subject.ports.second)[: subject.contender.copies]
 
 
 def _result(

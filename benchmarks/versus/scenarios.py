@@ -6,14 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from benchmarks.versus.contenders import TABLES, Contender, Native, Router
+from benchmarks.versus import sized
+from benchmarks.versus.contenders import PAYLOADS, TABLES, Contender, Native, Router
 from benchmarks.versus.costs import inbound_cost, outbound_cost
 from benchmarks.versus.figures import Aim
+from benchmarks.versus.flood import flood
+from benchmarks.versus.footprint import start_and_memory
 from benchmarks.versus.helpers import ALL_TOPICS, IMU
 from benchmarks.versus.latencies import latency
+from benchmarks.versus.limits import highest_rate, overload
 from benchmarks.versus.trial import Measure
 
 RATES = (1000, 5000, 20_000, 40_000)
+SIZE_RATES = (5000, 20_000)
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,14 @@ def at_most(against: str, limits: dict[str, float]) -> tuple[Aim, ...]:
 def cpu_at_most(against: str, limits: Sequence[float], rates: Sequence[float] = RATES) -> tuple[Aim, ...]:
     return at_most(against, {f"cpu_us@{rate:g}": limit for rate, limit in zip(rates, limits, strict=True)})
 
+
+def sized_router(name: str, routes: int, spread: bool = False) -> Router:
+    """One with so many routes; with `spread`, datagrams are of all their payload cases."""
+    folder = sized.folder(routes)
+    return Router(name, folder / "table.yaml", payloads=folder / "payloads.txt" if spread else PAYLOADS)
+
+
+FOOTPRINT = (Aim("start_s", at_most=1.0), Aim("rss_mb", at_most=120))
 
 SCENARIOS = (
     Scenario(
@@ -70,6 +83,20 @@ SCENARIOS = (
         cpu_at_most("peer", (0.7,) * 4) + cpu_at_most("bare", (2.0,) * 4),
     ),
     Scenario(
+        "max_rate",
+        "Highest rate without loss over 10 s, one subscriber of imu_data",
+        (OWN, PEER, Native("peer_4mib", "cpp_peer", ("--rcvbuf", str(4 << 20)), copies=2)),
+        partial(highest_rate, topics=(IMU,)),
+        (Aim("max_rate", "peer", at_least=1.2), Aim("max_rate", "peer_4mib")),
+    ),
+    Scenario(
+        "overloaded",
+        "Datagrams per second when 250,000 per second are offered, without and with one subscriber of imu_data",
+        (OWN, PEER),
+        partial(overload, topics=(IMU,)),
+        (Aim("processed", "peer", at_least=1.0), Aim("processed_subscribed", "peer", at_least=1.0)),
+    ),
+    Scenario(
         "latency",
         "One-way latency at 1000 gps_info per second, to the first destination and to a subscriber",
         (OWN, PEER),
@@ -92,5 +119,40 @@ SCENARIOS = (
         ),
         partial(outbound_cost, rates=(100, 2000)),
         cpu_at_most("peer", (1.5, 1.5), (100, 2000)),
+    ),
+    Scenario(
+        "footprint",
+        "Start to the first datagram routed, and memory after 60 s at 5000 per second",
+        (OWN, PEER),
+        start_and_memory,
+        FOOTPRINT,
+    ),
+    Scenario(
+        "footprint_rover",
+        "The same with all routes of the rover",
+        (Router("router", TABLES / "rover.yaml"),),
+        start_and_memory,
+        FOOTPRINT,
+    ),
+    Scenario(
+        "table_size",
+        "CPU per datagram: 260 routes beside 26, the same four payload cases, one subscriber of imu_data",
+        (sized_router("routes_260", sized.LARGE), sized_router("routes_26", sized.SMALL)),
+        partial(inbound_cost, rates=SIZE_RATES, topics=(IMU,)),
+        cpu_at_most("routes_26", (1.05, 1.05), SIZE_RATES),
+    ),
+    Scenario(
+        "table_size_spread",
+        "CPU per datagram: 260 routes beside 26, all payload cases in turn, nobody subscribes",
+        (sized_router("routes_260", sized.LARGE, spread=True), sized_router("routes_26", sized.SMALL, spread=True)),
+        partial(inbound_cost, rates=SIZE_RATES, topics=()),
+        cpu_at_most("routes_26", (1.05, 1.05), SIZE_RATES),
+    ),
+    Scenario(
+        "flood",
+        "p99 latency of seven listeners, 200 datagrams per second each, while an eighth gets 50,000",
+        (Router("router", TABLES / "flood.yaml"),),
+        flood,
+        (Aim("flooded_by_quiet", at_most=1.2), Aim("flooded_by_control")),
     ),
 )

@@ -56,6 +56,10 @@ class Subject(AbstractContextManager["Subject"]):
         if self._process.poll() is not None or time.monotonic() > deadline:
             sys.exit(f"{self.contender.name} did not start:\n{self._log.read_text()}")
 
+    def destinations(self) -> tuple[int, ...]:
+        """The ports to which it sends each datagram."""
+        return (self.ports.first, self.ports.second)[: self.contender.copies]
+
     def cpu_ns(self) -> int:
         """CPU time of all living threads: schedstat counts ns where utime and stime count ticks."""
         tasks = (path for pid in self._pids() for path in Path(f"/proc/{pid}/task").glob("*/schedstat"))

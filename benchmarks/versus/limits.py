@@ -1,0 +1,93 @@
+"""What a process can take: its highest rate without loss, and what it still does when too much comes. Knows no aims."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+from benchmarks.versus.helpers import Topic, load, sink
+from benchmarks.versus.runs import Traffic, run, warm_up
+from benchmarks.versus.subject import Subject
+from benchmarks.versus.subscriber import Subscriber, subscribed
+from benchmarks.versus.trial import Metrics, Pace, Trial
+
+FIRST_RATE = 10_000
+BURST = 8
+SEARCH_SECONDS, CONFIRM_SECONDS = 2, 10
+KEEPS_UP = 0.97
+"""Of the rate that is asked of the generator, what it has to reach."""
+
+OVERLOAD_RATE, OVERLOAD_BURST = 250_000, 64
+OVERLOAD_SECONDS = 4
+FILLING = 1
+"""Seconds of an overload in which buffers become full, and which do not count."""
+
+
+class Search:
+    """Looks for the highest rate at which nothing is lost. One hiccup of the machine is no limit: two runs are."""
+
+    def __init__(self, subject: Subject, pace: Pace, listening: Subscriber | None) -> None:
+        self._subject = subject
+        self._pace = replace(pace, retries=0)
+        self._listening = listening
+        self.generator_gave_up = False
+
+    def passes(self, rate: float, seconds: float) -> bool:
+        traffic = Traffic(rate, min(seconds, self._pace.longest), burst=BURST)
+        for _ in range(2):
+            result = run(self._subject, traffic, self._pace, self._listening)
+            if result.achieved < KEEPS_UP * rate:
+                self.generator_gave_up = True
+                return False
+            if not result.drops and not result.lost:
+                return True
+        return False
+
+    def highest(self) -> float:
+        """By doubling and bisection in short runs, then confirmed by long ones; 0 if even FIRST_RATE is too much."""
+        low, high = 0.0, float(FIRST_RATE)
+        while self.passes(high, SEARCH_SECONDS):
+            low, high = high, high * 2
+        while low and high / low > self._pace.step:
+            middle = (low * high) ** 0.5
+            low, high = (middle, high) if self.passes(middle, SEARCH_SECONDS) else (low, middle)
+        while low > FIRST_RATE and not self.passes(low, CONFIRM_SECONDS):
+            low /= self._pace.step
+        return low
+
+
+def highest_rate(trial: Trial, topics: Sequence[Topic]) -> Metrics:
+    """`max_rate` in datagrams per second; `generator_gave_up` is 1 where a faster generator might have found more."""
+    with trial.started() as subject, subscribed(topics) as listening:
+        warm_up(subject, trial.pace)
+        search = Search(subject, trial.pace, listening)
+        return {"max_rate": round(search.highest()), "generator_gave_up": search.generator_gave_up}
+
+
+def overload(trial: Trial, topics: Sequence[Topic]) -> Metrics:
+    """Datagrams per second: `offered` and `processed` with no subscriber, `*_subscribed` with one."""
+    metrics: Metrics = {}
+    with trial.started() as subject:
+        warm_up(subject, trial.pace)
+        for suffix, wanted in (("", ()), ("_subscribed", topics)):
+            with subscribed(wanted):
+                metrics |= {f"{name}{suffix}": value for name, value in _overloaded(subject, trial.pace).items()}
+    return metrics
+
+
+def _overloaded(subject: Subject, pace: Pace) -> Metrics:
+    """Counted where they arrive, between two moments at which the subject's buffer is full."""
+    seconds = min(OVERLOAD_SECONDS, pace.longest)
+    with (
+        sink(*subject.destinations()) as receiver,
+        load(subject.ports.listen[:1], OVERLOAD_RATE, seconds + FILLING + 0.5, OVERLOAD_BURST) as generator,
+    ):
+        time.sleep(FILLING)
+        before = receiver.ask()
+        time.sleep(seconds)
+        after = receiver.ask()
+        sent = generator.result()
+        dropped = sum(port["drops"] for port in receiver.stop()["ports"])
+    rate = (after["datagrams"] - before["datagrams"]) * 1e9 / (after["at_ns"] - before["at_ns"])
+    return {"processed": round(rate), "offered": round(sent["rate"]), "sink_drops": dropped}
