@@ -53,7 +53,7 @@ def main() -> None:
     args = arguments()
     pace = QUICK if args.quick else replace(Pace(), seconds=args.seconds)
     output = args.output or (None if args.quick else results.DEFAULT)
-    known = results.load(output) if output else {"scenarios": {}}
+    known = results.load(output) if output else results.empty()
     build()
     for routes in (sized.SMALL, sized.LARGE):
         sized.write(routes, sized.folder(routes))
@@ -66,7 +66,7 @@ def main() -> None:
         for scenario in args.only:
             entry = measured(scenario, pace, 1 if args.quick else args.repeat, Path(folder))
             print(report.text(scenario.name, entry), flush=True)
-            known["scenarios"][scenario.name] = entry
+            results.merge(known, scenario.name, entry)
             if output:
                 results.store(output, known)
 

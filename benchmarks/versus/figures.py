@@ -10,7 +10,7 @@ from typing import NamedTuple
 from benchmarks.versus.trial import Metrics
 
 COUNTED = ("lost", "ros_lost")
-"""Where one of these is above 0, what was measured at the same rate does not count."""
+"""Where one of these is above 0, what was measured under the same condition does not count."""
 
 
 class Spread(NamedTuple):
@@ -67,8 +67,8 @@ def ratio(metric: str, ours: Sequence[Metrics], theirs: Sequence[Metrics]) -> Sp
 
 def counts(metric: str, rounds: Iterable[Metrics]) -> bool:
     """Whether nothing got lost where this metric was measured."""
-    _, at, rate = metric.partition("@")
-    return not any(metrics.get(f"{name}{at}{rate}") for metrics in rounds for name in COUNTED)
+    _, at, condition = metric.partition("@")
+    return not any(metrics.get(f"{name}{at}{condition}") for metrics in rounds for name in COUNTED)
 
 
 class Judged(NamedTuple):

@@ -21,9 +21,9 @@ SECONDS = 8
 
 
 def flood(trial: Trial) -> Metrics:
-    """`p99_us_*` over seven listeners: `quiet`, `flooded` on the eighth, and the `control`; and how they compare.
+    """`p99_us@*` over seven listeners: `quiet`, `flooded` on the eighth, and the `control`; and how they compare.
 
-    `flood_through` is how much of the flood reached its destination.
+    `through@*` is how much of a flood reached its destination.
     """
     seconds = min(SECONDS, trial.pace.longest)
     with trial.started() as subject:
@@ -31,8 +31,9 @@ def flood(trial: Trial) -> Metrics:
         metrics = _p99("quiet", subject, seconds, None)
         metrics |= _p99("control", subject, seconds, subject.ports.second)
         metrics |= _p99("flooded", subject, seconds, subject.ports.listen[0])
-    metrics["flooded_by_quiet"] = metrics["p99_us_flooded"] / metrics["p99_us_quiet"]
-    metrics["flooded_by_control"] = metrics["p99_us_flooded"] / metrics["p99_us_control"]
+    metrics["lost"] = sum(metrics[f"lost@{name}"] for name in ("quiet", "control", "flooded"))
+    metrics["flooded_by_quiet"] = metrics["p99_us@flooded"] / metrics["p99_us@quiet"]
+    metrics["flooded_by_control"] = metrics["p99_us@flooded"] / metrics["p99_us@control"]
     return metrics
 
 
@@ -50,7 +51,7 @@ def _p99(name: str, subject: Subject, seconds: float, flooded: int | None) -> Me
                 poured = storm.result()["sent"]
         [arrived] = receiver.stop()["ports"]
         [drained] = drain.stop()["ports"]
-    metrics = {f"p99_us_{name}": arrived["latency_us"]["p99"], f"lost_{name}": sent["sent"] - arrived["datagrams"]}
+    metrics = {f"p99_us@{name}": arrived["latency_us"]["p99"], f"lost@{name}": sent["sent"] - arrived["datagrams"]}
     if flooded:
-        metrics[f"through_{name}"] = round(drained["datagrams"] / poured, 4)
+        metrics[f"through@{name}"] = round(drained["datagrams"] / poured, 4)
     return metrics

@@ -64,6 +64,9 @@ class Helper(AbstractContextManager["Helper"]):
         answer: dict[str, Any] = json.loads(line)
         return answer
 
+    def is_running(self) -> bool:
+        return self._process.poll() is None
+
     def go(self) -> None:
         """Lets a helper begin that waits for it."""
         self._in.write("go\n")

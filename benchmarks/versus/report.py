@@ -1,18 +1,32 @@
-"""Results as a table for people. Knows nothing but the file's contents."""
+"""Results as tables for people. Knows nothing but the file's contents."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from textwrap import fill
 from typing import Any
 
-NOISY = 0.05
-"""Of a core that others took; where it was more in any round, the line says so."""
+NOTES = {"noise": (0.05, "noisy"), "generator_gave_up": (0.0, "at least")}
+"""What to say of a contender in whose rounds such a metric was above a limit: others took so much of a core; a faster
+generator might have found more."""
 
-HEADINGS = ("figure", "router", "other", "ratio", "range", "aim", "")
+HEADINGS = ("figure", "router", "other", "ratio", "range", "aim", "", "notes")
+
+WIDTH = 118
 
 
 def number(value: float) -> str:
     return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
+
+
+def notes(contenders: Mapping[str, Any]) -> str:
+    found = (
+        f"{name} {note}"
+        for name, metrics in contenders.items()
+        for metric, (limit, note) in NOTES.items()
+        if metric in metrics and metrics[metric]["max"] > limit
+    )
+    return ", ".join(found)
 
 
 def cells(entry: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -21,16 +35,16 @@ def cells(entry: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     first = next(iter(contenders.values()))
     for figure in entry["figures"]:
         metric, against = figure["metric"], figure["against"]
-        other = contenders[against][metric]["median"] if against else None
-        noisy = max(metrics.get("noise", {"max": 0})["max"] for metrics in contenders.values()) > NOISY
+        shown = {name: contenders[name] for name in (next(iter(contenders)), against) if name}
         yield (
             metric,
             number(first[metric]["median"]),
-            f"{against} {number(other)}" if other is not None else "",
+            f"{against} {number(contenders[against][metric]['median'])}" if against else "",
             f"{figure['median']:.2f}" if against else "",
             f"{number(figure['min'])} to {number(figure['max'])}",
             figure["aim"],
-            " ".join(filter(None, (figure["verdict"], "noisy" if noisy else ""))),
+            figure["verdict"],
+            notes(shown),
         )
 
 
@@ -40,3 +54,16 @@ def text(name: str, entry: Mapping[str, Any]) -> str:
     widths = [max(len(row[column]) for row in rows) for column in range(len(HEADINGS))]
     lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
     return "\n".join((f"{name}: {entry['title']}", *(f"  {line}" for line in lines)))
+
+
+def page(results: Mapping[str, Any]) -> str:
+    """All scenarios, as the body of a page of docs/."""
+    machine = results["machine"]
+    lines = [
+        fill(f"{machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, Python {machine['python']}.")
+    ]
+    for name, entry in results["scenarios"].items():
+        rounds = f"Medians of {entry['repeat']} fresh processes, {entry['date']}, commit {entry['commit']}."
+        lines += ["", f"## `{name}`", "", fill(f"{entry['title']}. {rounds}", WIDTH), ""]
+        lines += [f"| {' | '.join(row)} |" for row in (HEADINGS, ("---",) * len(HEADINGS), *cells(entry))]
+    return "\n".join([*lines, ""])

@@ -1,4 +1,4 @@
-"""The file of results: written, merged, and the machine that it is about. Knows no scenario's meaning."""
+"""The file of results: written, merged, and the machine that it is about. Knows not what figures mean."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.versus.building import ROOT
 from benchmarks.versus.figures import Judged, spreads
 from benchmarks.versus.processes import read
-from benchmarks.versus.scenarios import Scenario
+from benchmarks.versus.scenarios import SCENARIOS, Scenario
 from benchmarks.versus.trial import Metrics
 
 DEFAULT = ROOT / "benchmarks" / "results.json"
@@ -67,15 +67,25 @@ def entry(
     }
 
 
+def empty() -> dict[str, Any]:
+    """Results of this machine, without any scenario yet."""
+    return {"machine": machine(), "scenarios": {}}
+
+
 def load(path: Path) -> dict[str, Any]:
-    """The file, or what one looks like that has no scenario yet. Ends this program if it is of another machine."""
-    here = machine()
+    """What a file has, if there is one. Ends this program if it is of another machine."""
     if not path.exists():
-        return {"machine": here, "scenarios": {}}
+        return empty()
     found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    if found["machine"] != here:
+    if found["machine"] != machine():
         sys.exit(f"{path.name} is of another machine or Python; move it away, or write elsewhere with --output")
     return found
+
+
+def merge(results: dict[str, Any], name: str, entry: Mapping[str, Any]) -> None:
+    """Puts a scenario in the place of what was there of it; the others stay, in the order of their definition."""
+    found = {**results["scenarios"], name: entry}
+    results["scenarios"] = {scenario.name: found[scenario.name] for scenario in SCENARIOS if scenario.name in found}
 
 
 def store(path: Path, results: Mapping[str, Any]) -> None:

@@ -94,7 +94,7 @@ SCENARIOS = (
         "Datagrams per second when 250,000 per second are offered, without and with one subscriber of imu_data",
         (OWN, PEER),
         partial(overload, topics=(IMU,)),
-        (Aim("processed", "peer", at_least=1.0), Aim("processed_subscribed", "peer", at_least=1.0)),
+        (Aim("processed@alone", "peer", at_least=1.0), Aim("processed@subscribed", "peer", at_least=1.0)),
     ),
     Scenario(
         "latency",
@@ -125,7 +125,7 @@ SCENARIOS = (
         "Start to the first datagram routed, and memory after 60 s at 5000 per second",
         (OWN, PEER),
         start_and_memory,
-        FOOTPRINT,
+        (*FOOTPRINT, Aim("start_s", "peer"), Aim("rss_mb", "peer")),
     ),
     Scenario(
         "footprint_rover",
@@ -153,6 +153,12 @@ SCENARIOS = (
         "p99 latency of seven listeners, 200 datagrams per second each, while an eighth gets 50,000",
         (Router("router", TABLES / "flood.yaml"),),
         flood,
-        (Aim("flooded_by_quiet", at_most=1.2), Aim("flooded_by_control")),
+        (
+            Aim("p99_us@quiet"),
+            Aim("p99_us@control"),
+            Aim("p99_us@flooded"),
+            Aim("flooded_by_quiet", at_most=1.2),
+            Aim("flooded_by_control"),
+        ),
     ),
 )

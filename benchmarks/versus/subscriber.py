@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 
 from benchmarks.versus.helpers import Helper, Topic, subscriber
+
+
+def number_of(wanted: Collection[str], sent: int, cases: Sequence[str]) -> int:
+    """How many of so many datagrams are of the wanted payload cases, when `cases` take turns."""
+    rounds, rest = divmod(sent, len(cases))
+    return sum(rounds + (place < rest) for place, case in enumerate(cases) if case in wanted)
 
 
 class Subscriber:
@@ -20,8 +26,7 @@ class Subscriber:
 
     def expected(self, sent: int, cases: Sequence[str]) -> int:
         """How many messages so many datagrams should have become, whose payload cases took turns."""
-        rounds, rest = divmod(sent, len(cases))
-        return rounds * sum(case in self._cases for case in cases) + sum(case in self._cases for case in cases[:rest])
+        return number_of(self._cases, sent, cases)
 
     def stop(self) -> dict[str, float]:
         """Latencies in microseconds, of all stamped messages since the start."""

@@ -25,7 +25,7 @@ class Pace:
     longest: float = 60
     settle: float = 1.5
     retries: int = 4
-    step: float = 1.03
+    step: float = 1.05
     most_rates: int = 10
 
     def rates(self, rates: Sequence[float]) -> Sequence[float]:
@@ -59,4 +59,4 @@ class Trial:
 
 
 Measure = Callable[[Trial], Metrics]
-"""All figures of one fresh process, by name: `METRIC` or `METRIC@RATE`; runs.py says what becomes of what is lost."""
+"""All figures of one fresh process, by name: `METRIC`, or `METRIC@CONDITION`, which mostly is a rate."""
