@@ -27,6 +27,7 @@ demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost l
 
 bench: setup  ## measure the router beside the C++ node, about an hour; ARGS="--only own_table --repeat 3" for less
 	@$(ENV) .venv/bin/python -m benchmarks.versus $(ARGS)
+	@.venv/bin/python docs/generate.py
 
 validate: setup  ## say what is wrong with the tables in routes/
 	@$(ENV) .venv/bin/router validate routes/

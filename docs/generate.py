@@ -5,15 +5,18 @@ tests/test_docs.py fails when a page is not what this would write.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 
+from benchmarks.versus.report import page
 from router.compiler.books import DROP_REASONS, HISTOGRAM_BOUNDS_NS, METRICS, REJECT_REASONS
 from router.compiler.functions import FUNCTIONS
 from router.errors import Code
 
 HERE = Path(__file__).parent
+RESULTS = HERE.parent / "benchmarks" / "results.json"
 WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 _BOOKS = """\
@@ -76,12 +79,20 @@ def findings_page() -> str:
     return "\n".join([*lines, ""])
 
 
+def figures_page() -> str:
+    """What `make bench` measured."""
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    return f"# Figures\n\n{_MADE}\n[How they were measured](performance.md).\n\n{page(found)}"
+
+
 PAGES = {"functions.md": functions_page, "metrics.md": metrics_page, "findings.md": findings_page}
+if RESULTS.exists():
+    PAGES["figures.md"] = figures_page
 
 
 def main() -> None:
-    for name, page in PAGES.items():
-        (HERE / name).write_text(page(), encoding="utf-8")
+    for name, written in PAGES.items():
+        (HERE / name).write_text(written(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 /* Drains UDP ports, counts, and measures one-way latency from the stamps that datagrams carry:
    CLOCK_MONOTONIC in gps_info.utc_timestamp (put there by load --stamp), or with --float-stamps in the
-   first two floats of ph_info and arm_target (put there by ros_probe.py publish: 24 bits each, because
-   a float holds whole numbers up to 2^24 exactly).
+   first two floats of arm_target (put there by versus/probe.py: 24 bits each, because a float holds
+   whole numbers up to 2^24 exactly).
 
    By default it wakes for every datagram, as a real receiver would; latency ends when this program has
    the datagram. With --poll-us N it looks only every N microseconds, so that the sender never pays for
@@ -46,7 +46,7 @@ static int64_t latency(const uint8_t *datagram, size_t length, int64_t now) {
     if (!find_field(datagram, end, GPS_INFO, &message)) return -1;
     return find_field(message.contents, message.end, UTC_TIMESTAMP, &first) ? now - (int64_t)first.varint : -1;
   }
-  if (!find_field(datagram, end, PH_INFO, &message) && !find_field(datagram, end, ARM_TARGET, &message)) return -1;
+  if (!find_field(datagram, end, ARM_TARGET, &message)) return -1;
   if (!find_field(message.contents, message.end, 1, &first) ||
       !find_field(message.contents, message.end, 2, &second)) return -1;
   int64_t sent_at = (int64_t)as_float(&first) * (1 << 24) + (int64_t)as_float(&second);
