@@ -1,7 +1,5 @@
 /* Drains UDP ports, counts, and measures one-way latency from the stamps that datagrams carry:
-   CLOCK_MONOTONIC in gps_info.utc_timestamp (put there by load --stamp), or with --float-stamps in the
-   first two floats of arm_target (put there by versus/probe.py: 24 bits each, because a float holds
-   whole numbers up to 2^24 exactly).
+   CLOCK_MONOTONIC in gps_info.utc_timestamp (put there by load --stamp).
 
    By default it wakes for every datagram, as a real receiver would; latency ends when this program has
    the datagram. With --poll-us N it looks only every N microseconds, so that the sender never pays for
@@ -15,7 +13,7 @@
 #include <signal.h>
 #include <sys/prctl.h>
 
-static const char USAGE[] = "sink --listen A:P [--listen A:P ...] [--poll-us N] [--float-stamps]";
+static const char USAGE[] = "sink --listen A:P [--listen A:P ...] [--poll-us N]";
 enum { MAX_PORTS = 8, MAX_SAMPLES = 1 << 20, SINK_BUFFER = 32 << 20, MEMINFO_DROPS = 8 };
 
 struct port {
@@ -27,30 +25,15 @@ struct port {
 };
 
 static volatile sig_atomic_t stopping, asked;
-static int float_stamps;
 
 static void stop(int number) { stopping = number; }
 static void ask(int number) { asked = number; }
 
-static float as_float(const struct field *f) {
-  float value;
-  memcpy(&value, f->contents, sizeof value);
-  return value;
-}
-
 /* Latency of one datagram in ns, or -1 when it carries no stamp. */
 static int64_t latency(const uint8_t *datagram, size_t length, int64_t now) {
-  struct field message, first, second;
-  const uint8_t *end = datagram + length;
-  if (!float_stamps) {
-    if (!find_field(datagram, end, GPS_INFO, &message)) return -1;
-    return find_field(message.contents, message.end, UTC_TIMESTAMP, &first) ? now - (int64_t)first.varint : -1;
-  }
-  if (!find_field(datagram, end, ARM_TARGET, &message)) return -1;
-  if (!find_field(message.contents, message.end, 1, &first) ||
-      !find_field(message.contents, message.end, 2, &second)) return -1;
-  int64_t sent_at = (int64_t)as_float(&first) * (1 << 24) + (int64_t)as_float(&second);
-  return (now - sent_at) & 0xffffffffffffLL; /* the stamp has 48 bits */
+  struct field gps, utc;
+  if (!find_field(datagram, datagram + length, GPS_INFO, &gps)) return -1;
+  return find_field(gps.contents, gps.end, UTC_TIMESTAMP, &utc) ? now - (int64_t)utc.varint : -1;
 }
 
 static void drain(struct port *port) {
@@ -102,7 +85,6 @@ int main(int argc, char **argv) {
   (void)argc;
   check_options(argv, USAGE);
   const long poll_us = atol(option(argv, "--poll-us", 0, "0"));
-  float_stamps = flag(argv, "--float-stamps");
   for (const char *name; count < MAX_PORTS && (name = option(argv, "--listen", count, NULL)); count++) {
     int fd = open_udp(parse_address(name), SINK_BUFFER);
     ports[count] = (struct port){.name = name, .fd = fd, .latency_ns = calloc(MAX_SAMPLES, sizeof(int64_t))};

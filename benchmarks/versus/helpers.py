@@ -100,14 +100,10 @@ def load(
     return Helper(PROGRAMS / "load", *words, priority=priority)
 
 
-def sink(*ports: int, wakes: bool = False, from_ros: bool = False, priority: int | None = -5) -> Helper:
-    """Drains ports and counts. With `wakes` each datagram wakes it, as latency needs it.
-
-    `from_ros`: stamps are those of our publisher, not of our generator.
-    """
+def sink(*ports: int, wakes: bool = False, priority: int | None = -5) -> Helper:
+    """Drains ports and counts. With `wakes` each datagram wakes it, as latency needs it."""
     words = [word for port in ports for word in ("--listen", f"127.0.0.1:{port}")]
     words += [] if wakes else ["--poll-us", str(POLL_US)]
-    words += ["--float-stamps"] if from_ros else []
     helper = Helper(PROGRAMS / "sink", *words, priority=priority)
     time.sleep(0.2)
     return helper

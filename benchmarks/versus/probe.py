@@ -32,8 +32,6 @@ DISCOVERY_SECONDS = 30
 GPS_TYPE = "comms/msg/SensorBoardGPSInfo"
 GPS_STAMP_OFFSET = 4 + 48  # CDR header, then utc_timestamp after 43 bytes of fields, aligned to 8
 OUTBOUND = "arm_target", "comms/msg/ArmBoardTargetMovement"
-FLOATS_OFFSET = 4  # the outbound type begins with two float32
-FLOAT_BITS = 24  # a float32 holds whole numbers of this many bits exactly
 
 
 def message_class(name: str) -> Any:
@@ -104,26 +102,22 @@ def subscribe(node: Node, topics: Mapping[str, str]) -> None:
 
 
 def publish(node: Node, rate: float, seconds: float) -> None:
-    """Publishes stamped messages on an absolute schedule, once a line arrives on stdin."""
+    """Publishes on an absolute schedule, once a line arrives on stdin."""
     topic, kind = OUTBOUND
     message = message_class(kind)()
     for field, field_type in message.get_fields_and_field_types().items():
         if field_type == "float":
             setattr(message, field, 1.5)  # protobuf leaves out zeros; a real message has few
     sender = node.create_publisher(type(message), topic, QUEUE_DEPTH)
-    data = bytearray(serialize_message(message))
+    data = serialize_message(message)
     wait_for(node.count_subscribers, [topic])
     sys.stdin.readline()
-    start, mask = time.monotonic_ns(), (1 << FLOAT_BITS) - 1
-    count = round(rate * seconds)
+    start, count = time.monotonic(), round(rate * seconds)
     for number in range(count):
-        now = time.monotonic_ns()
-        if (early := start + int(number * 1e9 / rate) - now) > 0:
-            time.sleep(early / 1e9)
-            now = time.monotonic_ns()
-        struct.pack_into("<ff", data, FLOATS_OFFSET, now >> FLOAT_BITS & mask, now & mask)
-        sender.publish(bytes(data))
-    elapsed = (time.monotonic_ns() - start) / 1e9
+        if (early := start + number / rate - time.monotonic()) > 0:
+            time.sleep(early)
+        sender.publish(data)
+    elapsed = time.monotonic() - start
     time.sleep(0.2)  # a publisher that leaves takes its unacknowledged messages with it
     say(sent=count, rate=count / elapsed)
 

@@ -85,7 +85,7 @@ def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Ru
 
 
 def _run_outbound(subject: Subject, rate: float, seconds: float) -> Run:
-    with sink(subject.ports.first, from_ros=True) as receiver, publisher(rate, seconds) as source:
+    with sink(subject.ports.first) as receiver, publisher(rate, seconds) as source:
         meter = Meter(subject)
         source.go()
         sent = source.result()
