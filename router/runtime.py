@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from router.compiler.program import Program
 from router.edges.background import background_threads
 from router.edges.clock import monotonic_ns, wall_ns
+from router.edges.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
 from router.edges.log import logger
 from router.edges.metrics import BooksCollector, MetricsServer
 from router.edges.receiver import ReceiveThread
@@ -122,7 +123,9 @@ class Router:
         inbound = Engine(program, outlets, {name: listener.arrived_at for name, listener in self.listeners.items()})
         outbound = OutboundEngine(program, replace(outlets, counts=self._fresh_counts()))
         receive = {name: inbound.receiver(name) for name in self.listeners}
-        receiving = ReceiveThread(list(self.listeners.values()), receive, MAX_DATAGRAM, reporter.failed)
+        receiving = ReceiveThread(
+            list(self.listeners.values()), receive, MAX_DATAGRAM, _enough(outlets.wanted), reporter.failed
+        )
         take = {plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions}
         self._open_metrics(opening)
 
@@ -223,6 +226,12 @@ class Router:
         )
         opening.callback(server.close)
         self.metrics_address = server.address
+
+
+def _enough(wanted: Mapping[str, Sequence[bool]]) -> Callable[[], int]:
+    """How many datagrams may gather, now."""
+    flags = list(wanted.values())
+    return lambda: FOR_SUBSCRIBERS if any(flag for [flag] in flags) else FOR_SOCKETS
 
 
 def _version() -> str:

@@ -52,7 +52,7 @@ def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Seq
         envelope=envelope,
         books=books,
         listeners=tuple(
-            ListenerPlan(one.name, one.address.value, one.framing, one.receive_buffer)
+            ListenerPlan(one.name, one.address.value, one.framing, one.receive_buffer, one.coalesce)
             for one in table.listeners.values()
         ),
         senders=tuple(

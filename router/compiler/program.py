@@ -25,10 +25,13 @@ def source_label(source: str | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ListenerPlan:
+    """A UDP socket to receive from. `receive_buffer` in bytes, `coalesce` in ns."""
+
     name: str
     address: Address
     framing: Framing
     receive_buffer: int
+    coalesce: int
 
 
 @dataclass(frozen=True, slots=True)

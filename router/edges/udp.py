@@ -37,6 +37,7 @@ class Listener:
 
     def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
         self.name = plan.name
+        self.coalesce = plan.coalesce
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stamp = bytearray(_TIMESPEC.size)
         try:

@@ -29,12 +29,13 @@ from router.table.nodes import Entry, MappingNode, is_sound, marked_broken
 from router.table.reading import UnsoundError, boolean, integer, mapping, optional_text, text, text_or
 from router.table.salvage import sound_part
 from router.table.source import Source
-from router.table.units import parse_data_rate, parse_size
+from router.table.units import parse_coalesce, parse_data_rate, parse_size
 
 T = TypeVar("T")
 
 DEFAULT_NODE = NodeSettings("rover_router", "/")
 DEFAULT_RECEIVE_BUFFER = 4 << 20
+DEFAULT_COALESCE = 1_000_000
 
 
 def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Diagnostic]) -> RouteTable | None:
@@ -147,7 +148,7 @@ def _metrics(entry: Entry) -> Located[Address]:
 
 def _listener(entry: Entry) -> Listener:
     settings = mapping(entry.value)
-    size = optional_text(settings, "receive_buffer")
+    size, coalesce = optional_text(settings, "receive_buffer"), optional_text(settings, "coalesce")
     return Listener(
         name=entry.key.text,
         span=entry.key.span,
@@ -156,6 +157,7 @@ def _listener(entry: Entry) -> Listener:
         receive_buffer=UnsoundError.guard(parse_size, text(settings, "receive_buffer"))
         if size
         else DEFAULT_RECEIVE_BUFFER,
+        coalesce=UnsoundError.guard(parse_coalesce, text(settings, "coalesce")) if coalesce else DEFAULT_COALESCE,
     )
 
 

@@ -79,13 +79,14 @@ class NodeSettings:
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """`span` is the listener's name in the table. `receive_buffer` is in bytes."""
+    """`span` is the listener's name in the table. `receive_buffer` is in bytes, `coalesce` in ns."""
 
     name: str
     span: SourceSpan
     address: Located[Address]
     framing: Framing
     receive_buffer: int
+    coalesce: int
 
 
 @dataclass(frozen=True, slots=True)

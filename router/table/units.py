@@ -20,6 +20,9 @@ _HERTZ = re.compile(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?Hz")
 MAX_DURATION = (1 << 63) - 1
 """ROS durations are 64-bit nanoseconds."""
 
+MAX_COALESCE = 10_000_000
+"""Longer than that, what waits no longer pays: the wake-ups that 10 ms leave cost next to nothing."""
+
 MAX_SIZE = (1 << 30) - 1
 """The largest receive buffer that the kernel takes, which doubles what it is asked for."""
 
@@ -30,6 +33,11 @@ MAX_DATA_RATE = 10**12
 def parse_duration(text: str) -> int:
     """`500ms` as nanoseconds."""
     return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION)
+
+
+def parse_coalesce(text: str) -> int:
+    """`1ms` as nanoseconds, or `never` as 0."""
+    return 0 if text == "never" else _exact(text, _NANOSECONDS, "nanoseconds", MAX_COALESCE)
 
 
 def parse_size(text: str) -> int:

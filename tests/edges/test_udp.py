@@ -16,18 +16,20 @@ from structlog.testing import capture_logs
 
 from router.compiler.program import ListenerPlan, SenderPlan
 from router.edges.clock import wall_ns
+from router.edges.coalescing import FOR_SOCKETS, SAMPLE
 from router.edges.receiver import ReceiveThread
-from router.edges.udp import Listener, Sender
+from router.edges.udp import SO_RCVBUFFORCE, Listener, Sender
 from router.errors import SourceSpan, StartError
 from router.table.model import Address, Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 LIMIT = 1000
+COALESCE = 1_000_000
 Received = "queue.SimpleQueue[tuple[str, bytes, tuple[str, int]]]"
 
 
 def plan(name: str = "rover", host: str = "127.0.0.1", port: int = 0, receive_buffer: int = 65536) -> ListenerPlan:
-    return ListenerPlan(name, Address(host, port), Framing.EXACT, receive_buffer)
+    return ListenerPlan(name, Address(host, port), Framing.EXACT, receive_buffer, COALESCE)
 
 
 @pytest.fixture
@@ -46,7 +48,7 @@ def peer(stack: ExitStack) -> socket.socket:
 
 
 def listen(stack: ExitStack, name: str = "rover") -> Listener:
-    return stack.enter_context(closing(Listener(plan(name), SPAN)))
+    return stack.enter_context(closing(Listener(plan(name, receive_buffer=1 << 20), SPAN)))
 
 
 class Receiving:
@@ -56,7 +58,7 @@ class Receiving:
         self.got: queue.SimpleQueue[tuple[str, bytes, tuple[str, int]]] = queue.SimpleQueue()
         self.failures: queue.SimpleQueue[Exception] = queue.SimpleQueue()
         receive = {listener.name: self._into_queue(listener.name) for listener in listeners}
-        self.thread = ReceiveThread(listeners, receive, LIMIT, self.failures.put)
+        self.thread = ReceiveThread(listeners, receive, LIMIT, lambda: FOR_SOCKETS, self.failures.put)
 
     def _into_queue(self, name: str) -> Callable[[bytes, tuple[str, int]], None]:
         def receive(data: bytes, peer: tuple[str, int]) -> None:
@@ -93,6 +95,50 @@ def test_stop_handles_what_has_arrived_and_ends(several: list[Listener], peer: s
     receiving.thread.start()
     receiving.thread.stop()
     assert receiving.all_received() == sent
+
+
+def test_a_flood_is_received_whole_and_in_order_and_nobody_else_waits_for_its_end(
+    several: list[Listener], peer: socket.socket
+) -> None:
+    """Thick enough to coalesce. Others get their turn before the flood has been handled."""
+    receiving = Receiving(several)
+    flood = [b"%d" % number for number in range(40 * SAMPLE)]
+    for listener in several:
+        listener.socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 4 << 20)
+    for number, data in enumerate(flood):
+        peer.sendto(data, several[0].address)
+        if number == SAMPLE:
+            receiving.thread.start()
+    for listener in several[1:]:
+        peer.sendto(b"quiet", listener.address)
+    got = [receiving.got.get(timeout=5) for _ in range(len(flood) + len(several) - 1)]
+    receiving.thread.stop()
+    assert [data for name, data, _ in got if name == several[0].name] == flood
+    assert sorted(name for name, data, _ in got if data == b"quiet") == sorted(one.name for one in several[1:])
+
+
+def test_after_a_flood_each_datagram_is_waited_for_again(several: list[Listener], peer: socket.socket) -> None:
+    receiving = Receiving(several)
+    for number in range(4 * SAMPLE):
+        peer.sendto(b"%d" % number, several[0].address)
+    receiving.thread.start()
+    for _ in range(4 * SAMPLE):
+        receiving.got.get(timeout=5)
+    for number in range(3):
+        peer.sendto(b"%d" % number, several[0].address)
+        assert receiving.got.get(timeout=5)[1] == b"%d" % number
+    receiving.thread.stop()
+
+
+def test_a_bug_while_datagrams_gather_loses_nothing(several: list[Listener], peer: socket.socket) -> None:
+    receiving = Receiving(several)
+    sent = [b"bug" if number % 50 == 49 else b"%d" % number for number in range(10 * SAMPLE)]
+    for data in sent:
+        peer.sendto(data, several[0].address)
+    receiving.thread.start()
+    receiving.thread.stop()
+    assert receiving.all_received() == [data for data in sent if data != b"bug"]
+    assert receiving.failures.qsize() == sent.count(b"bug")
 
 
 def test_nothing_new_gets_in_after_the_end_of_input(stack: ExitStack, peer: socket.socket) -> None:

@@ -22,7 +22,7 @@ GOOD = """\
 version: 1
 envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
 listen:
-  rover: {address: 0.0.0.0:5000, framing: zero_trimmed, receive_buffer: "${BUFFER:-4MiB}"}
+  rover: {address: 0.0.0.0:5000, framing: zero_trimmed, receive_buffer: "${BUFFER:-4MiB}", coalesce: 500us}
 endpoints:
   sensor_board: {address: "${SENSOR:-192.168.0.30:8}", kind: board}
   basestation: {address: 192.168.0.10:9000, kind: basestation, budget: 500kB/s}
@@ -142,6 +142,7 @@ def test_a_mistake_is_underlined_where_it_is(
         ("protos", "Proto folder", "relative to this file"),
         ("framing", "Framing", "remove trailing zero bytes"),
         ("receive_buffer", "Receive buffer", "net.core.rmem_max"),
+        ("coalesce", "Coalesce", "interrupt coalescing"),
         ("kind", "Kind", "microcontroller"),
         ("source: [", "Source", "'any' for whoever does"),
         ("when", "When", "boolean expression"),

@@ -175,10 +175,8 @@ def test_what_is_left_out_has_defaults(tmp_path: Path) -> None:
     assert not findings
     assert table
     assert (table.node.name, table.node.namespace, table.metrics) == ("rover_router", "/", None)
-    assert (table.listeners["rover"].framing, table.listeners["rover"].receive_buffer) == (
-        Framing.ZERO_TRIMMED,
-        4 << 20,
-    )
+    listener = table.listeners["rover"]
+    assert (listener.framing, listener.receive_buffer, listener.coalesce) == (Framing.ZERO_TRIMMED, 4 << 20, 1_000_000)
 
 
 def test_what_has_a_finding_is_left_out_and_named(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from router.table.units import parse_data_rate, parse_duration, parse_rate, parse_size
+from router.table.units import parse_coalesce, parse_data_rate, parse_duration, parse_rate, parse_size
 
 
 @pytest.mark.parametrize(
@@ -39,6 +39,11 @@ def test_rates_are_numbers_or_carry_their_unit(value: str | float, hertz: float)
     assert parse_rate(value) == hertz
 
 
+@pytest.mark.parametrize(("text", "nanoseconds"), [("1ms", 1_000_000), ("250 us", 250_000), ("never", 0)])
+def test_coalescing_may_be_never(text: str, nanoseconds: int) -> None:
+    assert parse_coalesce(text) == nanoseconds
+
+
 @pytest.mark.parametrize(
     ("parse", "text"),
     [
@@ -49,6 +54,9 @@ def test_rates_are_numbers_or_carry_their_unit(value: str | float, hertz: float)
         (parse_duration, "0.5ns"),
         (parse_duration, "999999999999999h"),
         (parse_duration, "1e3s"),
+        (parse_coalesce, "0ms"),
+        (parse_coalesce, "11ms"),
+        (parse_coalesce, "off"),
         (parse_size, "4"),
         (parse_size, "4Mib"),
         (parse_size, "0B"),
