@@ -123,8 +123,13 @@ class Router:
         inbound = Engine(program, outlets, {name: listener.arrived_at for name, listener in self.listeners.items()})
         outbound = OutboundEngine(program, replace(outlets, counts=self._fresh_counts()))
         receive = {name: inbound.receiver(name) for name in self.listeners}
+        subscribed = ros.subscribed if ros else ()
         receiving = ReceiveThread(
-            list(self.listeners.values()), receive, MAX_DATAGRAM, _enough(outlets.wanted), reporter.failed
+            list(self.listeners.values()),
+            receive,
+            MAX_DATAGRAM,
+            lambda: FOR_SUBSCRIBERS if subscribed else FOR_SOCKETS,
+            reporter.failed,
         )
         take = {plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions}
         self._open_metrics(opening)
@@ -226,12 +231,6 @@ class Router:
         )
         opening.callback(server.close)
         self.metrics_address = server.address
-
-
-def _enough(wanted: Mapping[str, Sequence[bool]]) -> Callable[[], int]:
-    """How many datagrams may gather, now."""
-    flags = list(wanted.values())
-    return lambda: FOR_SUBSCRIBERS if any(flag for [flag] in flags) else FOR_SOCKETS
 
 
 def _version() -> str:

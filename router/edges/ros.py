@@ -5,7 +5,7 @@ Knows bytes and topics; what the bytes mean and why they are published is the en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 
 from rclpy.event_handler import EventHandler
@@ -24,9 +24,10 @@ from router.table.model import NodeSettings
 class RosEdge:
     """The node, its publishers and subscriptions, and the threads that serve them. Opening raises StartError.
 
-    `publish[topic]` takes CDR bytes. `wanted[topic]` is one boolean in a list, kept up to date in place:
-    whether anybody listens. `incompatible(topic, policy, peers)` is called by a thread of events, from opening on:
-    peers whose QoS does not go with ours, so far. Nothing is received before `start`.
+    `publish[topic]` takes CDR bytes. `wanted[topic]` is one boolean in a list, kept up to date in place: whether anybody
+    listens, or may want it later. `subscribed` has the topics with a subscriber now. `incompatible(topic, policy, peers)`
+    is called by a thread of events, from opening on: peers whose QoS does not go with ours, so far. Nothing is received
+    before `start`.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
@@ -50,6 +51,7 @@ class RosEdge:
             for plan in (*publishers, *subscriptions)
         }
         peers = PeerEvents(incompatible)
+        self.subscribed: Collection[str] = peers.subscribed
         of_publishers: list[EventHandler] = []
         of_subscriptions: list[EventHandler] = []
         with ExitStack() as opening:

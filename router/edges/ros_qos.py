@@ -44,9 +44,13 @@ Incompatible = Callable[[str, str, int], None]
 
 
 class PeerEvents:
-    """The callbacks with which publishers and subscriptions tell of their peers. For one thread."""
+    """The callbacks with which publishers and subscriptions tell of their peers. For one thread.
+
+    `subscribed` has the topics that somebody subscribes to; other threads may look whether it is empty.
+    """
 
     def __init__(self, incompatible: Incompatible) -> None:
+        self.subscribed: set[str] = set()
         self._incompatible = incompatible
         self._peers: Counter[tuple[str, str]] = Counter()
 
@@ -54,6 +58,7 @@ class PeerEvents:
         """They keep `wanted` up to date as well: whether anybody listens."""
 
         def on_matched(status: Any) -> None:
+            (self.subscribed.add if status.current_count else self.subscribed.discard)(plan.topic)
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
 
         def on_incompatible_qos(status: Any) -> None:

@@ -27,19 +27,21 @@ def subscribe() -> Iterator[Callable[..., Subscriber]]:
 def test_bytes_reach_a_subscriber_and_are_wanted_only_while_it_lives(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic())) as ros:
         wanted = ros.wanted["greeting"]
-        assert wanted == [False]
+        assert (wanted, list(ros.subscribed)) == ([False], [])
         peer = subscribe("greeting", "std_msgs/msg/String")
         wait_until(lambda: wanted[0])
+        assert list(ros.subscribed) == ["greeting"]
         assert peer.line() == "matched"
         ros.publish["greeting"](HELLO)
         assert bytes.fromhex(peer.line()) == HELLO
         peer.close()
         wait_until(lambda: not wanted[0])
+        assert not ros.subscribed
 
 
 def test_what_late_joiners_get_is_wanted_before_they_come(subscribe: Callable[..., Subscriber]) -> None:
     with closing(open_ros(string_topic(QosPlan("reliable", "transient_local", "keep_last", 1)))) as ros:
-        assert ros.wanted["greeting"] == [True]
+        assert (ros.wanted["greeting"], list(ros.subscribed)) == ([True], [])
         ros.publish["greeting"](HELLO)
         peer = subscribe("greeting", "std_msgs/msg/String", "--transient-local")
         assert {peer.line(), peer.line()} == {"matched", HELLO.hex()}
