@@ -24,10 +24,10 @@ from router.table.model import NodeSettings
 class RosEdge:
     """The node, its publishers and subscriptions, and the threads that serve them. Opening raises StartError.
 
-    `publish[topic]` takes CDR bytes. `wanted[topic]` is one boolean in a list, kept up to date in place: whether anybody
-    listens, or may want it later. `subscribed` has the topics with a subscriber now. `incompatible(topic, policy, peers)`
-    is called by a thread of events, from opening on: peers whose QoS does not go with ours, so far. Nothing is received
-    before `start`.
+    `publish[topic]` takes CDR bytes. `wanted[topic]` is one boolean in a list, kept up to date in place: whether
+    anybody listens, or may want it later. `subscribed` has the topics with a subscriber now.
+    `incompatible(topic, policy, peers)` is called by a thread of events, from opening on: peers whose QoS does not go
+    with ours, so far. Nothing is received before `start`.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
