@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from google.protobuf.message import DecodeError as ProtobufError
@@ -28,7 +28,6 @@ _SUM = HISTOGRAM_SLOTS - 1
 class _Route:
     """A route as one of its senders has it: the slots in which it counts, and what expressions call the sender."""
 
-    parse: Callable[[bytes], Message]
     received: int
     name: str
     handle: Handle
@@ -37,15 +36,13 @@ class _Route:
 
 
 @dataclass(frozen=True, slots=True)
-class _Sender:
-    """What one sender's datagrams are given to. `seen` is the slot of its endpoint; strangers have none.
+class _Case:
+    """What dispatch needs of a payload case. `routes` is by IP address, or by (IP address, port)."""
 
-    `by_tag` has the routes whose tag is two bytes at most, `by_number` all of them, by field number.
-    """
-
-    seen: int | None
-    by_tag: Mapping[int, _Route]
-    by_number: Mapping[int, _Route]
+    name: str
+    parse: Callable[[bytes], Message]
+    routes: Mapping[object, _Route]
+    stranger: _Route | None
 
 
 class Engine:
@@ -61,30 +58,32 @@ class Engine:
         self._arrived_at = arrived_at
         self._freshness = Freshness()
         by_host, self._by_address = recognisers(program.table.endpoints)
-        self._names: dict[str | Peer, str] = dict([*by_host.items(), *self._by_address.items()])
+        self._addresses: list[tuple[object, str]] = [*by_host.items(), *self._by_address.items()]
         self._handles = {
             handler.route: bind(handler, program.books, outlets, self._freshness)
             for handlers in program.inbound.values()
             for handler in handlers
         }
 
-    def _sender(self, name: str | None, listener: str) -> _Sender:
-        """An endpoint, or STRANGER. Routes that name it go before those that take any sender."""
-        by_number = {}
-        for number, handlers in self._program.inbound.items():
-            by_source = {source: handler for handler in handlers for source in handler.sources}
-            source = name if name in by_source else STRANGER
-            if source in by_source:
-                by_number[number] = self._route(by_source[source], source, listener)
-        seen = None if name is STRANGER else self._program.books.slot("endpoint_last_seen_timestamp_seconds", name)
-        by_tag = {number << 3 | LEN: route for number, route in by_number.items() if number < 2048}
-        return _Sender(seen, by_tag, by_number)
+    def _cases(self, listener: str) -> dict[int, _Case]:
+        """What a listener's datagrams are given to, by field number."""
+        return {number: self._case(handlers, listener) for number, handlers in self._program.inbound.items()}
+
+    def _case(self, handlers: Sequence[Handler], listener: str) -> _Case:
+        by_source = {
+            source: self._route(handler, source, listener) for handler in handlers for source in handler.sources
+        }
+        return _Case(
+            name=handlers[0].case.name,
+            parse=handlers[0].case.message_class.FromString,
+            routes={key: by_source[name] for key, name in self._addresses if name in by_source},
+            stranger=by_source.get(STRANGER),
+        )
 
     def _route(self, handler: Handler, source: str | None, listener: str) -> _Route:
         books, label = self._program.books, source_label(source)
         handle = self._handles[handler.route]
         return _Route(
-            parse=handler.case.message_class.FromString,
             received=books.slot("messages_received", handler.route, label),
             name=label,
             handle=handle if handler.ttl is None else self._aged(handle, self._arrived_at[listener]),
@@ -108,12 +107,14 @@ class Engine:
         complete, of a routed case, from its endpoint) goes straight through.
         """
         books, counts = self._program.books, self._counts
-        stranger = self._sender(STRANGER, listener)
-        senders = {key: self._sender(name, listener) for key, name in self._names.items()}
-        by_address = self._by_address
+        cases = self._cases(listener)
+        # Of those whose tag is two bytes at most.
+        by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
         clock_ns, wall_ns, bounds = self._outlets.clock_ns, self._outlets.wall_ns, HISTOGRAM_BOUNDS_NS
         received, received_bytes = books.slot("datagrams_received", listener), books.slot("received_bytes", listener)
-        settle, reject = Settler(self._program, counts, listener).settle, self._rejecter(listener)
+        seen = self._seen_slots()
+        by_address = self._by_address
+        settle, reject = Settler(self._program, counts, listener, cases).settle, self._rejecter(listener)
 
         def receive(data: bytes, peer: Peer) -> None:
             now = clock_ns()
@@ -121,9 +122,9 @@ class Engine:
             size = len(data)
             counts[received] += 1
             counts[received_bytes] += size
-            sender = senders.get(peer if by_address and peer in by_address else peer[0], stranger)
-            if sender.seen is not None:
-                counts[sender.seen] = received_at
+            sender_key = peer if by_address and peer in by_address else peer[0]
+            if sender_key in seen:
+                counts[seen[sender_key]] = received_at
             try:
                 tag, start = data[0], 1
                 if tag > 0x7F:
@@ -131,20 +132,20 @@ class Engine:
                 length, start = data[start], start + 1
                 if length > 0x7F:
                     length, start = length & 0x7F | data[start] << 7, start + 1
-                route = sender.by_tag[tag]
+                case = by_tag[tag]
                 if start + length != size or size > MAX_DATAGRAM:
                     raise LookupError
-                message = route.parse(data[start:])
+                message = case.parse(data[start:])
             except (LookupError, ProtobufError):  # not the usual datagram
                 try:
                     case, message = settle(data)
-                    route = sender.by_number[case.number]
                 except Rejected as rejected:
                     reject(rejected.reason, peer, str(rejected))
                     return
-                except KeyError:
-                    reject("source_mismatch", peer, case.name)
-                    return
+            route = case.routes.get(sender_key, case.stranger)
+            if route is None:
+                reject("source_mismatch", peer, case.name)
+                return
             counts[route.received] += 1
             route.handle(message, data, received_at, now, route.name)
             counts[route.last_message] = received_at
@@ -153,6 +154,10 @@ class Engine:
             counts[route.seconds + _SUM] += elapsed
 
         return receive
+
+    def _seen_slots(self) -> dict[object, int]:
+        metric = "endpoint_last_seen_timestamp_seconds"
+        return {key: self._program.books.slot(metric, name) for key, name in self._addresses}
 
     def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
         books, counts, report = self._program.books, self._counts, self._outlets.report

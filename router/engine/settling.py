@@ -5,6 +5,9 @@ What comes of it is a payload, or the reason why there is none. Knows no routes 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Generic, TypeVar
+
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 
@@ -13,7 +16,8 @@ from router.compiler.program import Program
 from router.engine.framing import restored
 from router.engine.payloadless import why_no_payload
 from router.table.model import Framing
-from router.types.protobuf import PayloadCase
+
+Case = TypeVar("Case")
 
 MAX_DATAGRAM = 16 * 1024
 """The longest datagram, in bytes, that is looked at; a longer one is rejected as `truncated`."""
@@ -27,10 +31,10 @@ class Rejected(Exception):
         self.reason = reason
 
 
-class Settler:
-    """For the datagrams of one listener."""
+class Settler(Generic[Case]):
+    """For the datagrams of one listener. `cases` are those with a route, by field number."""
 
-    def __init__(self, program: Program, counts: list[int], listener: str) -> None:
+    def __init__(self, program: Program, counts: list[int], listener: str, cases: Mapping[int, Case]) -> None:
         plan = next(plan for plan in program.listeners if plan.name == listener)
         self._repairs = plan.framing is Framing.ZERO_TRIMMED
         self._padded = program.books.slot("datagrams_padded", listener)
@@ -38,10 +42,10 @@ class Settler:
         self._envelope = program.envelope
         self._ignored = program.ignored
         self._case_numbers = frozenset(case.number for case in program.envelope.cases.values())
-        self._routed = program.inbound.keys()
         self._counts = counts
+        self._cases = cases
 
-    def settle(self, data: bytes) -> tuple[PayloadCase, Message]:
+    def settle(self, data: bytes) -> tuple[Case, Message]:
         """The payload case and the payload of a datagram, whatever else is in it. Raises Rejected."""
         if len(data) > MAX_DATAGRAM:
             raise Rejected("truncated", f"{len(data)} bytes")
@@ -56,17 +60,18 @@ class Settler:
             self._counts[self._padded] += 1
         return self._found(envelope)
 
-    def _found(self, envelope: Message) -> tuple[PayloadCase, Message]:
+    def _found(self, envelope: Message) -> tuple[Case, Message]:
         name = envelope.WhichOneof(self._envelope.oneof)
         if name is None:
             reason, detail = why_no_payload(envelope, self._case_numbers)
             if reason == "unknown_case":
                 self._count_unhandled(UNKNOWN_CASE)
             raise Rejected(reason, detail)
-        case = self._envelope.cases[name]
-        if case.number in self._routed:
+        number = self._envelope.cases[name].number
+        case = self._cases.get(number)
+        if case is not None:
             return case, getattr(envelope, name)
-        if case.number in self._ignored:
+        if number in self._ignored:
             raise Rejected("ignored", name)
         self._count_unhandled(name)
         raise Rejected("unhandled", name)
