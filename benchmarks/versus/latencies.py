@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from benchmarks.versus.helpers import GPS, subscriber
 from benchmarks.versus.runs import Traffic, run, warm_up
 from benchmarks.versus.subscriber import Subscriber
@@ -9,6 +11,7 @@ from benchmarks.versus.trial import Metrics, Trial
 
 QUANTILES = ("p50", "p99", "p999")
 RATE = 1000
+THICK_QUANTILES = ("p50", "p99")
 
 
 def latency(trial: Trial, seconds: float) -> Metrics:
@@ -29,4 +32,17 @@ def latency(trial: Trial, seconds: float) -> Metrics:
         result.add_to(metrics, "")
     for name, latencies in found.items():
         metrics |= {f"{name}_{quantile}_us": latencies[quantile] for quantile in QUANTILES if latencies}
+    return metrics
+
+
+def latency_at(trial: Trial, rates: Sequence[float]) -> Metrics:
+    """`udp_*_us@RATE`: microseconds to the first destination, without a subscriber."""
+    metrics: Metrics = {}
+    with trial.started() as subject:
+        warm_up(subject, trial.pace)
+        for rate in trial.pace.rates(rates):
+            result = run(subject, Traffic(rate, trial.pace.seconds, stamped=True), trial.pace)
+            result.add_to(metrics, f"@{rate:g}")
+            if found := result.latency_us:
+                metrics |= {f"udp_{quantile}_us@{rate:g}": found[quantile] for quantile in THICK_QUANTILES}
     return metrics

@@ -13,12 +13,13 @@ from benchmarks.versus.figures import Aim
 from benchmarks.versus.flood import flood
 from benchmarks.versus.footprint import start_and_memory
 from benchmarks.versus.helpers import ALL_TOPICS, IMU
-from benchmarks.versus.latencies import latency
+from benchmarks.versus.latencies import THICK_QUANTILES, latency, latency_at
 from benchmarks.versus.limits import highest_rate, overload
 from benchmarks.versus.trial import Measure
 
 RATES = (1000, 5000, 20_000, 40_000)
 SIZE_RATES = (5000, 20_000)
+THICK_RATES = (5000, 20_000)
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,18 @@ SCENARIOS = (
                 for edge in ("udp", "udp_subscribed", "ros")
                 for quantile, limit in (("p50", 1.2), ("p99", 1.2), ("p999", 1.5))
             },
+        ),
+    ),
+    Scenario(
+        "latency_thick",
+        "One-way latency where datagrams come thick: gps_info to the first destination, nobody subscribes",
+        (OWN, Router("never", TABLES / "own_never.yaml"), PEER),
+        partial(latency_at, rates=THICK_RATES),
+        tuple(
+            Aim(f"udp_{quantile}_us@{rate:g}", against)
+            for rate in THICK_RATES
+            for quantile in THICK_QUANTILES
+            for against in ("peer", "never")
         ),
     ),
     Scenario(
