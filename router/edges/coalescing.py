@@ -12,7 +12,7 @@ SAMPLE = 32
 """So many datagrams tell how thick they come."""
 
 _THICK = 3
-"""Datagrams in the longest rest, on average, that are worth it. With fewer, the timer costs what the wake-ups do."""
+"""Datagrams in the longest rest, on average, with which resting begins. With fewer than two in a rest it ends."""
 
 FOR_SUBSCRIBERS = 8
 """So many datagrams are enough for one look while anybody subscribes: ROS queues are commonly ten deep, and a longer
@@ -26,20 +26,23 @@ _SHORTEST = 150e-6
 
 
 class Coalescing:
-    """One listener's. `longest` is the longest rest in ns; 0 for none at all. `enough` tells how many may gather."""
+    """One listener's rests, in seconds; 0 means that each datagram is waited for.
+
+    `longest` is the longest rest in ns; with 0 there is none. `enough` tells how many datagrams one look should get.
+    """
 
     def __init__(self, longest: int, enough: Callable[[], int]) -> None:
         self._longest = longest / 1e9
         self._enough = enough
         self._rest = 0.0
 
-    def begins(self, elapsed: int) -> bool:
-        """Whether to rest from now on, because SAMPLE datagrams came in so many ns."""
+    def first(self, elapsed: int) -> float:
+        """The rest after SAMPLE datagrams that were waited for and came in so many ns."""
         self._rest = elapsed / 1e9
-        return elapsed / 1e9 * _THICK < self._longest * SAMPLE
+        return self.next(SAMPLE) if self._rest * _THICK < self._longest * SAMPLE else 0.0
 
-    def rest(self, taken: int) -> float:
-        """Seconds until the next look, after one that got so many datagrams. 0: not worth it any more."""
+    def next(self, taken: int) -> float:
+        """The rest after a rest that ended with so many datagrams."""
         if taken < 2:
             return 0.0
         self._rest = min(self._longest, self._rest * self._enough() / taken)

@@ -77,46 +77,58 @@ class ReceiveThread:
                 if peer is None:
                     return
                 receive(data, peer)
-            if intake.coalescing.begins(monotonic_ns() - since):
-                taken = SAMPLE
-                while rest := intake.coalescing.rest(taken):
-                    time.sleep(rest)
-                    taken = intake.take(sys.maxsize)
+            rest = intake.coalescing.first(monotonic_ns() - since)
+            while rest:
+                time.sleep(rest)
+                rest = intake.coalescing.next(intake.take(sys.maxsize))
 
     def _from_many(self) -> None:
-        """Few datagrams per listener and turn, so that a flooded listener cannot starve the others."""
+        """Few datagrams per listener and turn, so that a flooded listener cannot starve the others.
+
+        Those that coalesce are not waited for, but looked at when they have rested.
+        """
         with select.epoll() as waiting:
             open_ones = {intake.descriptor: intake for intake in self._intakes}
             for descriptor in open_ones:
                 waiting.register(descriptor, select.EPOLLIN)
-            resting: dict[int, float] = {}  # until when, by time.monotonic
+            looks: dict[int, float] = {}  # of those that coalesce: when, by time.monotonic
             while open_ones:
                 ended = self._ended  # before looking: what arrives after that is still taken
-                for descriptor, _ in waiting.poll(_until(resting)):
-                    taken, rest = open_ones[descriptor].take_turn()
-                    if not taken and ended:
+                for descriptor in _ready(waiting, looks):
+                    taken, rest = open_ones[descriptor].take_one()
+                    if rest:
+                        waiting.modify(descriptor, 0)
+                        looks[descriptor] = time.monotonic() + rest
+                    elif not taken and ended:
                         waiting.unregister(descriptor)
                         del open_ones[descriptor]
-                    elif rest:
-                        waiting.modify(descriptor, 0)
-                        resting[descriptor] = time.monotonic() + rest
-                for descriptor in _rested(resting):
-                    waiting.modify(descriptor, select.EPOLLIN)
-                    del resting[descriptor]
+                for descriptor in _due(looks):
+                    taken, rest = open_ones[descriptor].take_some()
+                    if taken == _TURN:
+                        continue
+                    if rest:
+                        looks[descriptor] = time.monotonic() + rest
+                    else:
+                        waiting.modify(descriptor, select.EPOLLIN)
+                        del looks[descriptor]
 
 
-def _until(resting: Mapping[int, float]) -> float | None:
-    """Seconds until the first has rested."""
-    return max(0.0, min(resting.values()) - time.monotonic()) if resting else None
+def _ready(waiting: select.epoll, looks: Mapping[int, float]) -> list[int]:
+    """What has something. Waits for that until the next look is due; epoll alone would wait whole milliseconds."""
+    if not looks:
+        return [descriptor for descriptor, _ in waiting.poll()]
+    if (timeout := min(looks.values()) - time.monotonic()) > 0:
+        select.select([waiting], [], [], timeout)
+    return [descriptor for descriptor, _ in waiting.poll(0) if descriptor not in looks]
 
 
-def _rested(resting: Mapping[int, float]) -> list[int]:
-    now = time.monotonic() if resting else 0.0
-    return [descriptor for descriptor, until in resting.items() if until <= now]
+def _due(looks: Mapping[int, float]) -> list[int]:
+    now = time.monotonic() if looks else 0.0
+    return [descriptor for descriptor, at in looks.items() if at <= now]
 
 
 class _Intake:
-    """One listener's datagrams, and whether it rests between looks."""
+    """One listener's datagrams, and how long it rests between looks."""
 
     def __init__(self, listener: Listener, receive: Receive, size: int, enough: Callable[[], int]) -> None:
         self.descriptor = listener.socket.fileno()
@@ -124,7 +136,6 @@ class _Intake:
         self.receive = receive
         self.size = size
         self.coalescing = Coalescing(listener.coalesce, enough)
-        self._is_coalescing = False
         self._taken = 0  # since the last look at the clock, or the last rest
         self._since = 0
 
@@ -139,25 +150,21 @@ class _Intake:
             receive(data, peer)
         return most
 
-    def take_turn(self) -> tuple[int, float]:
-        """The turn of one of several listeners: how many datagrams it took, and the seconds for which it rests."""
-        return self._take_some() if self._is_coalescing else (self._take_one(), 0.0)
-
-    def _take_one(self) -> int:
-        taken = self.take(1)
+    def take_one(self) -> tuple[int, float]:
+        """For one of several listeners that was waited for: how many it took, and for how long it rests then."""
+        taken, rest = self.take(1), 0.0
         self._taken += taken
         if self._taken == SAMPLE:
             now = monotonic_ns()
-            self._is_coalescing = self.coalescing.begins(now - self._since)
+            rest = self.coalescing.first(now - self._since)
             self._taken, self._since = 0, now
-        return taken
+        return taken, rest
 
-    def _take_some(self) -> tuple[int, float]:
-        taken = self.take(_TURN)
+    def take_some(self) -> tuple[int, float]:
+        """For one of several listeners that has rested: the same, but the rest only after less than a whole turn."""
+        taken, rest = self.take(_TURN), 0.0
         self._taken += taken
-        if taken == _TURN:
-            return taken, 0.0
-        rest = self.coalescing.rest(self._taken)
-        self._is_coalescing = rest > 0
-        self._taken, self._since = 0, monotonic_ns()
+        if taken < _TURN:
+            rest = self.coalescing.next(self._taken)
+            self._taken, self._since = 0, monotonic_ns()
         return taken, rest

@@ -14,13 +14,12 @@ TIMER_LATE = 60e-6
 def settled(rate: float, enough: int, longest: int = LONGEST) -> tuple[float, int]:
     """The rest in seconds, and how many datagrams one look gets, of a steady stream; 0 and 1 without rests."""
     coalescing = Coalescing(longest, lambda: enough)
-    if not coalescing.begins(round(SAMPLE / rate * 1e9)):
-        return 0.0, 1
-    taken = SAMPLE
+    rest, taken = coalescing.first(round(SAMPLE / rate * 1e9)), 1
     for _ in range(100):
-        if not (rest := coalescing.rest(taken)):
+        if not rest:
             return 0.0, 1
         taken = round(rate * (rest + TIMER_LATE) / (1 - rate * HANDLING))
+        rest = coalescing.next(taken)
     return rest, taken
 
 
@@ -50,17 +49,17 @@ def test_a_rest_too_short_to_save_anything_is_none() -> None:
 def test_what_is_enough_is_asked_each_time() -> None:
     enough = FOR_SOCKETS
     coalescing = Coalescing(LONGEST, lambda: enough)
-    coalescing.begins(round(SAMPLE / 80_000 * 1e9))
-    alone = coalescing.rest(FOR_SOCKETS)
+    coalescing.first(round(SAMPLE / 80_000 * 1e9))
+    alone = coalescing.next(FOR_SOCKETS)
     enough = FOR_SOCKETS // 2
-    assert coalescing.rest(FOR_SOCKETS) == pytest.approx(alone / 2)
+    assert coalescing.next(FOR_SOCKETS) == pytest.approx(alone / 2)
 
 
 @pytest.mark.parametrize("taken", [0, 1])
 def test_rests_end_when_hardly_anything_comes(taken: int) -> None:
     coalescing = Coalescing(LONGEST, lambda: FOR_SOCKETS)
-    assert coalescing.begins(round(SAMPLE / 20_000 * 1e9))
-    assert coalescing.rest(taken) == 0.0
+    assert coalescing.first(round(SAMPLE / 20_000 * 1e9)) > 0
+    assert coalescing.next(taken) == 0.0
 
 
 @pytest.mark.parametrize("rate", [1, 3100, 100_000, 1e9])

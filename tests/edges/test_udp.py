@@ -8,15 +8,17 @@ import queue
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 
 import pytest
 from structlog.testing import capture_logs
 
 from router.compiler.program import ListenerPlan, SenderPlan
+from router.edges import receiver
 from router.edges.clock import wall_ns
-from router.edges.coalescing import FOR_SOCKETS, SAMPLE
+from router.edges.coalescing import FOR_SOCKETS, SAMPLE, Coalescing
 from router.edges.receiver import ReceiveThread
 from router.edges.udp import SO_RCVBUFFORCE, Listener, Sender
 from router.errors import SourceSpan, StartError
@@ -49,6 +51,29 @@ def peer(stack: ExitStack) -> socket.socket:
 
 def listen(stack: ExitStack, name: str = "rover") -> Listener:
     return stack.enter_context(closing(Listener(plan(name, receive_buffer=1 << 20), SPAN)))
+
+
+@pytest.fixture
+def rests(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
+    """How many datagrams each look of a coalescing listener got, and the rest in seconds that followed."""
+    told: list[tuple[int, float]] = []
+
+    class Watched(Coalescing):
+        def next(self, taken: int) -> float:
+            told.append((taken, super().next(taken)))
+            return told[-1][1]
+
+    monkeypatch.setattr(receiver, "Coalescing", Watched)
+    return told
+
+
+def pour(peer: socket.socket, listener: Listener, rate: float, datagrams: int) -> list[bytes]:
+    """Sends them one by one, evenly, or faster where this was late."""
+    start, sent = monotonic(), [b"%d" % number for number in range(datagrams)]
+    for number, data in enumerate(sent):
+        sleep(max(0.0, start + number / rate - monotonic()))
+        peer.sendto(data, listener.address)
+    return sent
 
 
 class Receiving:
@@ -115,6 +140,31 @@ def test_a_flood_is_received_whole_and_in_order_and_nobody_else_waits_for_its_en
     receiving.thread.stop()
     assert [data for name, data, _ in got if name == several[0].name] == flood
     assert sorted(name for name, data, _ in got if data == b"quiet") == sorted(one.name for one in several[1:])
+
+
+def test_what_comes_thick_is_looked_at_seldom(
+    several: list[Listener], peer: socket.socket, rests: list[tuple[int, float]]
+) -> None:
+    receiving = Receiving(several)
+    receiving.thread.start()
+    sent = pour(peer, several[0], 6000, 3000)
+    receiving.thread.stop()
+    assert receiving.all_received() == sent
+    assert max(taken for taken, _ in rests) > 1
+    assert 0 < max(rest for _, rest in rests) <= COALESCE / 1e9
+
+
+@pytest.mark.parametrize("others", [0, 1])
+def test_a_listener_that_never_coalesces_takes_each_at_once(
+    stack: ExitStack, peer: socket.socket, rests: list[tuple[int, float]], others: int
+) -> None:
+    never = Listener(replace(plan(receive_buffer=1 << 20), coalesce=0), SPAN)
+    receiving = Receiving([stack.enter_context(closing(never)), *(listen(stack, "other") for _ in range(others))])
+    receiving.thread.start()
+    sent = pour(peer, never, 1e9, 10 * SAMPLE)
+    receiving.thread.stop()
+    assert receiving.all_received() == sent
+    assert not rests
 
 
 def test_after_a_flood_each_datagram_is_waited_for_again(several: list[Listener], peer: socket.socket) -> None:
