@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from benchmarks.versus.trial import Metrics
 
-COUNTED = ("lost", "ros_lost")
+COUNTED = ("lost", "ros_lost", "too_slow")
 """Where one of these is above 0, what was measured under the same condition does not count."""
 
 
@@ -34,11 +34,11 @@ class Aim:
         return f">= {self.at_least:g}" if self.at_least is not None else ""
 
     def verdict(self, value: float, counts: bool) -> str:
-        """`met`, `missed`, or `void`; empty where there is no limit."""
-        if not self.text():
-            return ""
+        """`void`, `met` or `missed`; where there is no limit, `void` or empty."""
         if not counts:
             return "void"
+        if not self.text():
+            return ""
         high = self.at_most is not None and value > self.at_most
         low = self.at_least is not None and value < self.at_least
         return "missed" if high or low else "met"
@@ -66,7 +66,7 @@ def ratio(metric: str, ours: Sequence[Metrics], theirs: Sequence[Metrics]) -> Sp
 
 
 def counts(metric: str, rounds: Iterable[Metrics]) -> bool:
-    """Whether nothing got lost where this metric was measured."""
+    """Whether all that was sent arrived, and was as much as it should be, where this metric was measured."""
     _, at, condition = metric.partition("@")
     return not any(metrics.get(f"{name}{at}{condition}") for metrics in rounds for name in COUNTED)
 

@@ -23,6 +23,9 @@ from benchmarks.versus.processes import cores, spawn
 POLL_US = 1000
 """How often a sink looks that costs the sender no wake-ups, as if the receiver were another machine."""
 
+KEEPS_UP = 0.97
+"""Of the rate that is asked of a generator, what it has to reach."""
+
 SENSOR_BOARD = "127.0.0.30:0"
 STAMPED_CASE = "gps_info"
 

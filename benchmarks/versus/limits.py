@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from benchmarks.versus.helpers import Topic, load, sink
+from benchmarks.versus.helpers import KEEPS_UP, Topic, load, sink
 from benchmarks.versus.runs import warm_up
 from benchmarks.versus.subject import Subject
 from benchmarks.versus.subscriber import subscribed
@@ -16,8 +16,6 @@ BURST = 8
 SEARCH_SECONDS, CONFIRM_SECONDS = 1, 10
 LOOK_EVERY = 0.1
 """Seconds between looks at what the kernel dropped: a run that lost something need not go on."""
-KEEPS_UP = 0.97
-"""Of the rate that is asked of the generator, what it has to reach."""
 
 OVERLOAD_RATE, OVERLOAD_BURST = 250_000, 64
 OVERLOAD_SECONDS = 4

@@ -1,8 +1,9 @@
 """One run: traffic through a process for some seconds, what came out, and what that cost. Knows no aims.
 
-A run that others disturbed, or in which something got lost, is repeated, and the best one counts. What is lost then
-stays in the figures: `lost` are datagrams that should have reached a destination and did not, `ros_lost` messages that
-a subscriber should have got. A figure counts only where both are 0.
+A run that others disturbed, in which something got lost, or whose generator was too slow is repeated, and the best one
+counts. What is wrong with that stays in the figures: `lost` are datagrams that should have reached a destination and
+did not, `ros_lost` messages that a subscriber should have got, `too_slow` runs that had less traffic than was asked
+for. A figure counts only where all are 0.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.versus.contenders import datagrams
-from benchmarks.versus.helpers import STAMPED_CASE, load, publisher, sink
+from benchmarks.versus.helpers import KEEPS_UP, STAMPED_CASE, load, publisher, sink
 from benchmarks.versus.subject import Meter, Subject
 from benchmarks.versus.subscriber import Subscriber
 from benchmarks.versus.trial import Metrics, Pace
@@ -37,13 +38,17 @@ class Run:
     latency_us: dict[str, float] | None
 
     @property
+    def too_slow(self) -> bool:
+        return self.achieved < KEEPS_UP * self.asked
+
+    @property
     def is_sound(self) -> bool:
-        return self.noise <= NOISE_LIMIT and not self.lost and not self.ros_lost
+        return self.noise <= NOISE_LIMIT and not self.lost and not self.ros_lost and not self.too_slow
 
     def add_to(self, metrics: Metrics, suffix: str) -> None:
         """Adds what says whether figures with this suffix count."""
         metrics["noise"] = max(metrics.get("noise", 0), round(self.noise, 3))
-        for name, value in (("lost", self.lost), ("ros_lost", self.ros_lost)):
+        for name, value in (("lost", self.lost), ("ros_lost", self.ros_lost), ("too_slow", int(self.too_slow))):
             metrics[f"{name}{suffix}"] = metrics.get(f"{name}{suffix}", 0) + value
 
 
@@ -109,22 +114,23 @@ def _result(
     )
 
 
-def _best(attempt: Callable[[], Run], retries: int) -> Run:
-    best = attempt()
+def best(attempt: Callable[[], Run], retries: int) -> Run:
+    """The first sound one, else the one with the least wrong."""
+    found = attempt()
     for _ in range(retries):
-        if best.is_sound:
+        if found.is_sound:
             break
-        best = min(best, attempt(), key=lambda run: (run.lost + run.ros_lost, run.noise))
-    return best
+        found = min(found, attempt(), key=lambda run: (run.too_slow, run.lost + run.ros_lost, run.noise))
+    return found
 
 
 def run(subject: Subject, traffic: Traffic, pace: Pace, listening: Subscriber | None = None) -> Run:
-    return _best(lambda: _run(subject, traffic, listening), pace.retries)
+    return best(lambda: _run(subject, traffic, listening), pace.retries)
 
 
 def run_outbound(subject: Subject, rate: float, pace: Pace) -> Run:
     """ROS messages, which the subject makes datagrams of."""
-    return _best(lambda: _run_outbound(subject, rate, pace.seconds), pace.retries)
+    return best(lambda: _run_outbound(subject, rate, pace.seconds), pace.retries)
 
 
 def warm_up(subject: Subject, pace: Pace) -> None:
