@@ -21,6 +21,11 @@ def datagrams(payloads: Path) -> list[tuple[str, bytes]]:
     return [(words[0], bytes.fromhex(words[1])) for words in lines if words and words[0] != "#"]
 
 
+def payload_cases(payloads: Path) -> list[str]:
+    """Those that take turns, in their order."""
+    return [case for case, _ in datagrams(payloads)]
+
+
 @dataclass(frozen=True)
 class Ports:
     """All that a contender may bind or send to, on the loopback interface."""

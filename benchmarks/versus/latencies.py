@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from benchmarks.versus.helpers import GPS, subscriber
+from benchmarks.versus.helpers import GPS
 from benchmarks.versus.runs import Traffic, run, warm_up
-from benchmarks.versus.subscriber import Subscriber
+from benchmarks.versus.subscriber import subscribed
 from benchmarks.versus.trial import Metrics, Trial
 
 QUANTILES = ("p50", "p99", "p999")
@@ -24,12 +24,11 @@ def latency(trial: Trial, seconds: float) -> Metrics:
     with trial.started() as subject:
         warm_up(subject, trial.pace)
         alone = run(subject, traffic, trial.pace)
-        with subscriber([GPS]) as helper:
-            listening = Subscriber(helper, [GPS])
-            subscribed = run(subject, traffic, trial.pace, listening)
-            found = {"udp": alone.latency_us, "udp_subscribed": subscribed.latency_us, "ros": listening.stop()}
-    for result in (alone, subscribed):
+        with subscribed([GPS]) as listening:
+            heard = run(subject, traffic, trial.pace, listening)
+    for result in (alone, heard):
         result.add_to(metrics, "")
+    found = {"udp": alone.latency_us, "udp_subscribed": heard.latency_us, "ros": heard.ros_latency_us}
     for name, latencies in found.items():
         metrics |= {f"{name}_{quantile}_us": latencies[quantile] for quantile in QUANTILES if latencies}
     return metrics

@@ -64,7 +64,7 @@ def quantiles_us(samples_ns: Iterable[int]) -> dict[str, float] | None:
 
 
 def subscribe(node: Node, topics: Mapping[str, str]) -> None:
-    """Counts messages until SIGTERM, and tells the count on SIGUSR1.
+    """On SIGUSR1 and, at the end, on SIGTERM: tells what came since it told that the last time.
 
     Messages of GPS_TYPE are expected to carry the time of sending in utc_timestamp.
     """
@@ -73,6 +73,12 @@ def subscribe(node: Node, topics: Mapping[str, str]) -> None:
     def stop(*_: object) -> None:
         nonlocal running
         running = False
+
+    def tell(*_: object) -> None:
+        nonlocal received
+        say(received=received, latency_us=quantiles_us(latencies))
+        received = 0
+        latencies.clear()
 
     latencies: list[int] = []
     subscriptions = [
@@ -83,7 +89,7 @@ def subscribe(node: Node, topics: Mapping[str, str]) -> None:
         (subscription.handle, subscription.msg_type, kind == GPS_TYPE)
         for subscription, kind in zip(subscriptions, topics.values(), strict=True)
     ]
-    signal.signal(signal.SIGUSR1, lambda *_: say(received=received))
+    signal.signal(signal.SIGUSR1, tell)
     wait_for(node.count_publishers, topics)
     signal.signal(signal.SIGTERM, stop)
     wait_set = rclpy_implementation.WaitSet(len(topics), 0, 0, 0, 0, 0, node.context.handle)
@@ -98,7 +104,7 @@ def subscribe(node: Node, topics: Mapping[str, str]) -> None:
                 if is_stamped:
                     sent_at = struct.unpack_from("<q", taken[0], GPS_STAMP_OFFSET)[0]
                     latencies.append(time.monotonic_ns() - sent_at)
-    say(received=received, latency_us=quantiles_us(latencies))
+    tell()
 
 
 def publish(node: Node, rate: float, seconds: float) -> None:

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from benchmarks.versus.contenders import datagrams
+from benchmarks.versus.contenders import payload_cases
 from benchmarks.versus.helpers import KEEPS_UP, STAMPED_CASE, load, publisher, sink
 from benchmarks.versus.subject import Meter, Subject
 from benchmarks.versus.subscriber import Subscriber
@@ -25,7 +25,10 @@ NOISE_LIMIT = 0.05
 
 @dataclass(frozen=True)
 class Run:
-    """`asked` and `achieved` are per second; `drops` those of the subject's socket, `latency_us` of the first sink."""
+    """`asked` and `achieved` are per second; `drops` those of the subject's socket, `latency_us` of the first sink.
+
+    `ros_latency_us` is that of the subscriber.
+    """
 
     asked: float
     achieved: float
@@ -36,6 +39,7 @@ class Run:
     cpu_us: float
     noise: float
     latency_us: dict[str, float] | None
+    ros_latency_us: dict[str, float] | None = None
 
     @property
     def too_slow(self) -> bool:
@@ -67,7 +71,8 @@ class Traffic:
 
 def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Run:
     with sink(*subject.destinations(), wakes=traffic.stamped) as receiver:
-        seen = listening.received() if listening else 0
+        if listening:
+            listening.heard()  # what came before is no part of this run
         meter = Meter(subject)
         with load(
             subject.ports.listen[:1],
@@ -82,11 +87,13 @@ def _run(subject: Subject, traffic: Traffic, listening: Subscriber | None) -> Ru
         time.sleep(0.1)
         meter.read()
         arrived = receiver.stop()["ports"]
-    missing = 0
-    if listening:
-        cases = [STAMPED_CASE] if traffic.stamped else [case for case, _ in datagrams(subject.contender.payloads)]
-        missing = listening.expected(sent["sent"], cases) - (listening.received() - seen)
-    return _result(subject, traffic.rate, sent, meter, arrived, max(0, missing))
+    result = _result(subject, traffic.rate, sent, meter, arrived)
+    if not listening:
+        return result
+    cases = [STAMPED_CASE] if traffic.stamped else payload_cases(subject.contender.payloads)
+    heard = listening.heard()
+    missing = max(0, listening.expected(sent["sent"], cases) - heard.received)
+    return replace(result, ros_lost=missing, ros_latency_us=heard.latency_us)
 
 
 def _run_outbound(subject: Subject, rate: float, seconds: float) -> Run:
@@ -95,19 +102,18 @@ def _run_outbound(subject: Subject, rate: float, seconds: float) -> Run:
         source.go()
         sent = source.result()
         meter.read()
-        return _result(subject, rate, sent, meter, receiver.stop()["ports"], 0)
+        return _result(subject, rate, sent, meter, receiver.stop()["ports"])
 
 
-def _result(
-    subject: Subject, rate: float, sent: dict[str, Any], meter: Meter, arrived: list[dict[str, Any]], ros_lost: int
-) -> Run:
+def _result(subject: Subject, rate: float, sent: dict[str, Any], meter: Meter, arrived: list[dict[str, Any]]) -> Run:
+    """Of a run in which nobody subscribed."""
     return Run(
         asked=rate,
         achieved=sent["rate"],
         sent=sent["sent"],
         drops=meter.drops,
         lost=max(0, sent["sent"] * subject.contender.copies - sum(port["datagrams"] for port in arrived)),
-        ros_lost=ros_lost,
+        ros_lost=0,
         cpu_us=round(meter.cpu_ns / 1e3 / max(1, sent["sent"] - meter.drops), 2),
         noise=meter.noise,
         latency_us=arrived[0]["latency_us"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 from benchmarks.versus.helpers import Helper, Topic, subscriber
 
@@ -14,6 +15,13 @@ def number_of(wanted: Collection[str], sent: int, cases: Sequence[str]) -> int:
     return sum(rounds + (place < rest) for place, case in enumerate(cases) if case in wanted)
 
 
+class Heard(NamedTuple):
+    """How many messages came, and the latency of those that are stamped, in microseconds."""
+
+    received: int
+    latency_us: dict[str, float] | None
+
+
 class Subscriber:
     """One process that subscribes to some of a subject's topics."""
 
@@ -21,17 +29,13 @@ class Subscriber:
         self._helper = helper
         self._cases = {topic.case for topic in topics}
 
-    def received(self) -> int:
-        return int(self._helper.ask()["received"])
+    def heard(self) -> Heard:
+        """Since this was asked the last time."""
+        return Heard(**self._helper.ask())
 
     def expected(self, sent: int, cases: Sequence[str]) -> int:
         """How many messages so many datagrams should have become, whose payload cases took turns."""
         return number_of(self._cases, sent, cases)
-
-    def stop(self) -> dict[str, float]:
-        """Latencies in microseconds, of all stamped messages since the start."""
-        latencies: dict[str, float] = self._helper.stop()["latency_us"]
-        return latencies
 
 
 @contextmanager
