@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from benchmarks.versus.trial import Metrics
 
-COUNTED = ("lost", "ros_lost", "too_slow")
+COUNTED = ("lost", "ros_lost", "too_slow", "not_overloaded")
 """Where one of these is above 0, what was measured under the same condition does not count."""
 
 

@@ -117,6 +117,7 @@ def _overloaded(subject: Subject, pace: Pace, listening: Subscriber | None) -> M
     """Counted where they arrive, between two moments at which the subject's buffer is full.
 
     `lost` are those for which the sink had no room: the subject is not to blame, but was not counted right.
+    `not_overloaded` is 1 where the kernel had room for all that was offered meanwhile.
     """
     seconds = min(OVERLOAD_SECONDS, pace.longest)
     with (
@@ -125,16 +126,23 @@ def _overloaded(subject: Subject, pace: Pace, listening: Subscriber | None) -> M
     ):
         time.sleep(FILLING)
         before = receiver.ask()
+        drops = subject.kernel_drops()
         if listening:
             listening.heard()  # what came before does not count
         time.sleep(seconds)
+        not_overloaded = subject.kernel_drops() == drops
         after = receiver.ask()
         heard = listening.heard().received if listening else 0
         sent = generator.result()
         dropped = sum(port["drops"] for port in receiver.stop()["ports"])
     processed = after["datagrams"] - before["datagrams"]
     rate = processed * 1e9 / (after["at_ns"] - before["at_ns"])
-    metrics: Metrics = {"processed": round(rate), "offered": round(sent["rate"]), "lost": dropped}
+    metrics: Metrics = {
+        "processed": round(rate),
+        "offered": round(sent["rate"]),
+        "lost": dropped,
+        "not_overloaded": not_overloaded,
+    }
     if listening and (expected := listening.expected(processed, payload_cases(subject.contender.payloads))):
         metrics["ros_share"] = round(heard / expected, 4)
     return metrics

@@ -44,7 +44,7 @@ def test_aims_are_met_up_to_their_limit(aim: Aim, verdict: str) -> None:
 
 
 @pytest.mark.parametrize("loser", ["router", "peer"])
-@pytest.mark.parametrize("what", ["lost", "ros_lost", "too_slow"])
+@pytest.mark.parametrize("what", ["lost", "ros_lost", "too_slow", "not_overloaded"])
 def test_a_figure_does_not_count_where_something_was_missing(loser: str, what: str) -> None:
     rounds = {name: [{"cpu@5": 3.0, "cpu@9": 3.0, f"{what}@5": float(name == loser)}] for name in ("router", "peer")}
     aims = [Aim("cpu@5", "peer", at_most=2), Aim("cpu@5", "peer"), Aim("cpu@9", "peer", at_most=2)]
