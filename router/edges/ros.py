@@ -12,11 +12,11 @@ from rclpy.event_handler import EventHandler
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from router.compiler.program import TopicPlan
+from router.edges.ros_arrivals import RawSubscription
 from router.edges.ros_node import RCL_ERRORS, close_node, open_node
 from router.edges.ros_qos import Incompatible, PeerEvents, qos_profile
 from router.edges.ros_threads import EventThread, MessageThread, Receive
 from router.edges.ros_types import checked_class
-from router.edges.ros_wait import RawSubscription
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
 
@@ -90,10 +90,11 @@ class RosEdge:
     def start(self, receive: Mapping[str, Receive], failed: Callable[[Exception], None]) -> None:
         """Calls `receive[topic]` with each message's CDR bytes and the wall clock ns at which it set out.
 
-        One thread does that. What it raises goes to `failed`.
+        One thread does that. What it raises goes to `failed`. Raises StartError.
         """
         if self._subscriptions:
-            self._messages = MessageThread(self._node, self._subscriptions, receive, failed)
+            with _refusing("ROS messages cannot be received"):
+                self._messages = MessageThread(self._subscriptions, receive, failed)
             self._messages.start()
 
     def stop_receiving(self) -> None:

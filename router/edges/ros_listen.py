@@ -12,9 +12,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
+from router.edges.ros_arrivals import Arrivals, RawSubscription
 from router.edges.ros_node import RCL_ERRORS, close_node, open_node
 from router.edges.ros_types import installed_class
-from router.edges.ros_wait import RawSubscription, WaitSet
 from router.errors import StartError
 
 DEPTH = 100
@@ -41,10 +41,10 @@ class TopicListener:
                 self.type_name = type_name or publishers[0].topic_type
                 self._message_class = installed_class(self.type_name)
                 self._subscription = RawSubscription(node, self._message_class, topic, _qos(publishers))
+                self._arrivals = Arrivals([self._subscription])
             except (*RCL_ERRORS, ValueError) as error:
                 raise StartError(f"topic '{topic}' cannot be listened to: {error}") from error
-            self._wait_set = WaitSet(node, [self._subscription])
-            opening.callback(self._wait_set.close)
+            opening.callback(self._arrivals.close)
             self._open = opening.pop_all()
 
     def take(self, timeout: float) -> list[tuple[bytes, int]]:
@@ -52,7 +52,7 @@ class TopicListener:
 
         Ctrl-C is only noticed when the wait is over.
         """
-        self._wait_set.wait(int(timeout * 1e9))
+        self._arrivals.wait(timeout)
         return list(islice(iter(self._subscription.take, None), DEPTH))
 
     def message(self, cdr: bytes) -> Any:

@@ -1,5 +1,5 @@
-"""The two threads that wait on ROS. Messages have one of their own because a turn costs what its wait set holds:
-with the events of a rover's topics in it, a message would cost twice as much.
+"""The two threads that wait on ROS. Events have one of their own because a wait set is needed for them, and a turn
+costs what the wait set holds: with a rover's topics, more than a message does.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from rclpy.node import Node
 
 from router.edges.clock import monotonic_ns
 from router.edges.log import logger
-from router.edges.ros_wait import RawSubscription, WaitSet
+from router.edges.ros_arrivals import Arrivals, RawSubscription
+from router.edges.ros_wait import WaitSet
 
 Receive = Callable[[bytes, int], None]
 
@@ -27,8 +28,8 @@ TURN = 32
 class _WaitThread(ABC):
     """Waits and serves in turn until it is stopped. It starts once and stops once."""
 
-    def __init__(self, name: str, wait_set: WaitSet) -> None:
-        self._wait_set = wait_set
+    def __init__(self, name: str, waits_on: WaitSet | Arrivals) -> None:
+        self._waits_on = waits_on
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=name)
 
@@ -37,9 +38,9 @@ class _WaitThread(ABC):
 
     def stop(self) -> None:
         self._stopping = True
-        self._wait_set.wake()
+        self._waits_on.wake()
         self._thread.join()
-        self._wait_set.close()
+        self._waits_on.close()
 
     @abstractmethod
     def _run(self) -> None: ...
@@ -55,8 +56,9 @@ class EventThread(_WaitThread):
     def __init__(
         self, node: Node, of_publishers: Sequence[EventHandler], of_subscriptions: Sequence[EventHandler]
     ) -> None:
-        super().__init__("ros events", WaitSet(node, events=of_publishers))
-        self._looked_at = WaitSet(node, events=of_subscriptions)
+        self._waited_for = WaitSet(node, of_publishers)
+        super().__init__("ros events", self._waited_for)
+        self._looked_at = WaitSet(node, of_subscriptions)
         self._context = node.context
 
     def stop(self) -> None:
@@ -66,11 +68,11 @@ class EventThread(_WaitThread):
     def _run(self) -> None:
         look_at = 0
         while not self._stopping:
-            self._wait_set.wait(max(0, look_at - monotonic_ns()))
+            self._waited_for.wait(max(0, look_at - monotonic_ns()))
             if not self._context.ok():
                 logger.critical("ROS was shut down from outside the router: nothing can be published any more")
                 return
-            self._serve(self._wait_set)
+            self._serve(self._waited_for)
             if (now := monotonic_ns()) >= look_at:
                 look_at = now + LOOK_INTERVAL_NS
                 self._looked_at.wait(0)
@@ -92,19 +94,18 @@ class MessageThread(_WaitThread):
 
     def __init__(
         self,
-        node: Node,
         subscriptions: Mapping[str, RawSubscription],
         receive: Mapping[str, Receive],
         failed: Callable[[Exception], None],
     ) -> None:
         self._receive = {subscription: receive[topic] for topic, subscription in subscriptions.items()}
         self._failed = failed
-        super().__init__("ros", WaitSet(node, list(self._receive)))
+        self._arrivals = Arrivals(list(self._receive))
+        super().__init__("ros", self._arrivals)
 
     def _run(self) -> None:
         while not self._stopping:
-            self._wait_set.wait()
-            for subscription in self._wait_set.ready_subscriptions():
+            for subscription in self._arrivals.wait():
                 self._serve(subscription, TURN)
         for subscription in self._receive:
             self._serve(subscription, subscription.capacity)  # no more than that, however fast they come
@@ -118,3 +119,4 @@ class MessageThread(_WaitThread):
                 receive(*message)
             except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, is no reason to stop receiving
                 self._failed(error)
+        self._arrivals.again(subscription)

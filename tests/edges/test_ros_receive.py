@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -12,10 +13,14 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from rclpy.event_handler import EventHandler
+from rclpy.qos import QoSProfile
+from std_msgs.msg import String
 from structlog.testing import capture_logs
 
 from router.compiler.program import QosPlan, TopicPlan
 from router.edges.clock import wall_ns
+from router.edges.ros_arrivals import RawSubscription
+from router.edges.ros_node import close_node, open_node
 from router.edges.ros_threads import TURN
 from router.edges.ros_wait import WaitSet
 from router.errors import StartError
@@ -251,6 +256,36 @@ def test_ros_arguments_rename_subscribed_topics(publisher: Publish) -> None:
         ros.start({"greeting": lambda data, _: received.append(data)}, raising)
         publisher("salute").publish([HELLO])
         wait_until(lambda: received == [HELLO])
+
+
+def test_a_middleware_that_does_not_tell_of_new_messages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("router.edges.ros_arrivals._set_callback", lambda *_: 1)
+    with (
+        closing(open_ros(subscriptions=[string_topic()])) as ros,
+        pytest.raises(StartError, match=r"ROS messages cannot be received: .* does not tell of new messages"),
+    ):
+        ros.start({"greeting": lambda *_: None}, raising)
+
+
+def test_messages_are_announced_to_an_eventfd_until_there_is_none(publisher: Publish) -> None:
+    eventfd = os.eventfd(0)
+    node = open_node("receiver")
+    try:
+        subscription = RawSubscription(node, String, "greeting", QoSProfile(depth=10))
+        subscription.announce_to(eventfd)
+        peer = publisher("greeting")
+        peer.publish([HELLO])
+        assert os.eventfd_read(eventfd) == 1
+        subscription.announce_to(None)
+        peer.publish([HELLO])
+        peer.await_receipt()
+        assert [subscription.take() is not None for _ in range(3)] == [True, True, False]
+        os.set_blocking(eventfd, False)
+        with pytest.raises(BlockingIOError):
+            os.eventfd_read(eventfd)
+    finally:
+        close_node(node)
+        os.close(eventfd)
 
 
 def test_a_topic_that_cannot_be_subscribed_to_is_refused() -> None:

@@ -1,0 +1,123 @@
+"""Subscriptions that hand out CDR bytes, and the waiting for what arrives on them.
+
+What the bytes mean, and which thread waits, is not known here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import select
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import Any
+
+from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile
+
+from router.edges.clock import wall_ns
+
+MOST_KEPT = 5000
+"""What a subscription without a depth holds: Fast DDS keeps no more samples unless it is told to."""
+
+_set_callback = ctypes.CDLL(rclpy_implementation.__file__).rcl_subscription_set_on_new_message_callback
+_set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
+
+# To the middleware it is `void callback(const void *user_data, size_t messages)`, to libc `int eventfd_write(int fd,
+# uint64_t value)`: where calls pass arguments in registers, a descriptor for user data makes one of the other.
+_ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
+
+
+class RawSubscription:
+    """A subscription whose messages are taken as CDR bytes, when its owner wants to. It holds up to `capacity`."""
+
+    def __init__(
+        self,
+        node: Node,
+        message_class: Any,
+        topic: str,
+        qos: QoSProfile,
+        event_callbacks: SubscriptionEventCallbacks | None = None,
+    ) -> None:
+        """Raises one of `ros_node.RCL_ERRORS`."""
+        subscription = node.create_subscription(  # the callback is an executor's to call, and there is none
+            message_class, topic, lambda _: None, qos, raw=True, event_callbacks=event_callbacks
+        )
+        self.events: list[EventHandler] = subscription.event_handlers
+        self.capacity: int = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else MOST_KEPT
+        self._handle = subscription.handle
+        self._message_class = message_class
+
+    def take(self) -> tuple[bytes, int] | None:
+        """The oldest message that waits, and when it set out, in ns of the wall clock; None when there is none.
+
+        That is when it was sent by the sender's clock, or came in by ours if that is earlier. When it came in alone
+        would make new what is not: reliable DDS repairs a loss seconds later, keeps messages for late joiners, and
+        a process that was stopped finds all that was sent meanwhile coming in at once.
+        """
+        taken = self._handle.take_message(self._message_class, True)
+        if taken is None:
+            return None
+        cdr, info = taken
+        sent, came_in = info["source_timestamp"], info["received_timestamp"]  # 0 from a middleware that does not tell
+        return cdr, min(sent or came_in, came_in or sent) or wall_ns()
+
+    def announce_to(self, eventfd: int | None) -> None:
+        """Has the middleware add the number of new messages to `eventfd`, or to nothing from now on.
+
+        A thread of the middleware does that, which holds the reader's lock. No Python may run there: it would wait for
+        the interpreter while whoever has the interpreter waits for that lock, to take a message. When this returns,
+        the eventfd that was announced to before is not touched any more. Raises one of `ros_node.RCL_ERRORS`.
+        """
+        callback = None if eventfd is None else _ADD_TO_EVENTFD
+        if _set_callback(self._handle.pointer, callback, eventfd):
+            raise rclpy_implementation.RCLError("the middleware does not tell of new messages")
+
+
+class Arrivals:
+    """Waits until something arrived on one of these. For one thread; `wake` is for the others.
+
+    Each has an eventfd that is watched for writes (edge-triggered) and never read: a turn is one system call, however
+    many subscriptions there are. A wait set is told of every one of them in every turn, and detaches them after it.
+    """
+
+    def __init__(self, subscriptions: Sequence[RawSubscription]) -> None:
+        """Raises one of `ros_node.RCL_ERRORS`."""
+        self._subscriptions: dict[int, RawSubscription] = {}
+        with ExitStack() as opening:
+            self._epoll = opening.enter_context(select.epoll())
+            self._wake = self._watched(opening)
+            for subscription in subscriptions:
+                eventfd = self._watched(opening)
+                self._subscriptions[eventfd] = subscription
+                subscription.announce_to(eventfd)
+                opening.callback(subscription.announce_to, None)
+            self._open = opening.pop_all()
+        self._eventfds = {subscription: eventfd for eventfd, subscription in self._subscriptions.items()}
+        for subscription in subscriptions:
+            self.again(subscription)  # what came before somebody was told of it
+
+    def _watched(self, opening: ExitStack) -> int:
+        eventfd = os.eventfd(0, os.EFD_CLOEXEC)
+        opening.callback(os.close, eventfd)
+        self._epoll.register(eventfd, select.EPOLLIN | select.EPOLLET)
+        return eventfd
+
+    def wait(self, timeout: float | None = None) -> list[RawSubscription]:
+        """Those on which something may have arrived since they were last named. Waits for that, at most `timeout` s."""
+        ready = self._epoll.poll(timeout, len(self._subscriptions) + 1)
+        return [self._subscriptions[eventfd] for eventfd, _ in ready if eventfd != self._wake]
+
+    def again(self, subscription: RawSubscription) -> None:
+        """Has `wait` name it once more: not everything was taken."""
+        os.eventfd_write(self._eventfds[subscription], 1)
+
+    def wake(self) -> None:
+        """Ends the present wait, or the next one."""
+        os.eventfd_write(self._wake, 1)
+
+    def close(self) -> None:
+        """Nobody may wait any more."""
+        self._open.close()
