@@ -18,7 +18,7 @@ FOR_SUBSCRIBERS = 8
 """So many datagrams are enough for one look while anybody subscribes: ROS queues are commonly ten deep, and a longer
 burst of one topic would overflow them."""
 
-FOR_SOCKETS = 64
+FOR_SOCKETS = 32
 """So many are enough where they only go to sockets, which hold hundreds."""
 
 _SHORTEST = 150e-6
