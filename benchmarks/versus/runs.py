@@ -25,15 +25,10 @@ NOISE_LIMIT = 0.05
 
 @dataclass(frozen=True)
 class Run:
-    """`asked` and `achieved` are per second; `drops` those of the subject's socket, `latency_us` of the first sink.
-
-    `ros_latency_us` is that of the subscriber.
-    """
+    """`asked` and `achieved` are per second, `latency_us` is of the first sink, `ros_latency_us` of the subscriber."""
 
     asked: float
     achieved: float
-    sent: int
-    drops: int
     lost: int
     ros_lost: int
     cpu_us: float
@@ -110,8 +105,6 @@ def _result(subject: Subject, rate: float, sent: dict[str, Any], meter: Meter, a
     return Run(
         asked=rate,
         achieved=sent["rate"],
-        sent=sent["sent"],
-        drops=meter.drops,
         lost=max(0, sent["sent"] * subject.contender.copies - sum(port["datagrams"] for port in arrived)),
         ros_lost=0,
         cpu_us=round(meter.cpu_ns / 1e3 / max(1, sent["sent"] - meter.drops), 2),

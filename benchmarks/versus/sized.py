@@ -17,6 +17,8 @@ import yaml
 from benchmarks.versus.building import PROGRAMS, ROOT
 from benchmarks.versus.contenders import PAYLOADS, datagrams
 from benchmarks.versus.helpers import ALL_TOPICS
+from router.engine.framing import LEN
+from tests.engine.wire import tag
 
 SMALL, LARGE = 26, 260
 FIRST_COPY = 101
@@ -85,11 +87,7 @@ def _payloads(cases: Sequence[Case]) -> Iterator[str]:
     realistic = dict(reversed(datagrams(PAYLOADS)))  # of each case the first
     for case in cases:
         behind_tag = realistic[case.like][1:]  # the rover's tags have one byte
-        yield f"{case.name} {(_varint(case.number << 3 | 2) + behind_tag).hex()}"
-
-
-def _varint(value: int) -> bytes:
-    return bytes([value]) if value < 0x80 else bytes([value & 0x7F | 0x80]) + _varint(value >> 7)
+        yield f"{case.name} {(tag(case.number, LEN) + behind_tag).hex()}"
 
 
 def _table(cases: Sequence[Case]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.versus.runs import Run, best
 from benchmarks.versus.trial import Metrics
 
-SOUND = Run(1000, 1000, 4000, drops=0, lost=0, ros_lost=0, cpu_us=10, noise=0, latency_us=None)
+SOUND = Run(1000, 1000, lost=0, ros_lost=0, cpu_us=10, noise=0, latency_us=None)
 SLOW = replace(SOUND, achieved=969)
 LOSSY = replace(SOUND, lost=3)
 NOISY = replace(SOUND, noise=0.2)
