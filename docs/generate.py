@@ -85,9 +85,12 @@ def figures_page() -> str:
     return f"# Figures\n\n{_MADE}\n[How they were measured](performance.md).\n\n{page(found)}"
 
 
-PAGES = {"functions.md": functions_page, "metrics.md": metrics_page, "findings.md": findings_page}
-if RESULTS.exists():
-    PAGES["figures.md"] = figures_page
+PAGES = {
+    "functions.md": functions_page,
+    "metrics.md": metrics_page,
+    "findings.md": findings_page,
+    "figures.md": figures_page,
+}
 
 
 def main() -> None:
