@@ -31,6 +31,7 @@ METRICS = (
     Metric("datagrams_sent", "counter", ("route", "destination"), "Datagrams handed to the kernel."),
     Metric("sent_bytes", "counter", ("route", "destination"), "Bytes in those datagrams."),
     Metric("messages_published", "counter", ("route", "topic"), "Messages handed to the ROS middleware."),
+    Metric("messages_sent", "counter", ("route", "target"), "ROS messages that a gateway handed to its clients."),
     Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
     Metric("messages_filtered", "counter", ("route", "target"), "Messages that `when` held back, or nobody wanted."),
     Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
@@ -41,6 +42,9 @@ METRICS = (
     Metric("deadman_trips", "counter", ("route",), "How often commands stopped coming."),
     Metric("deadman_datagrams_sent", "counter", ("route", "destination"), "Datagrams that the deadman sent."),
     Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
+    Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
+    Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),
+    Metric("client_messages_dropped", "counter", ("route", "reason"), "Messages that single clients did not get."),
     Metric("qos_incompatible", "number", ("route", "topic", "policy"), "Peers that got or gave nothing for their QoS."),
 )
 
@@ -65,10 +69,40 @@ DROP_REASONS: Mapping[str, str] = {
     "send_buffer_full": "the kernel's send buffer was full",
     "send_error": "the network refused it; `Connection refused`: nobody listens there",
     "publish_error": "the ROS middleware refused it",
+    "too_large": "longer than a gateway takes (`max_message`)",
     "incomplete": "a frame that was not complete when its time was up, or had no room",
     "loop": "it came from this router: stays 0, because tables with loops are refused",
 }
 """Why a target did not get a message, with what each means."""
+
+GATEWAY_REJECT_REASONS: Mapping[str, str] = {
+    "too_large": "longer than the gateway takes, also after decompression",
+    "malformed": "no packet or document of the gateway's format",
+    "source_mismatch": "not from the host that the gateway sends to",
+    "not_allowed": "a topic that `inbound` does not have",
+    "wrong_type": "another type than `inbound` says",
+    "invalid": "a field is missing, unknown, of another type or out of range",
+    "rate_limited": "schemas were asked for too often",
+}
+"""Why a gateway refused what a client sent, with what each means."""
+
+TOPIC_STATES: Mapping[str, str] = {
+    "served": "a client gets it",
+    "several_types": "served as the type that most of its publishers have",
+    "not_installed": "not served: its type is not installed here",
+}
+"""What a gateway can do with a topic that its patterns match."""
+
+CLIENT_DROP_REASONS: Mapping[str, str] = {
+    "superseded": "a newer value of the topic took its place, because the client is slow",
+    "too_large": "longer than the transport carries",
+    "send_error": "the network refused it",
+    "left": "it waited for a client that left",
+}
+"""Why one client of a gateway did not get a message, with what each means."""
+
+CLIENTS = "clients"
+"""The `target` and `source` label of a gateway's clients."""
 
 QOS_POLICIES = ("reliability", "durability", "deadline", "liveliness")
 """The policies that can keep a publisher and a subscriber apart."""

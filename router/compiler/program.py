@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from types import CodeType
 
 from router.compiler.books import Books
-from router.table.model import Address, Framing, Keep, Priority, RouteTable
+from router.table.model import Address, Framing, Gateway, Keep, Priority, RouteTable
+from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase
 
 STRANGER = None
@@ -106,6 +107,28 @@ class DeadmanPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class InboundPlan:
+    """A topic that a gateway's clients may publish on, with its type. `ttl` in ns, `max_rate` in Hz.
+
+    The datagrams of its deadman are CDR bytes, and the topic stands where a route's deadman has an endpoint.
+    """
+
+    topic: str
+    type: MessageType
+    ttl: int | None
+    max_rate: float | None
+    deadman: DeadmanPlan | None
+
+
+@dataclass(frozen=True, slots=True)
+class GatewayPlan:
+    """A gateway as the table has it, and what its clients may publish, by topic. The topics are absolute names."""
+
+    settings: Gateway
+    inbound: Mapping[str, InboundPlan]
+
+
+@dataclass(frozen=True, slots=True)
 class Handler:
     """One route as generated Python, for a route from ROS one for each of its topics.
 
@@ -148,3 +171,4 @@ class Program:
     deadmen: tuple[DeadmanPlan, ...]
     ignored: frozenset[int]
     protos_sha256: str
+    gateways: tuple[GatewayPlan, ...] = ()

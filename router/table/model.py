@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
@@ -255,6 +255,107 @@ class Route:
         )
 
 
+class Transport(enum.Enum):
+    """How a gateway reaches its clients."""
+
+    UDP = "udp"
+    TCP = "tcp"
+    WEBSOCKET = "websocket"
+    ZENOH = "zenoh"
+
+
+class GatewayFormat(enum.Enum):
+    """What a gateway's clients read: packets with a binary header, or JSON documents."""
+
+    GATEWAY_V1 = "gateway_v1"
+    GATEWAY_V2 = "gateway_v2"
+    JSON = "json"
+    JSON_LINES = "json_lines"
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPattern:
+    """A glob over absolute topic names, or a regular expression for the whole of them."""
+
+    text: str
+    is_regex: bool
+    span: SourceSpan
+
+
+EACH = 0
+"""The period of a gateway that sends every message."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicRate:
+    """How often topics that `pattern` matches are sent: a period in ns, or EACH."""
+
+    pattern: TopicPattern
+    period: int
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohSettings:
+    """Where a gateway meets its Zenoh network. `key` is what its key expressions begin with; locators as Zenoh has
+    them, `tcp/192.168.0.10:7447`. `mode` is peer, client or router.
+    """
+
+    key: Located[str]
+    mode: str = "peer"
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class InboundDeadman:
+    """What is published in place of a client's messages that stopped coming. `span` is the key `deadman`; in ns."""
+
+    span: SourceSpan
+    timeout: Located[int]
+    fields: FieldMap
+    repeat: Located[int]
+
+
+@dataclass(frozen=True, slots=True)
+class Inbound:
+    """A topic that a gateway's clients may publish on. `max_rate` in Hz, `ttl` in ns."""
+
+    topic: Topic
+    span: SourceSpan
+    ttl: Located[int] | None = None
+    max_rate: Located[float] | None = None
+    deadman: InboundDeadman | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Gateway:
+    """ROS topics for clients that speak neither ROS nor protobuf, and back. `span` is its name in the table.
+
+    `address` is where clients are (udp) or are waited for (tcp, websocket); None for Zenoh. `receive` is the local
+    address of a udp gateway. Periods in ns, sizes in bytes. `compression` is a zstd level, 0 for none. `rates` are
+    asked in order; what none matches has `publish_period`.
+    """
+
+    name: str
+    span: SourceSpan
+    transport: Located[Transport]
+    address: Located[Address] | None
+    zenoh: ZenohSettings | None
+    receive: Located[Address] | None
+    format: GatewayFormat
+    include: tuple[TopicPattern, ...]
+    exclude: tuple[TopicPattern, ...]
+    publish_period: int
+    schema_period: int
+    discovery_period: int
+    compression: int
+    rates: tuple[TopicRate, ...]
+    max_datagram: int
+    max_message: int
+    max_clients: int
+    inbound: tuple[Inbound, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class RouteTable:
     """One table after `extends` and variables. `files` are all files read, the table itself first.
@@ -275,4 +376,5 @@ class RouteTable:
     endpoints: Mapping[str, Endpoint]
     routes: tuple[Route, ...]
     routes_span: SourceSpan
+    gateways: Mapping[str, Gateway] = field(default_factory=dict)
     broken: frozenset[str] = frozenset()
