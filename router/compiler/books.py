@@ -69,7 +69,6 @@ DROP_REASONS: Mapping[str, str] = {
     "send_buffer_full": "the kernel's send buffer was full",
     "send_error": "the network refused it; `Connection refused`: nobody listens there",
     "publish_error": "the ROS middleware refused it",
-    "too_large": "longer than a gateway takes (`max_message`)",
     "incomplete": "a frame that was not complete when its time was up, or had no room",
     "loop": "it came from this router: stays 0, because tables with loops are refused",
 }
@@ -85,6 +84,15 @@ GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "rate_limited": "schemas were asked for too often",
 }
 """Why a gateway refused what a client sent, with what each means."""
+
+GATEWAY_DROP_REASONS: Mapping[str, str] = {
+    "mapping_error": "no message of the topic's type, or text that is no UTF-8",
+    "too_large": "longer than `max_message`",
+}
+"""Why no client of a gateway got a ROS message, with what each means."""
+
+INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
+"""Those of DROP_REASONS for which a client's message is not published."""
 
 TOPIC_STATES: Mapping[str, str] = {
     "served": "a client gets it",
