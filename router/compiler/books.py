@@ -87,7 +87,8 @@ GATEWAY_REJECT_REASONS: Mapping[str, str] = {
 
 GATEWAY_DROP_REASONS: Mapping[str, str] = {
     "mapping_error": "no message of the topic's type, or text that is no UTF-8",
-    "too_large": "longer than `max_message`",
+    "too_large": "longer than `max_message`, or than a datagram",
+    "overloaded": "it came while earlier ones were still being converted",
 }
 """Why no client of a gateway got a ROS message, with what each means."""
 
@@ -103,7 +104,6 @@ TOPIC_STATES: Mapping[str, str] = {
 
 CLIENT_DROP_REASONS: Mapping[str, str] = {
     "superseded": "a newer value of the topic took its place, because the client is slow",
-    "too_large": "longer than the transport carries",
     "send_error": "the network refused it",
     "left": "it waited for a client that left",
 }
