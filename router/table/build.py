@@ -1,6 +1,6 @@
 """Nodes that have their shape to the typed route table; what has a finding is left out and named in `broken`.
 
-Knows the schema's shape and relies on it. Routes are built in `build_routes`.
+Knows the schema's shape and relies on it. Routes are built in `build_routes`, gateways in `build_gateways`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar, Union
 
-from router.errors import Code, Diagnostic, SourceSpan
-from router.table.address import BadAddressError, parse_address
+from router.errors import Diagnostic
+from router.table.build_addresses import local_address, remote_address
+from router.table.build_gateways import build_gateway
 from router.table.build_routes import build_case, named
 from router.table.model import (
     Address,
@@ -61,6 +62,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         endpoints=builder.each(root, "endpoints", _endpoint),
         routes=named(builder.each(root, "routes", build_case, salvage=sound_part).values()),
         routes_span=routes.key.span,
+        gateways=builder.each(root, "gateways", build_gateway, salvage=sound_part),
         broken=frozenset(builder.broken),
     )
 
@@ -143,7 +145,7 @@ def _node(entry: Entry) -> NodeSettings:
 
 
 def _metrics(entry: Entry) -> Located[Address]:
-    return _local_address(mapping(entry.value))
+    return local_address(text(mapping(entry.value), "address"))
 
 
 def _listener(entry: Entry) -> Listener:
@@ -152,7 +154,7 @@ def _listener(entry: Entry) -> Listener:
     return Listener(
         name=entry.key.text,
         span=entry.key.span,
-        address=_local_address(settings),
+        address=local_address(text(settings, "address")),
         framing=Framing(text_or(settings, "framing", Framing.ZERO_TRIMMED.value)),
         receive_buffer=UnsoundError.guard(parse_size, text(settings, "receive_buffer"))
         if size
@@ -163,36 +165,13 @@ def _listener(entry: Entry) -> Listener:
 
 def _endpoint(entry: Entry) -> Endpoint:
     settings = mapping(entry.value)
-    address = _address(settings)
     budget = optional_text(settings, "budget")
-    first = int(address.value.host.partition(".")[0])
-    if first == 0 or first >= 224:
-        raise _bad_address(address.span, f"{address.value.host} is not the address of one machine")
     return Endpoint(
         name=entry.key.text,
         span=entry.key.span,
-        address=address,
+        address=remote_address(text(settings, "address")),
         kind=EndpointKind(text(settings, "kind").value),
         source_port=integer(settings, "source_port"),
         trim_trailing_zeros=boolean(settings, "trim_trailing_zeros"),
         budget=Located(UnsoundError.guard(parse_data_rate, budget), budget.span) if budget else None,
     )
-
-
-def _local_address(settings: MappingNode) -> Located[Address]:
-    address = _address(settings)
-    if int(address.value.host.partition(".")[0]) >= 224:
-        raise _bad_address(address.span, f"{address.value.host} is not an address that this machine can have")
-    return address
-
-
-def _address(settings: MappingNode) -> Located[Address]:
-    written = text(settings, "address")
-    try:
-        return Located(parse_address(written.value), written.span)
-    except BadAddressError as error:
-        raise _bad_address(written.span, error.what, error.hint) from error
-
-
-def _bad_address(span: SourceSpan, what: str, hint: str = "broadcast and multicast are not supported") -> UnsoundError:
-    return UnsoundError(Diagnostic(span, Code.BAD_ADDRESS, what, hint))

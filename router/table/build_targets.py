@@ -9,7 +9,7 @@ from router.errors import SourceSpan
 from router.table.build_fields import fields, optional_expression
 from router.table.model import Destination, Keep, Located, Qos, Topic
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode
-from router.table.reading import UnsoundError, duration, integer, located, mapping, optional_text, scalar, text
+from router.table.reading import UnsoundError, duration, integer, located, mapping, number_or_text, optional_text, text
 from router.table.units import parse_rate
 
 
@@ -69,11 +69,8 @@ def _max_rate(settings: MappingNode) -> Located[float] | None:
     node = settings.get("max_rate")
     if node is None:
         return None
-    found = scalar(node)
-    if found.value is None or isinstance(found.value, bool):
-        raise TypeError(f"a rate, not {found.value!r}")
-    written: Located[str | float] = Located(found.value, found.span)
-    return Located(UnsoundError.guard(parse_rate, written), found.span)
+    written = number_or_text(node)
+    return Located(UnsoundError.guard(parse_rate, written), written.span)
 
 
 def _keep(settings: MappingNode) -> Located[Keep] | None:

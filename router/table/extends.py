@@ -1,7 +1,8 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
-Knows `extends`, that a route is either carried or ignored, and that a deadman sends one payload. Mappings merge key
-by key, everything else replaces; every node keeps the span of the file in which it was written.
+Knows `extends`, that a route is either carried or ignored, that a deadman sends one payload and a gateway has one
+transport. Mappings merge key by key, everything else replaces; every node keeps the span of the file in which it was
+written.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ KEY = "extends"
 IGNORE = "ignore"
 _ROUTE_DEPTH = len(("routes", "case"))
 _PAYLOAD = ("deadman", "send")
+_GATEWAY_DEPTH = len(("gateways", "name"))
 
 
 def load_chain(
@@ -63,7 +65,9 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
-    """Nothing to merge: a route that one of the two ignores and the other carries; payloads of two cases."""
+    """Nothing to merge: a route that one of the two ignores and the other carries; two payloads; two transports."""
+    if path[0] == "gateways":
+        return path[_GATEWAY_DEPTH:] == ("transport",) and over.entries.keys() != base.entries.keys()
     if path[0] != "routes":
         return False
     if path[_ROUTE_DEPTH:] == _PAYLOAD:

@@ -85,6 +85,14 @@ def integer(settings: MappingNode, key: str) -> Located[int] | None:
     return Located(int(found.value), found.span)
 
 
+def number_or_text(node: Node | None) -> Located[str | float]:
+    """A rate, say: `0.5` or `0.5 Hz`."""
+    found = scalar(node)
+    if found.value is None or isinstance(found.value, bool):
+        raise TypeError(f"a number or text, not {found.value!r}")
+    return Located(found.value, found.span)
+
+
 def boolean(settings: MappingNode, key: str) -> bool:
     """A truth value that is false unless it is given."""
     node = settings.get(key)

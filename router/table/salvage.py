@@ -1,6 +1,6 @@
-"""What can still be checked of a route that has findings, so that one run shows all of them.
+"""What can still be checked of a route or a gateway that has findings, so that one run shows all of them.
 
-Knows which keys make the rest of a route meaningless by their absence, nothing else of what they mean.
+Knows which keys make the rest of it meaningless by their absence, nothing else of what they mean.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from dataclasses import replace
 from router.table.nodes import Entry, MappingNode, Node, SequenceNode, is_sound
 
 _INDISPENSABLE = frozenset(
-    {"source", "ignore", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count", "order"}
+    {"source", "ignore", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count", "order", "transport"}
 )
-"""Keys without which a route, a topic, a destination, a deadman or a collect says nothing."""
+"""Keys without which a route, a topic, a destination, a deadman, a collect or a gateway says nothing."""
 
-_SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"})
+_SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"}, {"transport"})
 """Keys with which it says something, whatever else it lacks or has too much."""
 
 _USES_NAMES_OF = {"for_each": ("fields", "destinations", "topics"), "collect": ("topics",)}
@@ -22,7 +22,7 @@ _USES_NAMES_OF = {"for_each": ("fields", "destinations", "topics"), "collect": (
 
 
 def sound_part(entry: Entry) -> Entry | None:
-    """A case without what has findings of its own, so that the rest is checked in the same run."""
+    """A case or a gateway without what has findings of its own, so that the rest is checked in the same run."""
     value = None if entry.key.broken else _sound_part(entry.value)
     return Entry(entry.key, value) if value else None
 

@@ -25,6 +25,8 @@ _TYPES = {
     "boolean": "true or false",
 }
 _LONGEST = 60
+_ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
+"""Keys under which an address stands."""
 _NAME_DEPTH = len(("endpoints", "name"))
 NAME_FIELDS = ("fields", "send")
 """Keys under which the names of fields stand, each with an expression."""
@@ -72,7 +74,7 @@ def finding(misfit: Misfit, tree: Node) -> Diagnostic:
         return _missing_key(misfit, tree)
     if keyword == "type":
         return Diagnostic(span, Code.WRONG_TYPE, f"{name} {_expected(misfit)}, not {shown(misfit.value)}")
-    if keyword == "pattern" and path[-1:] == ("address",):
+    if keyword == "pattern" and path[-1] in _ADDRESSES:
         return _bad_address(str(misfit.value), span)
     if keyword == "uniqueItems":
         return _repeated(misfit, tree)

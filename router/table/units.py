@@ -29,6 +29,20 @@ MAX_SIZE = (1 << 30) - 1
 MAX_DATA_RATE = 10**12
 """More than any link carries; what is multiplied with nanoseconds stays a small integer."""
 
+EACH = "each"
+"""In place of a gateway's period or rate: every message is sent."""
+
+MIN_PERIOD = 1_000_000
+"""ns. A gateway that ticks faster does nothing else; `each` is meant for that."""
+
+MIN_INTERVAL = 10_000_000
+"""ns. Looking at the ROS graph, and sending schemas, costs more than data."""
+
+MIN_DATAGRAM, MAX_DATAGRAM = 576, 65507
+"""What every IPv4 host takes, and the longest that UDP carries."""
+
+MIN_MESSAGE, MAX_MESSAGE = 1000, 256 << 20
+
 
 def parse_duration(text: str) -> int:
     """`500ms` as nanoseconds."""
@@ -43,6 +57,26 @@ def parse_coalesce(text: str) -> int:
 def parse_size(text: str) -> int:
     """`4MiB` or `64kB` as bytes."""
     return _exact(text, _BYTES, "bytes", MAX_SIZE)
+
+
+def parse_datagram_size(text: str) -> int:
+    """`1400B` as bytes of a UDP datagram."""
+    return _exact(text, _BYTES, "bytes", MAX_DATAGRAM, MIN_DATAGRAM)
+
+
+def parse_message_size(text: str) -> int:
+    """`16MiB` as bytes of one message's text."""
+    return _exact(text, _BYTES, "bytes", MAX_MESSAGE, MIN_MESSAGE)
+
+
+def parse_period(text: str) -> int:
+    """`500ms` as nanoseconds, or `each` as 0."""
+    return 0 if text == EACH else _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION, MIN_PERIOD)
+
+
+def parse_interval(text: str) -> int:
+    """`5s` as nanoseconds, for what is done now and then."""
+    return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION, MIN_INTERVAL)
 
 
 def parse_data_rate(text: str) -> int:
@@ -61,7 +95,17 @@ def parse_rate(value: str | float) -> float:
     return float(value)
 
 
-def _exact(text: str, units: Mapping[str, int], base: str, largest: int) -> int:
+def parse_topic_rate(value: str | float) -> int:
+    """`50 Hz` or a plain number as a period in nanoseconds, or `each` as 0."""
+    if value == EACH:
+        return 0
+    period = round(1e9 / parse_rate(value))
+    if not MIN_PERIOD <= period <= MAX_DURATION:
+        raise ValueError(f"a topic's rate is at most {10**9 // MIN_PERIOD} Hz, or 'each'")
+    return period
+
+
+def _exact(text: str, units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> int:
     match = _QUANTITY.fullmatch(text)
     if not match or match[3] not in units:
         raise ValueError(f"'{text}' is not a number with a unit of {', '.join(units)}")
@@ -69,6 +113,7 @@ def _exact(text: str, units: Mapping[str, int], base: str, largest: int) -> int:
     amount, rest = divmod(int(match[1] + fraction) * units[match[3]], int("1" + "0" * len(fraction)))
     if rest:
         raise ValueError(f"'{text}' is not a whole number of {base}")
-    if not 0 < amount <= largest:
-        raise ValueError(f"'{text}' must be above zero and at most {largest} {base}")
+    if not smallest <= amount <= largest:
+        least = "above zero" if smallest == 1 else f"at least {smallest}"
+        raise ValueError(f"'{text}' must be {least} and at most {largest} {base}")
     return amount
