@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # usage: build.sh OUT_DIR PREFIX...
 #
-# OUT_DIR  gets load, sink, bare_forward and cpp_peer
+# OUT_DIR  gets load, sink, bare_forward, cpp_peer, ros_load and, where its libraries are installed, gateway_peer
 # PREFIX   where ROS packages are installed, the interfaces of schemas/comms among them
 #
 # `python -m benchmarks.versus` calls it and knows what it needs. The protoc has to be the system's: what the one in
@@ -39,3 +39,23 @@ g++ -O2 -DNDEBUG -std=c++17 -I. -c envelope.cc
 g++ -O2 -DNDEBUG -std=c++17 -Wall -Wextra -rdynamic "-I$here" -I. "${options[@]}" "$here/cpp_peer.cpp" envelope.o \
   -lcomms__rosidl_typesupport_c -lcomms__rosidl_generator_c -lrcl -lrmw -lrcutils -lrosidl_runtime_c \
   -lprotobuf -lpthread -Wl,--allow-shlib-undefined -o "$out/cpp_peer"
+
+gcc -O2 -Wall -Wextra -std=gnu11 -rdynamic "-I$here" "${options[@]}" "$here/ros_load.c" \
+  -lrcl -lrmw -lrcutils -lrosidl_runtime_c -Wl,--allow-shlib-undefined -o "$out/ros_load"
+
+# Only `python -m benchmarks.gateway` and tests/gateway/golden/capture.py want this one.
+rm -f "$out/gateway_peer"
+missing=()
+[ -f /usr/include/nlohmann/json.hpp ] || missing+=(nlohmann-json3-dev)
+[ -f /usr/include/zstd.h ] || missing+=(libzstd-dev)
+if [ ${#missing[@]} -gt 0 ]; then
+  printf 'gateway_peer is left out; on Debian or Ubuntu: apt-get install %s\n' "${missing[*]}" >&2
+  exit 0
+fi
+middleware=rmw_fastrtps_cpp  # the wheels have no rmw_implementation, which would choose one
+for prefix; do
+  if [ -f "$prefix/lib/librmw_implementation.so" ]; then middleware=rmw_implementation; fi
+done
+g++ -O2 -DNDEBUG -std=c++17 -Wall -Wextra -rdynamic "-I$here" "${options[@]}" "$here/gateway_peer.cpp" \
+  -lrcl -lrmw "-l$middleware" -lrcutils -lrcpputils -lament_index_cpp -lrosidl_runtime_c -lzstd -lpthread \
+  -Wl,--allow-shlib-undefined -o "$out/gateway_peer"
