@@ -1,0 +1,105 @@
+"""Which topics a gateway sends, and how often: its patterns, over absolute topic names.
+
+Pure: knows no ROS graph. Patterns are expected to be sound; `pattern_problem` says whether one is.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection
+from typing import NamedTuple
+
+from router.table.model import Gateway, TopicPattern
+
+_WILDCARDS = re.compile(r"[*?]")
+_PART = re.compile(r"\*\*|(?:[A-Za-z0-9_?]|\*(?!\*))+")
+_ANY_PARTS = "**"
+
+
+class PatternProblem(NamedTuple):
+    what: str
+    hint: str
+
+
+def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
+    """Why a pattern is none."""
+    if pattern.is_regex:
+        try:
+            re.compile(pattern.text)
+        except (re.error, OverflowError) as error:
+            return PatternProblem(f"'{pattern.text}' is not a regular expression: {error}", "they are Python's")
+        return None
+    if not pattern.text.startswith("/"):
+        hint = f"patterns are for absolute topic names; did you mean '/{pattern.text}' or '/**/{pattern.text}'?"
+        return PatternProblem(f"'{pattern.text}' does not begin with '/'", hint)
+    if wrong := [part for part in _parts(pattern.text) if not _PART.fullmatch(part)]:
+        what = f"'{wrong[0]}' is no part of a topic's name" if wrong[0] else "there is nothing between two '/'"
+        hint = "parts are letters, digits, '_', '*' and '?', or '**' alone; {regex: ...} can say more"
+        return PatternProblem(f"'{pattern.text}' matches no topic: {what}", hint)
+    return None
+
+
+class TopicSelector:
+    """The choice of one gateway. `inbound` are the absolute names of what its own clients publish."""
+
+    def __init__(self, settings: Gateway, inbound: Collection[str]) -> None:
+        include = settings.include or (TopicPattern("/**", is_regex=False, span=settings.span),)
+        self._include = [(pattern, _matcher(pattern)) for pattern in include]
+        self._exclude = [_matcher(pattern) for pattern in settings.exclude]
+        self._rates = [(_matcher(rate.pattern), rate) for rate in settings.rates]
+        self._named = {pattern.text for pattern in settings.include if is_name(pattern)}
+        self._inbound = frozenset(inbound)
+        self._publish_period = settings.publish_period
+
+    def selects(self, topic: str) -> bool:
+        return self.chosen_by(topic) is not None
+
+    def chosen_by(self, topic: str) -> TopicPattern | None:
+        """The first pattern that includes the topic; None where it is not sent.
+
+        Hidden topics, and those that its clients publish, are sent only under their very name.
+        """
+        if any(matches(topic) for matches in self._exclude):
+            return None
+        if (is_hidden(topic) or topic in self._inbound) and topic not in self._named:
+            return None
+        return next((pattern for pattern, matches in self._include if matches(topic)), None)
+
+    def period(self, topic: str) -> int:
+        """In ns, or EACH."""
+        return next((rate.period for matches, rate in self._rates if matches(topic)), self._publish_period)
+
+    def rated_by(self, topic: str) -> TopicPattern | None:
+        """The pattern of `rates` that the period is of; None where it is `publish_period`."""
+        return next((rate.pattern for matches, rate in self._rates if matches(topic)), None)
+
+
+def is_hidden(topic: str) -> bool:
+    """ROS hides what has a part that begins with `_`, such as the topics of actions."""
+    return any(part.startswith("_") for part in _parts(topic))
+
+
+def is_name(pattern: TopicPattern) -> bool:
+    """The pattern is the name of one topic."""
+    return not pattern.is_regex and not _WILDCARDS.search(pattern.text)
+
+
+def _parts(text: str) -> list[str]:
+    return text.split("/")[1:]
+
+
+def _matcher(pattern: TopicPattern) -> Callable[[str], object]:
+    return re.compile(pattern.text if pattern.is_regex else _regex(pattern.text)).fullmatch
+
+
+def _regex(glob: str) -> str:
+    """`**` may stand for no part at all, but at the end: `/a/**` is what is below `/a`."""
+    *inner, last = _parts(glob)
+    parts = [r"(?:/[^/]+)*" if part == _ANY_PARTS else _part_regex(part) for part in inner]
+    return "".join([*parts, r"(?:/[^/]+)+" if last == _ANY_PARTS else _part_regex(last)])
+
+
+def _part_regex(part: str) -> str:
+    if part == "*":
+        return "/[^/]+"
+    return "/" + part.replace("*", "[^/]*").replace("?", "[^/]")
