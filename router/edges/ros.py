@@ -16,6 +16,7 @@ from router.edges.ros_arrivals import RawSubscription
 from router.edges.ros_node import RCL_ERRORS, close_node, open_node
 from router.edges.ros_qos import Incompatible, PeerEvents, qos_profile
 from router.edges.ros_threads import EventThread, MessageThread, Receive
+from router.edges.ros_topics import RosTopics
 from router.edges.ros_types import checked_class
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
@@ -27,7 +28,7 @@ class RosEdge:
     `publish[topic]` takes CDR bytes. `wanted[topic]` is one boolean in a list, kept up to date in place: whether
     anybody listens, or may want it later. `subscribed` has the topics with a subscriber now.
     `incompatible(topic, policy, peers)` is called by a thread of events, from opening on: peers whose QoS does not go
-    with ours, so far. Nothing is received before `start`.
+    with ours, so far. Nothing is received before `start`. `topics` are those that the node sees.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
@@ -57,6 +58,7 @@ class RosEdge:
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
             opening.callback(close_node, self._node)
+            self.topics = RosTopics(self._node)
             for plan in publishers:
                 with _refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be published"):
                     of_publishers += self._open_publisher(plan, classes[plan.topic], peers, opening)

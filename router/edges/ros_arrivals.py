@@ -47,6 +47,8 @@ class RawSubscription:
         )
         self.events: list[EventHandler] = subscription.event_handlers
         self.capacity: int = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else MOST_KEPT
+        self._node = node
+        self._subscription = subscription
         self._handle = subscription.handle
         self._message_class = message_class
 
@@ -74,6 +76,10 @@ class RawSubscription:
         callback = None if eventfd is None else _ADD_TO_EVENTFD
         if _set_callback(self._handle.pointer, callback, eventfd):
             raise rclpy_implementation.RCLError("the middleware does not tell of new messages")
+
+    def close(self) -> None:
+        """It is not announced to anybody, and nobody may take from it any more."""
+        self._node.destroy_subscription(self._subscription)
 
 
 class Arrivals:

@@ -9,11 +9,12 @@ from time import sleep
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 
 from router.edges.ros_arrivals import Arrivals, RawSubscription
 from router.edges.ros_node import RCL_ERRORS, close_node, open_node
+from router.edges.ros_topics import RosTopics, SeenPublisher, hearing
 from router.edges.ros_types import installed_class
 from router.errors import StartError
 
@@ -38,7 +39,7 @@ class TopicListener:
             opening.callback(close_node, node)
             try:
                 publishers = _publishers(node, topic, wait=type_name is None)
-                self.type_name = type_name or publishers[0].topic_type
+                self.type_name = type_name or publishers[0].type_name
                 self._message_class = installed_class(self.type_name)
                 self._subscription = RawSubscription(node, self._message_class, topic, _qos(publishers))
                 self._arrivals = Arrivals([self._subscription])
@@ -63,21 +64,15 @@ class TopicListener:
         self._open.close()
 
 
-def _publishers(node: Node, topic: str, *, wait: bool) -> list[Any]:
-    """rclpy's TopicEndpointInfo of each publisher that has been discovered."""
-    while not (publishers := node.get_publishers_info_by_topic(topic)) and wait:
+def _publishers(node: Node, topic: str, *, wait: bool) -> Sequence[SeenPublisher]:
+    """Those that have been discovered."""
+    topics, name = RosTopics(node), node.resolve_topic_name(topic)
+    while not (publishers := topics.publishers(name)) and wait:
         sleep(_LOOK_INTERVAL)
-    return publishers  # type: ignore[no-any-return]
+    return publishers
 
 
-def _qos(publishers: Sequence[Any]) -> QoSProfile:
+def _qos(publishers: Sequence[SeenPublisher]) -> QoSProfile:
     """Best effort hears every publisher and makes none of them wait; kept messages come to reliable ones alone."""
-    if publishers and all(_keeps_for_late_joiners(publisher.qos_profile) for publisher in publishers):
-        reliability, durability = ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL
-    else:
-        reliability, durability = ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE
-    return QoSProfile(depth=DEPTH, reliability=reliability, durability=durability)
-
-
-def _keeps_for_late_joiners(qos: QoSProfile) -> bool:
-    return (qos.durability, qos.reliability) == (DurabilityPolicy.TRANSIENT_LOCAL, ReliabilityPolicy.RELIABLE)
+    keeps = bool(publishers) and all(publisher.is_reliable and publisher.keeps for publisher in publishers)
+    return hearing(is_reliable=keeps, keeps=keeps, depth=DEPTH)

@@ -17,14 +17,22 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
 
     Raises StartError that blames `span`.
     """
+    try:
+        return matching_class(name, definitions)
+    except StartError as error:
+        raise StartError(f"{span}: {error}") from error
+
+
+def matching_class(name: str, definitions: Mapping[str, Definition]) -> Any:
+    """The same where no table names the type. Raises StartError."""
     for part, compiled in definitions.items():
-        installed = tuple(_installed(part, span).get_fields_and_field_types().items())
+        installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
             raise StartError(
-                f"{span}: {part} as installed is not what the table was compiled for; {_remedy(part)}\n"
+                f"{part} as installed is not what the table was compiled for; {_remedy(part)}\n"
                 f"  installed: {_fields(installed)}\n  compiled:  {_fields(compiled)}"
             )
-    return _installed(name, span)
+    return installed_class(name)
 
 
 def installed_class(name: str) -> Any:
@@ -34,13 +42,6 @@ def installed_class(name: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), short)
     except (ImportError, AttributeError) as error:
         raise StartError(f"{name} is not installed ({error}); {_remedy(name)}") from error
-
-
-def _installed(name: str, span: SourceSpan) -> Any:
-    try:
-        return installed_class(name)
-    except StartError as error:
-        raise StartError(f"{span}: {error}") from error
 
 
 def _remedy(name: str) -> str:

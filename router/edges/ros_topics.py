@@ -1,0 +1,123 @@
+"""The topics that a node has discovered, and taps on them, for whoever follows topics that no table names.
+
+Which topics those are, and what their bytes mean, is not known here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.type_support import check_is_valid_msg_type
+
+from router.edges.ros_arrivals import RawSubscription
+from router.edges.ros_node import RCL_ERRORS
+from router.edges.ros_types import Definition, matching_class
+from router.errors import StartError
+
+
+class SeenPublisher(NamedTuple):
+    """A publisher that was discovered. `keeps` says that it keeps messages for those who join late.
+
+    `is_ours` says that it belongs to the node that looks.
+    """
+
+    type_name: str
+    is_reliable: bool
+    keeps: bool
+    is_ours: bool
+
+
+class RosTopics:
+    """What `node` knows of all topics. Names are absolute ones."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._handle = node.handle
+        self._name = node.get_name()
+        self._namespace = node.get_namespace()
+
+    def names(self) -> list[str]:
+        """Topics that somebody publishes or subscribes to."""
+        return [name for name, _ in self._node.get_topic_names_and_types()]
+
+    def publishers(self, topic: str) -> list[SeenPublisher]:
+        """Those of `topic`, whatever their types."""
+        # Node.get_publishers_info_by_topic() makes an object of each QoS, which takes three times as long.
+        with self._handle:
+            seen = rclpy_implementation.rclpy_get_publishers_info_by_topic(self._handle, topic, False)
+        return [self._publisher(publisher) for publisher in seen]
+
+    def _publisher(self, seen: Mapping[str, Any]) -> SeenPublisher:
+        qos = seen["qos_profile"]
+        return SeenPublisher(
+            type_name=seen["topic_type"],
+            is_reliable=qos["reliability"] == ReliabilityPolicy.RELIABLE,
+            keeps=qos["durability"] == DurabilityPolicy.TRANSIENT_LOCAL,
+            is_ours=seen["node_name"] == self._name and seen["node_namespace"] == self._namespace,
+        )
+
+    def load(self, type_name: str, definitions: Mapping[str, Definition]) -> Any:
+        """The class of a message, for `tap`, if it is installed as `definitions` say. Raises StartError.
+
+        The first of a package reads files for some 10 ms; any thread may call this.
+        """
+        message_class = matching_class(type_name, definitions)
+        try:
+            check_is_valid_msg_type(message_class)
+        except Exception as error:
+            raise StartError(f"{type_name} cannot be received: {error}") from error
+        return message_class
+
+    def tap(self, topic: str, message_class: Any, *, is_reliable: bool, keeps: bool, depth: int) -> TopicTap:
+        """Subscribes to `topic`. Raises StartError."""
+        return TopicTap(self._node, topic, message_class, hearing(is_reliable=is_reliable, keeps=keeps, depth=depth))
+
+
+class TopicTap:
+    """A subscription that is asked instead of telling: what nobody takes costs no Python at all. Close it.
+
+    `fd` is readable while messages have come that `arrived` has not counted.
+    """
+
+    def __init__(self, node: Node, topic: str, message_class: Any, qos: QoSProfile) -> None:
+        """Raises StartError. A process has one type for a topic: while another one is open, this is refused."""
+        silent = SubscriptionEventCallbacks(use_default_callbacks=False)
+        with ExitStack() as opening:
+            self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+            opening.callback(os.close, self.fd)
+            try:
+                subscription = RawSubscription(node, message_class, topic, qos, silent)
+                opening.callback(subscription.close)
+                subscription.announce_to(self.fd)  # what has come already is announced at once
+            except RCL_ERRORS as error:
+                raise StartError(f"topic '{topic}' cannot be subscribed to: {error}") from error
+            opening.callback(subscription.announce_to, None)
+            self._open = opening.pop_all()
+        self.take = subscription.take
+
+    def arrived(self) -> int:
+        """How many messages have come since this was asked last, taken or not. Does not wait."""
+        try:
+            return os.eventfd_read(self.fd)
+        except BlockingIOError:
+            return 0
+
+    def close(self) -> None:
+        """Nobody may `take` any more."""
+        self._open.close()
+
+
+def hearing(*, is_reliable: bool, keeps: bool, depth: int) -> QoSProfile:
+    """The newest `depth` messages. Best effort hears every publisher; only reliable ones give what they have kept."""
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if keeps else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,39 @@
+"""Which of a topic's publishers a gateway goes by. Pure: it is told of publishers, and opens nothing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:  # which imports rclpy
+    from router.edges.ros_topics import SeenPublisher
+
+
+class Choice(NamedTuple):
+    """How a topic is subscribed to. `keeps` asks for what was kept for those who join late.
+
+    `others` are the types that are not served, most publishers first.
+    """
+
+    type_name: str
+    is_reliable: bool
+    keeps: bool
+    others: tuple[str, ...]
+
+
+def choice(publishers: Sequence[SeenPublisher], *, is_let_in: bool) -> Choice | None:
+    """The type that most publishers have (of several the first by name), with a QoS that hears each of them.
+
+    Of a topic that is let in our own publishers do not count: what clients sent would go back to them. None where
+    nobody is left.
+    """
+    counted = [publisher for publisher in publishers if not (is_let_in and publisher.is_ours)]
+    if not counted:
+        return None
+    times = Counter(publisher.type_name for publisher in counted)
+    type_name, *others = sorted(times, key=lambda name: (-times[name], name))
+    heard = [publisher for publisher in counted if publisher.type_name == type_name]
+    is_reliable = all(publisher.is_reliable for publisher in heard)
+    keeps = is_reliable and all(publisher.keeps for publisher in heard)
+    return Choice(type_name, is_reliable, keeps, tuple(others))
