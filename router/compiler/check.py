@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from router.compiler.checked import CheckedRoute
+from router.compiler.checked import CheckedGateway, CheckedRoute
 from router.compiler.definitions import Definitions
+from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Lookup
 from router.compiler.meetings import clash_findings, topic_findings
 from router.compiler.network import network_findings
@@ -34,6 +35,7 @@ class Checked:
     schema: ProtoSchema | None = None
     envelope: Envelope | None = None
     routes: Sequence[CheckedRoute] = ()
+    gateways: Sequence[CheckedGateway] = ()
 
     @property
     def has_errors(self) -> bool:
@@ -46,7 +48,7 @@ class Checked:
 
         if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
             return None
-        return link(self.table, self.schema, self.envelope, self.routes)
+        return link(self.table, self.schema, self.envelope, self.routes, self.gateways)
 
 
 def check_table(
@@ -68,6 +70,7 @@ def check_table(
         return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
     lookup = Lookup(table, schema, envelope, definitions, locked_size(schema) or envelope.max_size)
     routes = RouteChecker(lookup).check_all()
+    gateways = check_gateways(lookup)
     findings = [
         *findings,
         *check_lock(schema, envelope),
@@ -76,4 +79,4 @@ def check_table(
         *clash_findings(table),
         *topic_findings(table, [checked.route for checked in routes]),
     ]
-    return Checked(path, sorted_findings(findings), table, schema, envelope, routes)
+    return Checked(path, sorted_findings(findings), table, schema, envelope, routes, gateways)

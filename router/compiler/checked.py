@@ -1,6 +1,6 @@
-"""A route after its check: what the generation of its code, and `explain`, take it from.
+"""A route or a gateway after its check: what the generation of its code, and `explain`, take it from.
 
-Plain data. Who finds out what is in it: `routes` and the modules that it asks.
+Plain data. Who finds out what is in it: `routes` and `gateways`, and the modules that they ask.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
 from router.compiler.target import Target
 from router.errors import SourceSpan
-from router.table.model import Route, Topic
+from router.table.model import Gateway, Inbound, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -86,3 +86,21 @@ class CheckedRoute:
     feeds: tuple[CheckedFeed, ...] = ()
     collect: CheckedCollect | None = None
     deadman: CheckedDeadman | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedInbound:
+    """A topic that clients may publish on, with its absolute name. `stop` are the CDR bytes that its deadman sends."""
+
+    inbound: Inbound
+    topic: str
+    type: MessageType
+    stop: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedGateway:
+    """A gateway, with those of its inbound topics whose types exist."""
+
+    settings: Gateway
+    inbound: tuple[CheckedInbound, ...]

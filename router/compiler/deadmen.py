@@ -1,7 +1,11 @@
-"""Checks deadmen: the payload that is sent when commands stop coming, and commands to boards that have none."""
+"""Checks deadmen: the payload that is sent when commands stop coming, and commands to boards that have none.
+
+Of deadmen for what a gateway's clients publish, the part that is the same.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
@@ -11,8 +15,9 @@ from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
-from router.errors import Code, MappingError
-from router.table.model import Deadman, EndpointKind, Keep, Route
+from router.compiler.plan import Record
+from router.errors import Code, Diagnostic, MappingError, SourceSpan
+from router.table.model import Deadman, EndpointKind, FieldMap, InboundDeadman, Keep, Route
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -66,13 +71,18 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
         return
     rates = [destination.max_rate for destination in feeding(route, deadman)]
     limited = [rate.value for rate in rates if rate is not None]
-    if len(limited) == len(rates) and deadman.timeout.value * max(limited) <= NS_PER_SECOND:
-        message = f"it would trip between commands that `max_rate` holds down to {max(limited):g} Hz"
-        lookup.report(deadman.timeout.span, Code.BAD_VALUE, message, "a longer timeout, or a higher max_rate")
-    if deadman.repeat.value < SHORTEST_REPEAT:
-        message = "more than 100 datagrams per second would flood who gets them"
-        lookup.report(deadman.repeat.span, Code.BAD_VALUE, message, "repeat it every 10ms at most")
+    lookup.findings += timing_findings(deadman, max(limited) if len(limited) == len(rates) else None, "datagrams")
     _want_no_late_commands(lookup, route, deadman)
+
+
+def timing_findings(deadman: Deadman | InboundDeadman, max_rate: float | None, sends: str) -> Iterator[Diagnostic]:
+    """A deadman that trips while commands come, or that floods. `max_rate` limits all that feeds it, in Hz."""
+    if max_rate is not None and deadman.timeout.value * max_rate <= NS_PER_SECOND:
+        message = f"it would trip between commands that `max_rate` holds down to {max_rate:g} Hz"
+        yield Diagnostic(deadman.timeout.span, Code.BAD_VALUE, message, "a longer timeout, or a higher max_rate")
+    if deadman.repeat.value < SHORTEST_REPEAT:
+        message = f"more than 100 {sends} per second would flood who gets them"
+        yield Diagnostic(deadman.repeat.span, Code.BAD_VALUE, message, "repeat it every 10ms at most")
 
 
 def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
@@ -108,15 +118,25 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
 
 
 def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | None:
-    """A payload of which nothing is filled is one: all zero."""
-    scope = replace(lookup.scope(_NOTHING, ParsedReads()), given=())
-    mapping = build(deadman.fields, case.type, scope, deadman.case.span)
-    findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
-    lookup.findings += findings
-    if findings:
+    plan = constant_plan(lookup, deadman.fields, case.type, deadman.case.span)
+    if plan is None:
         return None
     try:
-        return constant_envelope(mapping.plan, case)
+        return constant_envelope(plan, case)
     except (MappingError, ValueError) as error:
         lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None
+
+
+def constant_plan(
+    lookup: Lookup, fields: FieldMap, target: MessageType, span: SourceSpan, ros_type: MessageType | None = None
+) -> Record | None:
+    """The plan of a message that is filled from none, None where it has findings. All zero is one.
+
+    `ros_type` is that whose constants can be named.
+    """
+    scope = replace(lookup.scope(_NOTHING, ParsedReads(), ros_type), given=())
+    mapping = build(fields, target, scope, span)
+    findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
+    lookup.findings += findings
+    return None if findings else mapping.plan

@@ -1,4 +1,4 @@
-"""Puts checked routes together: their handlers, what must be opened for them, and the books with every series.
+"""Puts checked routes and gateways together: handlers, what must be opened for them, and the books with every series.
 
 Expects a table without errors: nothing here is checked, and nothing is found.
 """
@@ -6,10 +6,12 @@ Expects a table without errors: nothing here is checked, and nothing is found.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from router.compiler.books import QOS_POLICIES, REJECT_REASONS, UNKNOWN_CASE, Books
-from router.compiler.checked import CheckedDeadman, CheckedRoute
+from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedRoute
 from router.compiler.handlers import HandlerSource
+from router.compiler.link_gateways import link_gateway
 from router.compiler.lookup import nested_types
 from router.compiler.namespace import NAMESPACE
 from router.compiler.program import (
@@ -23,13 +25,19 @@ from router.compiler.program import (
     source_label,
 )
 from router.compiler.topics import qos_of
-from router.table.model import ANY, RouteTable, Topic
+from router.table.model import ANY, Located, RouteTable, Topic
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
 from router.types.ros import definition
 
 
-def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Sequence[CheckedRoute]) -> Program:
+def link(
+    table: RouteTable,
+    schema: ProtoSchema,
+    envelope: Envelope,
+    routes: Sequence[CheckedRoute],
+    gateways: Sequence[CheckedGateway] = (),
+) -> Program:
     books = Books()
     _open_books(books, table, envelope)
     served = [checked for checked in routes if not checked.route.ignore]
@@ -60,14 +68,28 @@ def link(table: RouteTable, schema: ProtoSchema, envelope: Envelope, routes: Seq
             for one in table.endpoints.values()
             if one.name in destinations
         ),
-        publishers=_topics((used.topic, used.type) for checked in served for used in checked.targets),
+        publishers=_topics(_published(table, served, gateways)),
         subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.feeds),
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos_sha256=schema.sha256,
+        gateways=tuple(link_gateway(checked, books) for checked in gateways),
     )
+
+
+def _published(
+    table: RouteTable, routes: Iterable[CheckedRoute], gateways: Iterable[CheckedGateway]
+) -> Iterator[tuple[Topic | None, MessageType | None]]:
+    """What routes fill, and under absolute names what clients of gateways publish."""
+    for checked in routes:
+        for used in checked.targets:
+            yield used.topic, used.type
+    for gateway in gateways:
+        for entry in gateway.inbound:
+            topic = entry.inbound.topic
+            yield replace(topic, topic=Located(entry.topic, topic.topic.span)), entry.type
 
 
 def _topics(used: Iterable[tuple[Topic | None, MessageType | None]]) -> tuple[TopicPlan, ...]:

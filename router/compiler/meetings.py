@@ -1,4 +1,6 @@
-"""Routes that meet: at a source, which one of them may have, and on a topic, where they must understand each other."""
+"""Routes and gateways that meet: at a source, which one route may have, and on a topic, where all must understand
+each other.
+"""
 
 from __future__ import annotations
 
@@ -43,19 +45,20 @@ def _taken(key: str, taken: Mapping[str, SourceSpan]) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class _Use:
-    """One mention of a topic in the table."""
+    """One mention of a topic in the table. `owner` is how sentences call the route or gateway that names it."""
 
     topic: Topic
-    route: Route
+    owner: str
+    publishes: bool
     qos: QosPlan
-
-    @property
-    def publishes(self) -> bool:
-        return not self.route.is_outbound
+    route: Route | None = None
 
 
 def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
-    """Topics that several routes name: one type, one QoS for each direction, QoS that matches, and no way back."""
+    """Topics that several name: one type, one QoS for each direction, QoS that matches, and no way back.
+
+    Of a gateway these are the topics that its clients publish on.
+    """
     for name, uses in _uses(table, routes).items():
         firsts = [uses[0], *[use for use in uses if use.publishes != uses[0].publishes][:1]]
         for use in uses[1:]:
@@ -63,18 +66,26 @@ def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagn
             if finding := next(filter(None, found), None):
                 yield finding
         for publisher, subscriber in product(uses, uses):
-            if publisher.publishes and not subscriber.publishes:
+            if publisher.publishes and not subscriber.publishes and publisher.route and subscriber.route:
                 yield from _echoes(name, publisher.route, subscriber.route)
 
 
 def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_Use]]:
     """By absolute name."""
     uses: dict[str, list[_Use]] = {}
+    for use in _all_uses(table, routes):
+        if topic_name_finding(use.topic) is None:
+            uses.setdefault(resolved(use.topic.topic.value, table.node), []).append(use)
+    return uses
+
+
+def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
     for route in routes:
         for topic in route.topics:
-            if topic_name_finding(topic) is None:
-                uses.setdefault(resolved(topic.topic.value, table.node), []).append(_Use(topic, route, qos_of(topic)))
-    return uses
+            yield _Use(topic, f"route '{route.name}'", not route.is_outbound, qos_of(topic), route)
+    for gateway in table.gateways.values():
+        for inbound in gateway.inbound:
+            yield _Use(inbound.topic, f"gateway '{gateway.name}'", True, qos_of(inbound.topic))
 
 
 def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
@@ -90,18 +101,18 @@ def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnost
 
 def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
     if use.topic.type.value != first.topic.type.value:
-        message = f"topic '{name}' has the type {first.topic.type.value} in route '{first.route.name}'"
+        message = f"topic '{name}' has the type {first.topic.type.value} in {first.owner}"
         hint = f"a topic has one type; see {first.topic.type.span}"
         return Diagnostic(use.topic.type.span, Code.TOPIC_TYPE_CLASH, message, hint)
     span = use.topic.qos.span if use.topic.qos else (use.topic.queue_depth or use.topic.topic).span
     if use.publishes == first.publishes:
         if use.qos == first.qos:
             return None
-        message = f"topic '{name}' has another QoS in route '{first.route.name}'"
+        message = f"topic '{name}' has another QoS in {first.owner}"
         return Diagnostic(span, Code.QOS_CONFLICT, message, f"a topic has one; see {first.topic.span}")
     publisher, subscriber = (use, first) if use.publishes else (first, use)
     if reason := _unheard(publisher.qos, subscriber.qos):
-        message = f"route '{subscriber.route.name}' hears nothing that route '{publisher.route.name}' publishes on"
+        message = f"{subscriber.owner} hears nothing that {publisher.owner} publishes on"
         return Diagnostic(span, Code.QOS_CONFLICT, f"{message} '{name}': {reason}", "give both the same QoS")
     return None
 

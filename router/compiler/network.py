@@ -2,29 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
 from itertools import combinations
 
 from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import Address, Endpoint, Listener, RouteTable
+from router.table.model import Address, Endpoint, Gateway, Listener, Located, RouteTable, Transport
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
 
 
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """A local address, and how sentences call who wants it. UDP and TCP are out of each other's way."""
+
+    owner: str
+    address: Located[Address]
+    is_udp: bool = False
+
+
 def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    for first, second in combinations(table.listeners.values(), 2):
-        if _overlap(first.address.value, second.address.value):
-            message = f"listener '{second.name}' has the address of listener '{first.name}'"
+    for first, second in combinations(_held(table), 2):
+        if first.is_udp == second.is_udp and _overlap(first.address.value, second.address.value):
+            message = f"{second.owner} has the address of {first.owner}"
             hint = "one socket takes it all; give it a port of its own"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
+    yield from _gateway_findings(table)
     sources = {source.value for route in table.routes for source in route.sources}
     blamed: set[str] = set()
     for one, other in combinations(table.endpoints.values(), 2):
         if other.name not in blamed and (clash := _clash(one, other, sources)):
             blamed.add(other.name)
             yield clash
+
+
+def _held(table: RouteTable) -> Iterator[_Held]:
+    for listener in table.listeners.values():
+        yield _Held(f"listener '{listener.name}'", listener.address, is_udp=True)
+    if table.metrics is not None:
+        yield _Held("the metrics", table.metrics)
+    for gateway in table.gateways.values():
+        owner = f"gateway '{gateway.name}'"
+        if gateway.receive is not None:
+            yield _Held(owner, gateway.receive, is_udp=True)
+        if gateway.address is not None and gateway.transport.value is not Transport.UDP:
+            yield _Held(owner, gateway.address)
+
+
+def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Gateways that send to the router itself, or cannot be told apart in their Zenoh network."""
+    keys: dict[str, Gateway] = {}
+    for gateway in table.gateways.values():
+        if gateway.address is not None and gateway.transport.value is Transport.UDP:
+            yield from _own_address(gateway, gateway.address, table.listeners.values())
+        if gateway.zenoh is not None:
+            first = keys.setdefault(gateway.zenoh.key.value, gateway)
+            if first is not gateway:
+                message = f"gateway '{gateway.name}' has the key of gateway '{first.name}'"
+                yield Diagnostic(gateway.zenoh.key.span, Code.ADDRESS_CLASH, message, "give it a key of its own")
+
+
+def _own_address(gateway: Gateway, address: Located[Address], listeners: Iterable[Listener]) -> Iterator[Diagnostic]:
+    own = {f"listener '{listener.name}'": listener.address.value for listener in listeners}
+    if gateway.receive is not None:
+        own["'receive' address"] = gateway.receive.value
+    for name, local in own.items():
+        if _reaches(address.value, local):
+            message = f"'{gateway.name}' would send to the router's own {name} ({address.value})"
+            yield Diagnostic(address.span, Code.FORWARDING_LOOP, message, "name the address of its client")
 
 
 def _overlap(one: Address, other: Address) -> bool:
@@ -54,14 +101,13 @@ def loop_finding(
         message = f"'{endpoint.name}' would get its own '{case}' back"
         return Diagnostic(span, Code.FORWARDING_LOOP, message, "remove it from the destinations or from the source")
     for listener in table.listeners.values():
-        if _reaches(endpoint.address.value, listener):
+        if _reaches(endpoint.address.value, listener.address.value):
             message = f"'{endpoint.name}' is the router's own listener '{listener.name}' ({endpoint.address.value})"
             return Diagnostic(span, Code.FORWARDING_LOOP, message, "the router would receive what it sends for ever")
     return None
 
 
-def _reaches(address: Address, listener: Listener) -> bool:
-    own = listener.address.value
+def _reaches(address: Address, own: Address) -> bool:
     if address.port != own.port:
         return False
     return address.host in (own.host, WILDCARD) or (own.host == WILDCARD and address.host.startswith(LOOPBACK))

@@ -1,0 +1,75 @@
+"""Plans of checked gateways, with every series that they count in.
+
+Expects gateways without errors: nothing here is checked, and nothing is found.
+"""
+
+from __future__ import annotations
+
+from router.compiler.books import (
+    CLIENT_DROP_REASONS,
+    CLIENTS,
+    GATEWAY_DROP_REASONS,
+    GATEWAY_REJECT_REASONS,
+    INBOUND_DROP_REASONS,
+    QOS_POLICIES,
+    TOPIC_STATES,
+    Books,
+)
+from router.compiler.checked import CheckedGateway, CheckedInbound
+from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
+from router.table.model import ROS, Gateway, InboundDeadman
+
+
+def link_gateway(checked: CheckedGateway, books: Books) -> GatewayPlan:
+    """The plan of one gateway; opens its series in the books."""
+    settings = checked.settings
+    _open_books(books, settings)
+    return GatewayPlan(settings, {entry.topic: _inbound(entry, settings.name, books) for entry in checked.inbound})
+
+
+def _inbound(entry: CheckedInbound, gateway: str, books: Books) -> InboundPlan:
+    topic, inbound = entry.topic, entry.inbound
+    books.slot("messages_published", gateway, topic)
+    for reason in INBOUND_DROP_REASONS:
+        books.slot("messages_dropped", gateway, topic, reason)
+    for policy in QOS_POLICIES:
+        books.slot("qos_incompatible", gateway, topic, policy)
+    deadman = None
+    if inbound.deadman is not None and entry.stop is not None:
+        deadman = _deadman(f"{gateway}:{topic}", inbound.deadman, topic, entry.stop, books)
+    return InboundPlan(
+        topic=topic,
+        type=entry.type,
+        ttl=inbound.ttl.value if inbound.ttl else None,
+        max_rate=inbound.max_rate.value if inbound.max_rate else None,
+        deadman=deadman,
+    )
+
+
+def _deadman(name: str, deadman: InboundDeadman, topic: str, stop: bytes, books: Books) -> DeadmanPlan:
+    for metric in ("deadman_active", "deadman_trips"):
+        books.slot(metric, name)
+    for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
+        books.slot(metric, name, topic)
+    return DeadmanPlan(name, deadman.timeout.value, deadman.repeat.value, ((topic, stop),))
+
+
+def _open_books(books: Books, gateway: Gateway) -> None:
+    name = gateway.name
+    for metric in ("datagrams_received", "received_bytes", "gateway_clients", "route_seconds"):
+        books.slot(metric, name)
+    books.slot("route_last_message_timestamp_seconds", name)
+    for reason in GATEWAY_REJECT_REASONS:
+        books.slot("datagrams_rejected", name, reason)
+    for source in (ROS, CLIENTS):
+        books.slot("messages_received", name, source)
+    for metric in ("messages_sent", "messages_filtered"):
+        books.slot(metric, name, CLIENTS)
+    for reason in GATEWAY_DROP_REASONS:
+        books.slot("messages_dropped", name, CLIENTS, reason)
+    for metric in ("datagrams_sent", "sent_bytes"):
+        books.slot(metric, name, gateway.transport.value.value)
+    for state in TOPIC_STATES:
+        books.slot("gateway_topics", name, state)
+    for reason in CLIENT_DROP_REASONS:
+        books.slot("client_messages_dropped", name, reason)
