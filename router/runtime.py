@@ -16,20 +16,23 @@ from router.edges.background import background_threads
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
 from router.edges.log import logger
-from router.edges.metrics import BooksCollector, MetricsServer
+from router.edges.metrics import Asked, BooksCollector, MetricsServer
 from router.edges.receiver import ReceiveThread
 from router.edges.reports import Reporter
 from router.edges.timekeeper import Timekeeper
 from router.edges.udp import Listener, Sender
 from router.engine import MAX_DATAGRAM, Engine, OutboundEngine
 from router.engine.binding import Guarded, Outlets
-from router.engine.deadman import Deadman, feeder
+from router.engine.deadman import Deadman, Feed, feeder
 from router.engine.pacing import Pacer
 from router.errors import StartError
+from router.gateway.inlet import InletOutlets
 from router.table.model import Address
+from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:
     from router.edges.ros import RosEdge
+    from router.gateway.thread import GatewayThread
 
 _TOTALS = (
     "datagrams_received",
@@ -116,7 +119,7 @@ class Router:
             wall_ns=wall_ns,
             pacing=Guarded(self._fresh_counts(), pacing.guard),
             collecting=Guarded(self._fresh_counts(), collecting.guard),
-            feed=feeder(self._deadmen(send, reporter), deadman.guard),
+            feed=(feed := feeder(self._deadmen(send, ros, reporter), deadman.guard)),
             publish_errors=ros.publish_errors if ros else (),
             pacers=self._pacers(pacing, send),
         )
@@ -132,11 +135,16 @@ class Router:
             reporter.failed,
         )
         take = {plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions}
-        self._open_metrics(opening)
+        gateways = self._open_gateways(ros, feed, reporter)
+        if gateways is not None:
+            opening.callback(gateways.stop)
+        self._open_metrics(opening, gateways)
 
         def start() -> None:
             for keeper in keepers:
                 keeper.start()
+            if gateways is not None:
+                gateways.start()
             if ros is not None:
                 opening.callback(ros.stop_receiving)
                 ros.start(take, reporter.failed)
@@ -167,14 +175,16 @@ class Router:
     def _open_ros(self, opening: ExitStack) -> RosEdge | None:
         """None where the table has no topics: such a table runs where there is no ROS."""
         program, table = self.program, self.program.table
-        if not program.publishers and not program.subscriptions:
+        if not (program.publishers or program.subscriptions or program.gateways):
             return None
         try:
             from router.edges.ros import RosEdge
         except ImportError as error:
             remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
             raise StartError(f"{table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
-        spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
+        topics = [topic.topic for route in table.routes for topic in route.topics]
+        topics += [inbound.topic.topic for gateway in table.gateways.values() for inbound in gateway.inbound]
+        spans = {topic.value: topic.span for topic in topics}
         ros = RosEdge(
             table.node,
             program.publishers,
@@ -193,6 +203,9 @@ class Router:
         for route in self.program.table.routes:
             for topic in route.topics:
                 routes.setdefault(topic.topic.value, []).append(route.name)
+        for gateway in self.program.gateways:
+            for name in gateway.inbound:
+                routes.setdefault(name, []).append(gateway.settings.name)
 
         def incompatible(topic: str, policy: str, peers: int) -> None:
             for route in routes[topic]:
@@ -200,12 +213,19 @@ class Router:
 
         return incompatible
 
-    def _deadmen(self, send: Mapping[str, Callable[[bytes], int]], reporter: Reporter) -> dict[str, Deadman]:
-        """By route."""
-        books, counts = self.program.books, self._fresh_counts()
+    def _deadmen(
+        self, send: Mapping[str, Callable[[bytes], int]], ros: RosEdge | None, reporter: Reporter
+    ) -> dict[str, Deadman]:
+        """By route; those of what gateways let in send to topics."""
+        program, counts = self.program, self._fresh_counts()
+        inbound = [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
+        outlets = {
+            **send,
+            **({topic: _sender(ros, topic) for plan in inbound for topic, _ in plan.datagrams} if ros else {}),
+        }
         return {
-            plan.route: Deadman(plan, books, counts, send, reporter.report, reporter.deadman_changed)
-            for plan in self.program.deadmen
+            plan.route: Deadman(plan, program.books, counts, outlets, reporter.report, reporter.deadman_changed)
+            for plan in (*program.deadmen, *inbound)
         }
 
     def _pacers(self, keeper: Timekeeper, send: Mapping[str, Callable[[bytes], int]]) -> dict[str, Pacer]:
@@ -216,7 +236,51 @@ class Router:
             keeper.add(pacer)  # before what hands on to it, so that it is ended after that
         return pacers
 
-    def _open_metrics(self, opening: ExitStack) -> None:
+    def _open_gateways(
+        self, ros: RosEdge | None, feed: Callable[[str, Sequence[str]], Feed], reporter: Reporter
+    ) -> GatewayThread | None:
+        """Their thread serves nobody before it is started."""
+        program = self.program
+        if ros is None or not program.gateways:
+            return None
+        from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
+
+        inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
+        outlets = InletOutlets(
+            publish=ros.publish,
+            publish_errors=ros.publish_errors,
+            feed_deadman={
+                each.deadman.route: feed(each.deadman.route, (each.deadman.route,)) for each in inbound if each.deadman
+            },
+            report=reporter.report,
+            clock_ns=monotonic_ns,
+            wall_ns=wall_ns,
+        )
+        return GatewayThread(
+            program.gateways,
+            ros.topics,
+            ros_interfaces(),
+            program.books,
+            self._fresh_counts(),
+            outlets,
+            reporter.failed,
+        )
+
+    def _asked(self, gateways: GatewayThread | None) -> dict[str, Asked]:
+        """Series that nobody counts in a slot."""
+        drops = [([name], listener.kernel_drops) for name, listener in self.listeners.items()]
+
+        def of_clients(column: int) -> Asked:
+            return lambda: (([row[0], row[1]], row[column]) for row in (gateways.clients() if gateways else ()))
+
+        return {
+            "kernel_drops": lambda: ((labels, drops()) for labels, drops in drops),
+            "gateway_client_lag_seconds": of_clients(2),
+            "gateway_client_sent": of_clients(3),
+            "gateway_client_dropped": of_clients(4),
+        }
+
+    def _open_metrics(self, opening: ExitStack, gateways: GatewayThread | None) -> None:
         program, settings = self.program, self.program.table.metrics
         if settings is None:
             return
@@ -225,12 +289,24 @@ class Router:
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
         }
-        kernel_drops = {name: listener.kernel_drops for name, listener in self.listeners.items()}
         server = MetricsServer(
-            settings.value, settings.span, BooksCollector(program.books, self._counts, kernel_drops, build)
+            settings.value, settings.span, BooksCollector(program.books, self._counts, self._asked(gateways), build)
         )
         opening.callback(server.close)
         self.metrics_address = server.address
+
+
+def _sender(ros: RosEdge, topic: str) -> Callable[[bytes], int]:
+    """Publishes as a socket sends: a deadman knows no topics."""
+
+    def send(message: bytes) -> int:
+        try:
+            ros.publish[topic](message)
+        except ros.publish_errors as error:
+            raise OSError(f"it cannot be published: {error}") from error
+        return len(message)
+
+    return send
 
 
 def _version() -> str:

@@ -44,6 +44,11 @@ METRICS = (
     Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
     Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
     Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),
+    Metric(
+        "gateway_client_lag_seconds", "number", ("route", "client"), "How long the oldest frame waits for a client."
+    ),
+    Metric("gateway_client_sent", "counter", ("route", "client"), "Frames handed to a client since it came."),
+    Metric("gateway_client_dropped", "counter", ("route", "client"), "Frames that newer ones replaced since it came."),
     Metric("client_messages_dropped", "counter", ("route", "reason"), "Messages that single clients did not get."),
     Metric("qos_incompatible", "number", ("route", "topic", "policy"), "Peers that got or gave nothing for their QoS."),
 )

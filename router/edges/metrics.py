@@ -32,22 +32,27 @@ _EXPORTED_AS = {"time": "gauge", "number": "gauge"}
 _BUCKETS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
 
+Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
+"""Gives the label values, in the metric's order, and the value of each series."""
+
+
 class BooksCollector(Collector):
     """All series of the books, each from its first scrape on, at 0 while nothing has happened.
 
     `counts` has the list of each thread that counts: a counter is their sum, a number or a time the largest of them.
-    `kernel_drops` is asked by listener at each scrape. `build` has the labels of `router_build_info`.
+    `asked` has what is asked for at each scrape instead, by metric: label values and the value of each series there is
+    then. `build` has the labels of `router_build_info`.
     """
 
     def __init__(
         self,
         books: Books,
         counts: Sequence[list[int]],
-        kernel_drops: Mapping[str, Callable[[], int]],
+        asked: Mapping[str, Asked],
         build: Mapping[str, str],
     ) -> None:
         self._counts = counts
-        self._kernel_drops = kernel_drops
+        self._asked = asked
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._slots: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, slot in books.series():
@@ -65,6 +70,11 @@ class BooksCollector(Collector):
 
     def _samples(self, metric: Metric, threads: Sequence[list[int]]) -> Iterator[Sample]:
         name = PREFIX + metric.name
+        suffix = "_total" if metric.kind == "counter" else ""
+        if metric.name in self._asked:
+            for values, value in self._asked[metric.name]():
+                yield Sample(name + suffix, dict(zip(metric.labels, values, strict=True)), value)
+            return
         for labels, slot in self._slots[metric.name]:
             if metric.kind == "histogram":
                 yield from _histogram(name, labels, [thread[slot : slot + HISTOGRAM_SLOTS] for thread in threads])
@@ -72,10 +82,8 @@ class BooksCollector(Collector):
                 yield Sample(name, labels, max(thread[slot] for thread in threads) / 1e9)
             elif metric.kind == "number":
                 yield Sample(name, labels, max(thread[slot] for thread in threads))
-            elif metric.name == "kernel_drops":
-                yield Sample(f"{name}_total", labels, self._kernel_drops[labels["listener"]]())
             else:
-                yield Sample(f"{name}_total", labels, sum(thread[slot] for thread in threads))
+                yield Sample(name + suffix, labels, sum(thread[slot] for thread in threads))
 
 
 def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:

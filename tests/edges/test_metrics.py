@@ -30,6 +30,8 @@ LABELS = {
     "target": "imu_data",
     "endpoint": "sensor_board",
     "policy": "reliability",
+    "state": "served",
+    "client": "0",
 }
 BUILD = {"version": "1", "table_sha256": "aa", "protos_sha256": "bb"}
 
@@ -63,7 +65,7 @@ def scraped() -> Iterator[Scraped]:
     slots = {metric.name: books.slot(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS}
     threads = [books.fresh_counts(), books.fresh_counts()]
     result = Scraped(slots, threads, 0, LOOPBACK)
-    collector = BooksCollector(books, threads, {"rover": lambda: result.drops}, BUILD)
+    collector = BooksCollector(books, threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD)
     with closing(MetricsServer(LOOPBACK, SPAN, collector)) as server:
         result.address = server.address
         yield result
@@ -102,7 +104,7 @@ def test_a_number_is_exported_as_the_thread_that_knows_it_left_it(scraped: Scrap
     assert scraped.value("router_deadman_active") == 0
 
 
-def test_kernel_drops_are_asked_for_at_each_scrape(scraped: Scraped) -> None:
+def test_what_is_in_no_slot_is_asked_for_at_each_scrape(scraped: Scraped) -> None:
     scraped.drops = 12
     assert scraped.value("router_kernel_drops_total") == 12
     scraped.drops = 13

@@ -1,0 +1,120 @@
+"""What a gateway's formats are on the wire: packets with a binary header, or JSON documents. Knows no clients."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Iterator, Sequence
+from itertools import count
+
+from router.edges.gateway_transport import Frame
+from router.gateway.compression import decompress
+from router.gateway.documents import PublishRequest, Request, SchemaRequest, data_document, request, schema_document
+from router.gateway.feeds import Sample
+from router.gateway.fragments import datagrams
+from router.gateway.json_reading import parse_json
+from router.gateway.packets import HEAD, prefix, unpack
+from router.gateway.style import Style
+from router.table.model import Gateway, GatewayFormat
+
+_IDS = 1 << 32
+
+
+class Encoding(ABC):
+    """How one gateway writes samples and schemas, and reads what clients send. Times are wall-clock seconds."""
+
+    style: Style
+    level: int
+    fragments = False
+    """Whether what is longer than a datagram is spread over several."""
+
+    def __init__(self, settings: Gateway) -> None:
+        self.level = settings.compression
+        self._most = settings.max_message
+
+    @abstractmethod
+    def introduces(self, topic: str, type_name: str) -> Hashable:
+        """What a client must have a schema of before this topic's data."""
+
+    @abstractmethod
+    def schema(self, topic: str, type_name: str, schema: str, time: float) -> bytes: ...
+
+    @abstractmethod
+    def data(self, sample: Sample, time: float) -> bytes:
+        """Raises UnreadableError."""
+
+    @abstractmethod
+    def request(self, data: bytes) -> Request:
+        """Raises PacketError for what has not the format, InvalidMessageError for JSON that is none."""
+
+    def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
+        """The same frames as the transport is to send them."""
+        return frames
+
+
+class PacketEncoding(Encoding):
+    """`gateway_v1`: one packet for each message and schema."""
+
+    style = Style.WRAPPED
+
+    def introduces(self, topic: str, type_name: str) -> Hashable:
+        return topic, type_name  # each packet names both, and clients may keep schemas by either
+
+    def schema(self, topic: str, type_name: str, schema: str, time: float) -> bytes:
+        return HEAD.pack(time, 0) + prefix(topic, type_name) + schema.encode()
+
+    def data(self, sample: Sample, time: float) -> bytes:
+        payload = sample.payload(self.style, self.level)
+        return HEAD.pack(time, self.level > 0) + prefix(sample.topic, sample.type_name) + payload
+
+    def request(self, data: bytes) -> Request:
+        packet = unpack(data)
+        if not packet.payload:
+            return SchemaRequest(packet.type_name or None)
+        text = decompress(packet.payload, self._most) if packet.is_compressed else packet.payload
+        return PublishRequest(packet.topic, packet.type_name, packet.time, parse_json(text))
+
+
+class BatchEncoding(PacketEncoding):
+    """`gateway_v2`: packets that fit share a datagram, one that does not fit is spread over several."""
+
+    fragments = True
+
+    def __init__(self, settings: Gateway) -> None:
+        super().__init__(settings)
+        self._datagram = settings.max_datagram
+        self._ids: Iterator[int] = (number % _IDS for number in count())
+
+    def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
+        packets = (frame.data for frame in frames)
+        return [
+            Frame(datagram, "", "", is_schema=False, born=frames[0].born)
+            for datagram in datagrams(packets, self._datagram, time, self._ids)
+        ]
+
+
+class DocumentEncoding(Encoding):
+    """`json` and `json_lines`: one document for each message and schema."""
+
+    style = Style.PLAIN
+
+    def introduces(self, topic: str, type_name: str) -> Hashable:
+        return type_name
+
+    def schema(self, topic: str, type_name: str, schema: str, time: float) -> bytes:
+        return schema_document(type_name, time, schema)
+
+    def data(self, sample: Sample, time: float) -> bytes:
+        return data_document(sample.topic, sample.type_name, time, sample.text(self.style))
+
+    def request(self, data: bytes) -> Request:
+        return request(data)
+
+
+def encoding(settings: Gateway) -> Encoding:
+    match settings.format:
+        case GatewayFormat.GATEWAY_V1:
+            return PacketEncoding(settings)
+        case GatewayFormat.GATEWAY_V2:
+            return BatchEncoding(settings)
+        case GatewayFormat.JSON | GatewayFormat.JSON_LINES:
+            return DocumentEncoding(settings)

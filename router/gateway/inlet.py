@@ -1,0 +1,124 @@
+"""What clients may publish: every request is checked, counted and handed to ROS, or refused. Knows no socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from router.compiler.books import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Books
+from router.compiler.program import GatewayPlan, InboundPlan
+from router.engine import Report
+from router.engine.deadman import Feed as FeedDeadman
+from router.engine.freshness import Freshness
+from router.engine.limiter import RateLimit
+from router.gateway.documents import PublishRequest
+from router.gateway.json_reading import InvalidMessageError, cdr_builder
+from router.gateway.style import Style
+
+
+class RefusedError(Exception):
+    """What a client sent is not published. `reason` is one of GATEWAY_REJECT_REASONS or of INBOUND_DROP_REASONS."""
+
+    def __init__(self, reason: str, detail: str, topic: str = "") -> None:
+        super().__init__(detail)
+        self.reason = reason
+        self.topic = topic
+
+
+@dataclass(frozen=True, slots=True)
+class InletOutlets:
+    """Where requests go. `publish` takes CDR bytes by topic and may raise `publish_errors`; `feed_deadman` is by
+    the deadman's route, each called with the monotonic time before a message is published. Clocks in ns.
+    """
+
+    publish: Mapping[str, Callable[[bytes], None]]
+    publish_errors: tuple[type[Exception], ...]
+    feed_deadman: Mapping[str, FeedDeadman]
+    report: Callable[[Report], None]
+    clock_ns: Callable[[], int]
+    wall_ns: Callable[[], int]
+
+
+class _Topic:
+    """One topic that clients may publish on."""
+
+    def __init__(self, plan: InboundPlan, style: Style, books: Books, gateway: str) -> None:
+        self.plan = plan
+        self.build = cdr_builder(plan.type, style)
+        self.may_pass = RateLimit(plan.max_rate).may_pass if plan.max_rate is not None else None
+        self.published = books.slot("messages_published", gateway, plan.topic)
+        self.dropped = {
+            reason: books.slot("messages_dropped", gateway, plan.topic, reason) for reason in INBOUND_DROP_REASONS
+        }
+
+
+class Inlet:
+    """Of one gateway, for the thread that owns `counts`."""
+
+    def __init__(self, plan: GatewayPlan, style: Style, books: Books, counts: list[int], outlets: InletOutlets) -> None:
+        name = plan.settings.name
+        self._gateway = name
+        self._topics = {topic: _Topic(each, style, books, name) for topic, each in plan.inbound.items()}
+        self._counts = counts
+        self._outlets = outlets
+        self._freshness = Freshness()
+        self._accepted = books.slot("messages_received", name, CLIENTS)
+        self._rejected = {reason: books.slot("datagrams_rejected", name, reason) for reason in GATEWAY_REJECT_REASONS}
+
+    def reject(self, reason: str, detail: str = "") -> None:
+        """Counts something that never became a message."""
+        self._counts[self._rejected[reason]] += 1
+        self._outlets.report(Report("reject", self._gateway, "", reason, None, detail))
+
+    def publish(self, request: PublishRequest, arrived_ns: int) -> None:
+        """Publishes what was asked for, which arrived at `arrived_ns` of the wall clock. Raises RefusedError.
+
+        Everything is counted here, and reported where it is lost.
+        """
+        try:
+            topic, cdr = self._checked(request)
+        except RefusedError as refused:
+            self.reject(refused.reason, str(refused))
+            raise
+        self._counts[self._accepted] += 1
+        now = self._outlets.clock_ns()
+        self._want_fresh(topic, request, arrived_ns, now)
+        if topic.may_pass and not topic.may_pass(now):
+            raise self._lost(topic, "rate_limited", f"more often than {topic.plan.max_rate:g} Hz")
+        if topic.plan.deadman is not None:
+            self._outlets.feed_deadman[topic.plan.deadman.route](now)
+        try:
+            self._outlets.publish[topic.plan.topic](cdr)
+        except self._outlets.publish_errors as error:
+            raise self._lost(topic, "publish_error", str(error), error) from error
+        self._counts[topic.published] += 1
+
+    def _checked(self, request: PublishRequest) -> tuple[_Topic, bytes]:
+        topic = self._topics.get(request.topic)
+        if topic is None:
+            raise RefusedError("not_allowed", f"clients may not publish on '{request.topic[:80]}'", request.topic)
+        wanted = topic.plan.type.name
+        if request.type_name not in (None, wanted):
+            raise RefusedError("wrong_type", f"{request.topic} has the type {wanted}", request.topic)
+        if topic.plan.ttl is not None and request.time is None:
+            raise RefusedError("invalid", f"{request.topic} needs the time at which it was sent", request.topic)
+        try:
+            return topic, topic.build(request.data)
+        except InvalidMessageError as error:
+            raise RefusedError("invalid", str(error), request.topic) from error
+
+    def _want_fresh(self, topic: _Topic, request: PublishRequest, arrived_ns: int, now: int) -> None:
+        """Its age counts from when the client says that it was sent, or from its arrival if that is earlier."""
+        if topic.plan.ttl is None or request.time is None:
+            return
+        stamp = round(min(max(request.time, 0.0), arrived_ns / 1e9) * 1e9)
+        age = now - self._freshness.born(stamp, self._outlets.wall_ns(), now)
+        if age > topic.plan.ttl:
+            detail = f"{age / 1e9:.3f} s old, and older than {topic.plan.ttl / 1e9:g} s; are both clocks right?"
+            raise self._lost(topic, "stale", detail)
+
+    def _lost(self, topic: _Topic, reason: str, detail: str, error: Exception | None = None) -> RefusedError:
+        self._counts[topic.dropped[reason]] += 1
+        if reason != "rate_limited":  # which is what the table asks for
+            self._outlets.report(Report("drop", self._gateway, topic.plan.topic, reason, error, detail))
+        return RefusedError(reason, detail, topic.plan.topic)

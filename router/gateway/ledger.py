@@ -1,0 +1,79 @@
+"""The books of one gateway: what came from ROS, what clients got, and what was lost on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from router.compiler.books import CLIENT_DROP_REASONS, CLIENTS, GATEWAY_DROP_REASONS, TOPIC_STATES, Books
+from router.engine import Report
+from router.table.model import ROS, Gateway
+
+
+class Ledger:
+    """For the thread that owns `counts`. Every ROS message that came is sent, filtered or dropped, once."""
+
+    def __init__(self, settings: Gateway, books: Books, counts: list[int], report: Callable[[Report], None]) -> None:
+        name, way = settings.name, settings.transport.value.value
+        self._name = name
+        self._counts = counts
+        self._report = report
+        self._received = books.slot("messages_received", name, ROS)
+        self._sent = books.slot("messages_sent", name, CLIENTS)
+        self._filtered = books.slot("messages_filtered", name, CLIENTS)
+        self._dropped = {
+            reason: books.slot("messages_dropped", name, CLIENTS, reason) for reason in GATEWAY_DROP_REASONS
+        }
+        self._written = books.slot("datagrams_sent", name, way)
+        self._written_bytes = books.slot("sent_bytes", name, way)
+        self._arrived = books.slot("datagrams_received", name)
+        self._arrived_bytes = books.slot("received_bytes", name)
+        self._clients = books.slot("gateway_clients", name)
+        self._topics = [books.slot("gateway_topics", name, state) for state in TOPIC_STATES]
+        self._lost = {reason: books.slot("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
+
+    def received(self, times: int) -> None:
+        """Messages came from ROS."""
+        self._counts[self._received] += times
+
+    def sent(self) -> None:
+        """One of them was handed to all clients."""
+        self._counts[self._sent] += 1
+
+    def filtered(self, times: int) -> None:
+        """Some were not wanted: a newer one took their place, or there was no client."""
+        self._counts[self._filtered] += times
+
+    def dropped(
+        self, reason: str, topic: str, error: Exception | None = None, detail: str = "", times: int = 1
+    ) -> None:
+        """No client got it, for one of GATEWAY_DROP_REASONS."""
+        if times:
+            self._counts[self._dropped[reason]] += times
+            self._report(Report("drop", self._name, topic, reason, error, detail))
+
+    def written(self, frames: int, size: int) -> None:
+        """Datagrams, packets or documents went to the transport."""
+        self._counts[self._written] += frames
+        self._counts[self._written_bytes] += size
+
+    def arrived(self, size: int) -> None:
+        """A client sent something."""
+        self._counts[self._arrived] += 1
+        self._counts[self._arrived_bytes] += size
+
+    def superseded(self, times: int) -> None:
+        self._counts[self._lost["superseded"]] += times
+
+    def left(self, times: int) -> None:
+        self._counts[self._lost["left"]] += times
+
+    def send_error(self, error: Exception, times: int) -> None:
+        self._counts[self._lost["send_error"]] += times
+        self._report(Report("drop", self._name, CLIENTS, "send_error", error))
+
+    def clients(self, number: int) -> None:
+        self._counts[self._clients] = number
+
+    def topics(self, served: int, several_types: int, not_installed: int) -> None:
+        for slot, number in zip(self._topics, (served, several_types, not_installed), strict=True):
+            self._counts[slot] = number

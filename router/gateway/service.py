@@ -1,0 +1,158 @@
+"""One gateway: its topics, its clients, and what they send, brought together. Runs in the thread of an event loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from router.compiler.program import GatewayPlan
+from router.edges.gateway_transport import Client, Frame, Transport
+from router.gateway.audience import Audience
+from router.gateway.documents import (
+    InboundRow,
+    SchemaRequest,
+    inbound_document,
+    rejected_document,
+    topics_document,
+)
+from router.gateway.encoding import encoding
+from router.gateway.inlet import Inlet, RefusedError
+from router.gateway.json_reading import InvalidMessageError, example
+from router.gateway.ledger import Ledger
+from router.gateway.packets import PacketError, TooLargeError
+from router.gateway.schema_text import schema_text
+from router.gateway.style import Style
+from router.gateway.tasks import Tasks
+from router.gateway.topics import Surroundings, Topics
+from router.table.model import Transport as Way
+
+_TELL_S = 1.0
+_ANSWER_NS = 100_000_000
+"""How often schemas are sent because a client asks for them: a small question has a large answer."""
+
+
+class GatewayService:
+    """Implements Ears, for its transport."""
+
+    def __init__(
+        self,
+        plan: GatewayPlan,
+        around: Surroundings,
+        ledger: Ledger,
+        inlet: Inlet,
+        transport: Callable[[GatewayService], Transport],
+    ) -> None:
+        settings = plan.settings
+        self.name = settings.name
+        self._plan = plan
+        self._around = around
+        self._ledger = ledger
+        self._inlet = inlet
+        self._encoding = encoding(settings)
+        self._tasks = Tasks(around.failed)
+        self.audience = Audience(self.name, self._encoding, ledger, self._tasks, around.clock_ns, around.wall_s)
+        self._topics = Topics(
+            plan, around, self._encoding, ledger, self._tasks, lambda: bool(self.audience), self._deliver
+        )
+        self._transport = transport(self)
+        self._answered = -_ANSWER_NS
+        self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
+        self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
+
+    async def open(self) -> None:
+        """Raises StartError."""
+        await self._transport.open()
+
+    def start(self) -> None:
+        """Looks for topics and serves them from now on."""
+        self._topics.start()
+        if self._has_page:
+            self._tasks.each(_TELL_S, self._tell_topics)
+
+    async def close(self) -> None:
+        """Nothing is sent or received any more."""
+        await self._tasks.close()
+        await self._transport.close()
+        self._topics.close()
+
+    def _deliver(self, frames: Sequence[Frame]) -> None:
+        self.audience.send(frames, self._transport)
+
+    # -- Ears ----------------------------------------------------------------------------------------------------
+
+    def joined(self, client: Client) -> None:
+        subscriber = self.audience.joined(client)
+        self.audience.send_to(subscriber, self._hello() + self._topics.snapshot())
+
+    def left(self, client: Client) -> None:
+        self.audience.left(client)
+
+    def drained(self, client: Client) -> None:
+        self.audience.drained(client)
+
+    def failed(self, client: Client | None, error: Exception, lost: int) -> None:
+        self._ledger.send_error(error, lost)
+
+    def snapshot(self) -> list[Frame]:
+        return self._topics.snapshot()
+
+    def refused(self, reason: str) -> None:
+        self._ledger.arrived(0)
+        self._inlet.reject(reason)
+
+    def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
+        self._ledger.arrived(len(data))
+        try:
+            request = self._encoding.request(data)
+        except PacketError as error:
+            reason = "too_large" if isinstance(error, TooLargeError) else "malformed"
+            self._refuse(client, RefusedError(reason, str(error)))
+            return
+        except InvalidMessageError as error:
+            self._refuse(client, RefusedError("invalid", str(error)))
+            return
+        if isinstance(request, SchemaRequest):
+            self._show_schemas(client, request.type_name)
+            return
+        try:
+            self._inlet.publish(request, arrived_ns)
+        except RefusedError as refused:
+            self._tell(client, refused)
+
+    # -- answers -------------------------------------------------------------------------------------------------
+
+    def _refuse(self, client: Client, refused: RefusedError) -> None:
+        self._inlet.reject(refused.reason, str(refused))
+        self._tell(client, refused)
+
+    def _tell(self, client: Client, refused: RefusedError) -> None:
+        subscriber = self.audience.subscribers.get(client)
+        if self._explains and subscriber is not None:
+            document = rejected_document(refused.reason, str(refused), refused.topic)
+            self.audience.send_to(subscriber, [self._document(document)])
+
+    def _show_schemas(self, client: Client, type_name: str | None) -> None:
+        now = self._around.clock_ns()
+        subscriber = self.audience.subscribers.get(client)
+        if subscriber is None or now - self._answered < _ANSWER_NS:
+            self._inlet.reject("rate_limited", "schemas are sent 10 times per second at most")
+            return
+        self._answered = now
+        self.audience.send_to(subscriber, self._topics.snapshot(type_name))
+
+    def _hello(self) -> list[Frame]:
+        """What a client may send, for one that can show that to a person."""
+        if not self._has_page:
+            return []
+        rows = [
+            InboundRow(inbound.topic, inbound.type.name, schema_text(inbound.type), example(inbound.type))
+            for inbound in self._plan.inbound.values()
+        ]
+        return [self._document(inbound_document(rows))]
+
+    async def _tell_topics(self) -> None:
+        rows = list(self._topics.rates(_TELL_S))
+        self._deliver([self._document(topics_document(self._around.wall_s(), rows))])
+
+    def _document(self, data: bytes) -> Frame:
+        """One that belongs to no topic; with a slow client, a newer one takes its place."""
+        return Frame(data, "", "", is_schema=False, born=self._around.clock_ns())

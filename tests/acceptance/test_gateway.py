@@ -1,0 +1,461 @@
+"""Gateways of a running router, with ROS software in other processes and clients on real sockets."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from backports import zstd
+from websockets.sync.client import connect
+
+from tests.acceptance.ros_peer import PATIENCE, RosPeer
+from tests.acceptance.ros_speaker import Speaker
+from tests.acceptance.site import RouterProcess, Site, key, site, total, udp, wait_until
+from tests.ports import free_port
+
+HEAD = """\
+version: 1
+extends: {root}/tests/acceptance/patient.yaml
+metrics:
+  address: 127.0.0.1:{metrics}
+listen:
+  rover:
+    address: 127.0.0.5:{listen}
+endpoints:
+{endpoints}gateways:
+"""
+
+HEADSET = """\
+  headset:
+    transport: {udp: 127.0.0.9:PORT}
+    receive: 127.0.0.5:RECEIVE
+    topics: {include: ["/gw/**"], exclude: ["/gw/secret/**"]}
+    publish_period: 100ms
+    schema_period: 1s
+    discovery_period: 200ms
+"""
+
+LOGGER = """\
+  logger:
+    transport: {tcp: 127.0.0.5:PORT}
+    format: json_lines
+    topics: {include: ["/gw/**"]}
+    publish_period: each
+    discovery_period: 200ms
+"""
+
+DASHBOARD = """\
+  dashboard:
+    transport: {websocket: 127.0.0.5:PORT}
+    topics: {include: ["/gw/**"]}
+    publish_period: 50ms
+    discovery_period: 200ms
+    inbound:
+      - {topic: /gw/cmd_vel, type: geometry_msgs/msg/Twist, ttl: 2s,
+         deadman: {timeout: 300ms, send: {linear.x: -1.0}, repeat: 100ms}}
+      - {topic: /gw/limited, type: std_msgs/msg/String, max_rate: 1 Hz}
+"""
+
+
+def packet(data: bytes) -> tuple[float, int, str, str, bytes]:
+    """As the existing clients take it apart."""
+    stamp, kind = struct.unpack_from("<dB", data)
+    topic, type_name, payload = data[9:].split(b"\0", 2)
+    return stamp, kind, topic.decode(), type_name.decode(), payload
+
+
+class Headset:
+    """The existing VR client, in what it expects: it drops data before the schema of its type."""
+
+    def __init__(self, opened: socket.socket) -> None:
+        self._opened = opened
+        self.schemas: dict[str, Any] = {}
+        self.early: list[str] = []
+
+    def next(self) -> tuple[str, Any]:
+        """Topic and data, or topic and None for a schema."""
+        data = self._opened.recv(65535)
+        assert len(data) >= 13
+        stamp, kind, topic, type_name, payload = packet(data)
+        assert abs(stamp - time.time()) < PATIENCE
+        text = zstd.decompress(payload) if kind else payload
+        value = json.loads(text)
+        if {"name", "namespace", "fields"} <= value.keys():
+            assert not kind
+            self.schemas[type_name] = value
+            return topic, None
+        if type_name not in self.schemas:
+            self.early.append(topic)
+        return topic, value
+
+    def wait_for(self, wanted: Callable[[str, Any], bool]) -> Any:
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            topic, value = self.next()
+            if value is not None and wanted(topic, value):
+                return value
+        raise AssertionError("it never came")
+
+    def silent_on(self, topic: str, seconds: float) -> bool:
+        """Whether nothing of `topic` comes any more for so long, once what was under way has come."""
+        deadline = time.monotonic() + PATIENCE
+        quiet_since = time.monotonic()
+        while time.monotonic() < deadline:
+            self._opened.settimeout(seconds)
+            try:
+                if self.next()[0] == topic:
+                    quiet_since = time.monotonic()
+            except TimeoutError:
+                return True
+            finally:
+                self._opened.settimeout(PATIENCE)
+            if time.monotonic() - quiet_since > seconds:
+                return True
+        return False
+
+
+@dataclass
+class Scene:
+    """A router with gateways, and ROS software that publishes."""
+
+    site: Site
+    router: RouterProcess
+    speaker: Speaker
+    port: int
+    receive: int
+
+    def count(self, metric: str, **labels: str) -> int:
+        return self.site.scrape()[key(metric, **labels)]
+
+
+@contextmanager
+def scene(folder: Path, gateways: str) -> Iterator[Scene]:
+    """`gateways` has the words PORT and RECEIVE where free ports are to be."""
+    with site(folder) as place:
+        port, receive = free_port("127.0.0.5", kind=socket.SOCK_STREAM), free_port("127.0.0.5")
+        text = gateways.replace("PORT", str(port)).replace("RECEIVE", str(receive))
+        table = place.table(HEAD + text.replace("{", "{{").replace("}", "}}"))
+        with RouterProcess(folder, table) as router, Speaker() as speaker:
+            yield Scene(place, router, speaker, port, receive)
+
+
+@contextmanager
+def headset(scene: Scene) -> Iterator[Headset]:
+    with udp("127.0.0.9", scene.port) as opened:
+        yield Headset(opened)
+
+
+def data_of(*topics: str) -> Callable[[str, Any], bool]:
+    return lambda topic, _: topic in topics
+
+
+def test_a_headset_gets_schemas_before_values_and_values_again_and_again(tmp_path: Path) -> None:
+    with scene(tmp_path, HEADSET) as now, headset(now) as client:
+        now.speaker.open("/gw/point", "geometry_msgs/msg/Point")
+        now.speaker.open("/gw/secret/word", "std_msgs/msg/String")
+        now.speaker.open("/elsewhere", "std_msgs/msg/String")
+        wait_until(lambda: now.speaker.heard_by("/gw/point") > 0, "the subscription")
+        now.speaker.say("/gw/point", {"x": 1.0, "y": 0.1, "z": -0.0})
+        value = client.wait_for(data_of("/gw/point"))
+        assert json.dumps(value, separators=(",", ":")) == '{"x":[1.0],"y":[0.1],"z":[-0.0]}'
+        for _ in range(5):
+            assert client.wait_for(data_of("/gw/point")) == value
+        assert client.early == []
+        assert client.schemas["geometry_msgs/msg/Point"]["namespace"] == "geometry_msgs::msg"
+        assert now.speaker.heard_by("/gw/secret/word") == now.speaker.heard_by("/elsewhere") == 0
+
+
+def test_a_topic_that_goes_away_is_silent_and_comes_back_once(tmp_path: Path) -> None:
+    with scene(tmp_path, HEADSET) as now, headset(now) as client:
+        now.speaker.open("/gw/word", "std_msgs/msg/String", keeps=True)
+        now.speaker.say("/gw/word", {"data": "first"})
+        client.wait_for(data_of("/gw/word"))
+        now.speaker.close("/gw/word")
+        assert client.silent_on("/gw/word", 1.0)
+        client.schemas.clear()
+        now.speaker.open("/gw/word", "std_msgs/msg/String", reliable=False)
+        wait_until(lambda: now.speaker.heard_by("/gw/word") > 0, "the subscription")
+        now.speaker.say("/gw/word", {"data": "second"})
+        assert client.wait_for(data_of("/gw/word")) == {"data": ["second"]}
+        assert client.early == []
+        before = time.monotonic()
+        for _ in range(10):
+            client.wait_for(data_of("/gw/word"))
+        assert time.monotonic() - before > 0.7, "it is sent more than once in a period"
+
+
+def test_qos_follows_the_publishers(tmp_path: Path) -> None:
+    with scene(tmp_path, HEADSET) as now, headset(now) as client:
+        now.speaker.open("/gw/latched", "std_msgs/msg/Int32", keeps=True)
+        now.speaker.say("/gw/latched", {"data": 1})  # before anybody listens
+        now.speaker.open("/gw/lossy", "std_msgs/msg/Int32", reliable=False)
+        assert client.wait_for(data_of("/gw/latched")) == {"data": [1]}
+        wait_until(lambda: now.speaker.heard_by("/gw/lossy") > 0, "the subscription")
+        now.speaker.say("/gw/lossy", {"data": 2})
+        assert client.wait_for(data_of("/gw/lossy")) == {"data": [2]}
+        now.speaker.open("/gw/latched", "std_msgs/msg/Int32", reliable=False, name="another")
+        wait_until(lambda: now.speaker.heard_by("another") > 0, "the subscription anew")
+        now.speaker.say("another", {"data": 3})
+        assert client.wait_for(lambda topic, value: topic == "/gw/latched" and value == {"data": [3]})
+
+
+def test_values_are_compressed_and_schemas_are_not(tmp_path: Path) -> None:
+    with scene(tmp_path, HEADSET + "    compression: {zstd: 3}\n") as now, headset(now) as client:
+        now.speaker.open("/gw/word", "std_msgs/msg/String", keeps=True)
+        now.speaker.say("/gw/word", {"data": "x" * 1000})
+        assert client.wait_for(data_of("/gw/word")) == {"data": ["x" * 1000]}
+        assert client.early == []
+
+
+def test_what_no_datagram_carries_is_counted_and_what_does_goes_on(tmp_path: Path) -> None:
+    with scene(tmp_path, HEADSET) as now, headset(now) as client:
+        now.speaker.open("/gw/long", "std_msgs/msg/String", keeps=True)
+        now.speaker.open("/gw/short", "std_msgs/msg/String", keeps=True)
+        now.speaker.say("/gw/long", {"data": "x" * 70_000})
+        now.speaker.say("/gw/short", {"data": "y"})
+        assert client.wait_for(data_of("/gw/short")) == {"data": ["y"]}
+        lost = key("messages_dropped", route="headset", target="clients", reason="too_large")
+        wait_until(lambda: now.site.scrape()[lost] == 1, "the drop")
+        assert "gateway_v2" in now.router.text()
+
+
+def lines(opened: socket.socket) -> Iterator[dict[str, Any]]:
+    with opened.makefile("r", encoding="utf-8") as text:
+        for line in text:
+            yield json.loads(line)
+
+
+def test_a_logger_gets_every_message_in_order(tmp_path: Path) -> None:
+    with scene(tmp_path, LOGGER) as now:
+        now.speaker.open("/gw/number", "std_msgs/msg/Int32")
+        wait_until(lambda: now.speaker.heard_by("/gw/number") > 0, "the subscription")
+        with socket.create_connection(("127.0.0.5", now.port), PATIENCE) as opened:
+            received = lines(opened)
+            wait_until(lambda: now.site.samples()['gateway_clients{route="logger"}'] == 1, "the client")
+            for number in range(100):
+                now.speaker.say("/gw/number", {"data": number})
+            assert next(received)["op"] == "schema"
+            assert [next(received)["data"] for _ in range(100)] == [{"data": number} for number in range(100)]
+        wait_until(lambda: now.site.samples()['gateway_clients{route="logger"}'] == 0, "the client to be gone")
+
+
+def test_a_stopped_client_delays_nobody_and_gets_the_latest_values_when_it_goes_on(tmp_path: Path) -> None:
+    with scene(tmp_path, LOGGER) as now:
+        now.speaker.open("/gw/word", "std_msgs/msg/String")
+        wait_until(lambda: now.speaker.heard_by("/gw/word") > 0, "the subscription")
+        with (
+            socket.create_connection(("127.0.0.5", now.port), PATIENCE) as slow,
+            socket.create_connection(("127.0.0.5", now.port), PATIENCE) as quick,
+        ):
+            wait_until(lambda: now.site.samples()['gateway_clients{route="logger"}'] == 2, "the clients")
+            slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            received = lines(quick)
+            for number in range(600):
+                now.speaker.say("/gw/word", {"data": f"{number} " + "x" * 30_000})
+                while (line := next(received))["op"] != "data":
+                    pass
+                assert line["data"]["data"].startswith(f"{number} ")
+            dropped = key("client_messages_dropped", route="logger", reason="superseded")
+            wait_until(lambda: now.site.scrape()[dropped] > 0, "drops")
+            assert any(lag > 0 for name, lag in now.site.samples().items() if name.startswith("gateway_client_lag"))
+            for line in lines(slow):
+                if line["op"] == "data" and line["data"]["data"].startswith("599 "):
+                    break
+
+
+class Dashboard:
+    """A client of the websocket gateway."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._connection = connect(f"ws://127.0.0.5:{scene.port}/", open_timeout=PATIENCE)
+        self._waiting: list[dict[str, Any]] = []
+
+    def __enter__(self) -> Dashboard:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.close()
+
+    def next(self, op: str, wanted: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            while self._waiting:
+                document = self._waiting.pop(0)
+                if document["op"] == op and wanted(document):
+                    return document
+            text = self._connection.recv(timeout=PATIENCE)
+            assert isinstance(text, str)
+            self._waiting += map(json.loads, text.split("\n"))
+        raise AssertionError(f"no {op}")
+
+    def publish(self, topic: str, data: object, **others: object) -> None:
+        self._connection.send(json.dumps({"op": "publish", "topic": topic, "data": data, **others}))
+
+    def ask(self, **document: object) -> None:
+        self._connection.send(json.dumps(document))
+
+
+def twist(x: float) -> dict[str, Any]:
+    return {"linear": {"x": x, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": 0.0}}
+
+
+def test_a_dashboard_is_told_what_there_is_and_what_it_may_send(tmp_path: Path) -> None:
+    with scene(tmp_path, DASHBOARD) as now:
+        now.speaker.open("/gw/point", "geometry_msgs/msg/Point", keeps=True)
+        now.speaker.say("/gw/point", {"x": 1.0, "y": 2.0, "z": 3.0})
+        wait_until(lambda: now.speaker.heard_by("/gw/point") > 0, "the subscription")
+        with Dashboard(now) as client:
+            inbound = client.next("inbound")["topics"]
+            assert [each["topic"] for each in inbound] == ["/gw/cmd_vel", "/gw/limited"]
+            assert inbound[0]["example"] == twist(0.0)
+            assert client.next("data")["data"] == {"x": 1.0, "y": 2.0, "z": 3.0}
+            assert [each["topic"] for each in client.next("topics")["topics"]] == ["/gw/point"]
+
+
+def test_a_late_client_gets_schema_and_latest_value_at_once(tmp_path: Path) -> None:
+    with scene(tmp_path, DASHBOARD) as now:
+        now.speaker.open("/gw/point", "geometry_msgs/msg/Point")
+        wait_until(lambda: now.speaker.heard_by("/gw/point") > 0, "the subscription")
+        now.speaker.say("/gw/point", {"x": 7.0})
+        with Dashboard(now) as first, Dashboard(now) as second:
+            for client in (first, second):
+                assert client.next("schema")["type"] == "geometry_msgs/msg/Point"
+                assert client.next("data")["data"]["x"] == 7.0
+
+
+def test_what_a_dashboard_may_send_is_published_and_its_silence_ends_in_the_deadman(tmp_path: Path) -> None:
+    with (
+        scene(tmp_path, DASHBOARD) as now,
+        RosPeer({"/gw/cmd_vel": "geometry_msgs/msg/Twist"}) as peer,
+        Dashboard(now) as client,
+    ):
+        client.publish("/gw/cmd_vel", twist(0.5), time=time.time())
+        assert peer.receive() == ("/gw/cmd_vel", twist(0.5))
+        assert peer.receive() == ("/gw/cmd_vel", twist(-1.0))
+        assert peer.receive() == ("/gw/cmd_vel", twist(-1.0))
+        assert now.count("messages_published", route="dashboard", topic="/gw/cmd_vel") == 1
+        assert now.count("deadman_trips", route="dashboard:/gw/cmd_vel") == 1
+
+
+@pytest.mark.parametrize(
+    ("request_", "reason"),
+    [
+        ({"topic": "/gw/other", "data": {}}, "not_allowed"),
+        ({"topic": "/gw/cmd_vel", "type": "std_msgs/msg/String", "data": {}}, "wrong_type"),
+        ({"topic": "/gw/cmd_vel", "data": twist(1.0)}, "invalid"),  # without a time, where there is a ttl
+        ({"topic": "/gw/cmd_vel", "time": 1.0, "data": twist(1.0)}, "stale"),
+        ({"topic": "/gw/limited", "data": {"data": 5}}, "invalid"),
+        ({"topic": "/gw/limited", "data": {"data": "x", "more": 1}}, "invalid"),
+        ({"topic": 5, "data": {}}, "malformed"),
+    ],
+)
+def test_what_may_not_be_sent_is_refused_with_a_reason_and_counted(
+    refusing: tuple[Scene, Dashboard], request_: dict[str, Any], reason: str
+) -> None:
+    now, client = refusing
+    metric = "messages_dropped" if reason == "stale" else "datagrams_rejected"
+    before = total(now.site.scrape(), metric, reason=reason)
+    client.ask(op="publish", **request_)
+    answer = client.next("rejected")
+    assert answer["reason"] == reason
+    assert answer["detail"]
+    assert total(now.site.scrape(), metric, reason=reason) == before + 1
+    assert total(now.site.scrape(), "messages_published", route="dashboard") == 0
+
+
+@pytest.fixture(scope="module")
+def refusing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Scene, Dashboard]]:
+    with scene(tmp_path_factory.mktemp("refusing"), DASHBOARD) as now, Dashboard(now) as client:
+        yield now, client
+
+
+def test_more_often_than_max_rate_is_refused(tmp_path: Path) -> None:
+    with scene(tmp_path, DASHBOARD) as now, Dashboard(now) as client:
+        for _ in range(3):
+            client.publish("/gw/limited", {"data": "x"})
+        assert client.next("rejected")["reason"] == "rate_limited"
+        assert client.next("rejected")["reason"] == "rate_limited"
+        assert now.count("messages_published", route="dashboard", topic="/gw/limited") == 1
+
+
+INBOUND = """\
+    inbound:
+      - {topic: /gw/set, type: std_msgs/msg/Int32}
+"""
+
+
+def test_a_headset_sends_what_it_receives_in(tmp_path: Path) -> None:
+    with (
+        scene(tmp_path, HEADSET + INBOUND) as now,
+        RosPeer({"/gw/set": "std_msgs/msg/Int32"}) as peer,
+        udp("127.0.0.9") as client,
+        udp("127.0.0.8") as stranger,
+    ):
+        head = struct.pack("<dB", time.time(), 0) + b"/gw/set\0std_msgs/msg/Int32\0"
+        stranger.sendto(head + b'{"data":[1]}', ("127.0.0.5", now.receive))
+        client.sendto(head + b'{"data":2}', ("127.0.0.5", now.receive))
+        client.sendto(head + b'{"data":[3]}', ("127.0.0.5", now.receive))
+        assert peer.receive() == ("/gw/set", {"data": 3})
+        compressed = struct.pack("<dB", time.time(), 1) + b"/gw/set\0std_msgs/msg/Int32\0"
+        client.sendto(compressed + zstd.compress(b'{"data":[4]}'), ("127.0.0.5", now.receive))
+        assert peer.receive() == ("/gw/set", {"data": 4})
+        counts = now.site.scrape()
+        assert counts[key("datagrams_rejected", listener="headset", reason="source_mismatch")] == 1
+        assert counts[key("datagrams_rejected", listener="headset", reason="invalid")] == 1
+        assert counts[key("datagrams_received", listener="headset")] == 4
+        assert counts[key("messages_received", route="headset", source="clients")] == 2
+
+
+def test_schemas_come_on_request(tmp_path: Path) -> None:
+    table = HEADSET.replace("schema_period: 1s", "schema_period: 1h")
+    with scene(tmp_path, table) as now, headset(now) as client:
+        now.speaker.open("/gw/word", "std_msgs/msg/String", keeps=True)
+        now.speaker.say("/gw/word", {"data": "x"})
+        client.wait_for(data_of("/gw/word"))
+        client.schemas.clear()
+        for _ in range(5):
+            client.wait_for(data_of("/gw/word"))
+        assert client.schemas == {}
+        with udp("127.0.0.9") as asking:
+            asking.sendto(struct.pack("<dB", time.time(), 0) + b"\0\0", ("127.0.0.5", now.receive))
+            wait_until(lambda: bool(client.next() and client.schemas), "the schema")
+
+
+def test_an_address_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+    missing = HEADSET.replace("127.0.0.5:RECEIVE", "192.0.2.1:RECEIVE")
+    with scene(tmp_path, missing + LOGGER.replace("PORT", "RECEIVE")) as now:
+        assert "192.0.2.1" in now.router.text()
+        with socket.create_connection(("127.0.0.5", now.receive), PATIENCE):
+            wait_until(lambda: now.site.samples()['gateway_clients{route="logger"}'] == 1, "the client")
+
+
+def test_an_address_that_another_has_ends_the_start(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.5", 0)) as other, site(tmp_path) as place:
+        text = LOGGER.replace("PORT", str(other.getsockname()[1])).replace("{", "{{").replace("}", "}}")
+        table = place.table(HEAD + text)
+        router = RouterProcess(tmp_path, table)
+        assert router.wait() == 78
+        assert "logger" in router.text()
+        assert "table.yaml:" in router.text()
+
+
+def test_the_books_of_a_gateway_balance(tmp_path: Path) -> None:
+    with scene(tmp_path, HEADSET) as now, headset(now) as client:
+        now.speaker.open("/gw/number", "std_msgs/msg/Int32")
+        wait_until(lambda: now.speaker.heard_by("/gw/number") > 0, "the subscription")
+        for number in range(200):
+            now.speaker.say("/gw/number", {"data": number})
+        client.wait_for(lambda topic, value: topic == "/gw/number" and value == {"data": [199]})
+        received = key("messages_received", route="headset", source="ros")
+        wait_until(lambda: now.site.scrape()[received] == 200, "the last message")
+        counts = now.site.scrape()
+        outcomes = ("messages_sent", "messages_filtered", "messages_dropped")
+        assert sum(total(counts, metric, route="headset", target="clients") for metric in outcomes) == 200
