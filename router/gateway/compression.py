@@ -9,7 +9,7 @@ import threading
 
 from backports import zstd
 
-from router.gateway.packets import PacketError
+from router.gateway.packets import PacketError, TooLargeError
 
 _SMALL = 1 << 16
 """Up to so many bytes one compressor is used again and again: making one takes three times as long as its work.
@@ -46,21 +46,21 @@ def compress(data: bytes, level: int) -> bytes:
 def decompress(data: bytes, most: int) -> bytes:
     """The content of one zstd frame, at most `most` bytes. The frame's window takes no more memory than that, or 8 MiB.
 
-    Raises PacketError for anything else: damage, a second frame, what needs a dictionary.
+    Raises TooLargeError for more, PacketError for anything else: damage, a second frame, what needs a dictionary.
     """
     if not data.startswith(_MAGIC):
         raise PacketError("the payload is no zstd frame")
     try:
         told = zstd.get_frame_info(data).decompressed_size
         if told is not None and told > most:
-            raise PacketError(f"the payload is {told} bytes uncompressed, more than {most}")
+            raise TooLargeError(f"the payload is {told} bytes uncompressed, more than {most}")
         window = max(_LEAST_WINDOW_LOG, (most - 1).bit_length())
         decompressor = zstd.ZstdDecompressor(options={zstd.DecompressionParameter.window_log_max: window})
         content: bytes = decompressor.decompress(data, most + 1)
     except zstd.ZstdError as error:
         raise PacketError(f"the payload cannot be decompressed: {error}") from error
     if len(content) > most:
-        raise PacketError(f"the payload is more than {most} bytes uncompressed")
+        raise TooLargeError(f"the payload is more than {most} bytes uncompressed")
     if not decompressor.eof:
         raise PacketError("the payload ends before its zstd frame does")
     if decompressor.unused_data:

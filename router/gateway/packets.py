@@ -21,7 +21,11 @@ LONGEST_NAME = 255
 
 
 class PacketError(ValueError):
-    """The sender's fault: bytes that are no packet, or hold more than is taken."""
+    """The sender's fault: bytes that are no packet."""
+
+
+class TooLargeError(PacketError):
+    """It holds more than is taken."""
 
 
 class Packet(NamedTuple):
