@@ -299,7 +299,7 @@ class Topic {
 
   std::string schema() {
     std::lock_guard lock(mutex_);
-    return schema_;
+    return data_.empty() ? "" : schema_;
   }
 
   bool is_compressed() const { return level_ > 0; }
