@@ -1,0 +1,245 @@
+"""Gateways: what is wrong with them, and what a program has of them."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from router.compiler import Checked
+from router.compiler.books import (
+    CLIENT_DROP_REASONS,
+    CLIENTS,
+    GATEWAY_DROP_REASONS,
+    GATEWAY_REJECT_REASONS,
+    INBOUND_DROP_REASONS,
+    QOS_POLICIES,
+    TOPIC_STATES,
+)
+from router.errors import Code
+from tests.compiler.conftest import CheckText
+
+UDP = "transport: {udp: 127.0.0.9:8502}, receive: 127.0.0.1:8500"
+TCP = "transport: {tcp: 127.0.0.1:8600}"
+ZENOH = "transport: {zenoh: {key: rover}}"
+TWIST = "topic: /cmd_vel, type: geometry_msgs/msg/Twist"
+NO_ROUTES = "routes: {}"
+PUBLISHES = (
+    "routes: {ph_info: {source: board, topics: [{topic: %s, type: std_msgs/msg/Float32, fields: {data: ph_value}}]}}"
+)
+SUBSCRIBES = """routes: {ph_info: {source: ros, topics: [{topic: %s, type: std_msgs/msg/Float32}],
+  fields: {ph_value: data}, destinations: [base]}}"""
+
+
+def checked(check_text: CheckText, gateways: str, routes: str = NO_ROUTES, **parts: str) -> Checked:
+    """`gateways` on one line in braces. Without the finding that there are few routes."""
+    found = check_text(f"{routes}\ngateways: {{{gateways}}}\n", **parts)
+    rest = [each for each in found.diagnostics if each.code is not Code.UNCOVERED_PAYLOAD_CASE]
+    return Checked(found.path, rest, found.table, found.schema, found.envelope, found.routes, found.gateways)
+
+
+def codes(check_text: CheckText, gateways: str, routes: str = NO_ROUTES, **parts: str) -> list[Code]:
+    return [finding.code for finding in checked(check_text, gateways, routes, **parts).diagnostics]
+
+
+def blamed(check_text: CheckText, gateways: str, routes: str = NO_ROUTES, **parts: str) -> list[str]:
+    """What stands in the table where each finding is."""
+    found = checked(check_text, gateways, routes, **parts)
+    lines = found.path.read_text(encoding="utf-8").splitlines()
+    spans = [finding.span for finding in found.diagnostics]
+    return [lines[span.line - 1][span.column - 1 : span.end_column - 1] for span in spans]
+
+
+def test_a_table_may_have_gateways_and_no_topics(check_text: CheckText) -> None:
+    program = checked(check_text, f"it: {{{UDP}}}").program
+    assert program
+    [gateway] = program.gateways
+    assert (gateway.settings.name, gateway.inbound, program.publishers) == ("it", {}, ())
+
+
+@pytest.mark.parametrize("name", ["here", "ph_info", "ph_info_from_board"])
+def test_a_gateway_has_a_name_of_its_own(check_text: CheckText, name: str) -> None:
+    routes = "routes: {ph_info: [{source: board, destinations: [base]}, {source: base, destinations: [tool]}]}"
+    endpoints = (
+        "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation},"
+        " tool: {address: 127.0.0.4:9, kind: tool}}"
+    )
+    assert blamed(check_text, f"{name}: {{{TCP}}}", routes, endpoints=endpoints) == [name]
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong"),
+    [
+        ("topics: {include: [/imu, imu]}", "imu"),
+        ('topics: {include: [{regex: "("}]}', '"("'),
+        ('topics: {exclude: ["/a[b]"]}', '"/a[b]"'),
+        ('rates: {"/a**": 5}', '"/a**"'),
+    ],
+)
+def test_a_bad_pattern_is_blamed(check_text: CheckText, settings: str, wrong: str) -> None:
+    found = checked(check_text, f"it: {{{TCP}, {settings}}}").diagnostics
+    assert [finding.code for finding in found] == [Code.BAD_VALUE]
+    assert blamed(check_text, f"it: {{{TCP}, {settings}}}") == [wrong]
+
+
+@pytest.mark.parametrize(
+    ("gateways", "clashes"),
+    [
+        (f"a: {{{UDP}}}, b: {{transport: {{udp: 127.0.0.9:8503}}, receive: 127.0.0.1:8500}}", 1),
+        (f"a: {{{UDP}}}, b: {{transport: {{udp: 127.0.0.9:8503}}, receive: 0.0.0.0:8500}}", 1),
+        (f"a: {{{UDP}}}, b: {{transport: {{udp: 127.0.0.9:8502}}}}", 0),
+        ("a: {transport: {udp: 127.0.0.9:8502}, receive: 127.0.0.1:25000}", 1),
+        ("a: {transport: {tcp: 127.0.0.1:25000}}", 0),
+        (f"a: {{{TCP}}}, b: {{transport: {{websocket: 0.0.0.0:8600}}}}", 1),
+        (f"a: {{{TCP}}}, b: {{transport: {{udp: 127.0.0.9:1}}, receive: 127.0.0.1:8600}}", 0),
+        ("a: {transport: {websocket: 127.0.0.1:9108}}", 1),
+        ("a: {transport: {udp: 127.0.0.9:1}, receive: 127.0.0.1:9108}", 0),
+        (f"a: {{{ZENOH}}}, b: {{{ZENOH}}}", 1),
+        (f"a: {{{ZENOH}}}, b: {{transport: {{zenoh: {{key: rover/two}}}}}}", 0),
+    ],
+)
+def test_each_has_an_address_of_its_own(check_text: CheckText, gateways: str, clashes: int) -> None:
+    routes = "metrics: {address: 127.0.0.1:9108}\nroutes: {}"
+    assert codes(check_text, gateways, routes) == [Code.ADDRESS_CLASH] * clashes
+
+
+@pytest.mark.parametrize("client", ["127.0.0.1:25000", "127.0.0.1:8500"])
+def test_a_gateway_does_not_send_to_the_router(check_text: CheckText, client: str) -> None:
+    gateway = f"it: {{transport: {{udp: {client!r}}}, receive: 127.0.0.1:8500}}"
+    assert codes(check_text, gateway) == [Code.FORWARDING_LOOP]
+
+
+@pytest.mark.parametrize(
+    ("inbound", "found"),
+    [
+        (f"{{{TWIST}}}", []),
+        ("{topic: /1st, type: std_msgs/msg/Empty}", [Code.BAD_TOPIC_NAME]),
+        ("{topic: /a, type: std_msgs/msg/Emty}", [Code.UNKNOWN_ROS_TYPE]),
+        (f"{{{TWIST}}}, {{{TWIST}}}", [Code.BAD_VALUE]),
+        (f"{{{TWIST}}}, {{topic: cmd_vel, type: geometry_msgs/msg/Twist}}", [Code.BAD_VALUE]),
+        (f"{{{TWIST}, qos: {{history: keep_all}}}}", [Code.QOS_CONFLICT]),
+        (f"{{{TWIST}, max_rate: 2, deadman: {{timeout: 500ms, send: {{}}}}}}", [Code.BAD_VALUE]),
+        (f"{{{TWIST}, max_rate: 2.1, deadman: {{timeout: 500ms, send: {{}}}}}}", []),
+        (f"{{{TWIST}, deadman: {{timeout: 500ms, send: {{}}, repeat: 9ms}}}}", [Code.BAD_VALUE]),
+        (f"{{{TWIST}, ttl: 5s, deadman: {{timeout: 500ms, send: {{}}}}}}", []),
+        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.w: 0}}}}}}", [Code.UNKNOWN_FIELD]),
+        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: y}}}}}}", [Code.UNKNOWN_FIELD]),
+        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: received_at}}}}}}", [Code.UNKNOWN_FIELD]),
+        (f"{{{TWIST}, deadman: {{timeout: 1s, send: {{linear.x: '1 / 0'}}}}}}", [Code.OUT_OF_RANGE]),
+        ("{topic: /a, type: std_msgs/msg/UInt8, deadman: {timeout: 1s, send: {data: 256}}}", [Code.OUT_OF_RANGE]),
+    ],
+)
+def test_what_is_let_in_is_checked(check_text: CheckText, inbound: str, found: list[Code]) -> None:
+    assert codes(check_text, f"it: {{{TCP}, inbound: [{inbound}]}}") == found
+
+
+def test_everything_that_is_wrong_is_found_in_one_run(check_text: CheckText) -> None:
+    gateway = f"here: {{{TCP}, topics: {{include: [a]}}, max_message: 5B, inbound: [{{topic: /1st, type: x, ttl: 3}}]}}"
+    assert len(codes(check_text, gateway)) == 6
+
+
+@pytest.mark.parametrize(
+    ("routes", "inbound", "found"),
+    [
+        (PUBLISHES % "/a", "{topic: /a, type: std_msgs/msg/Float32}", []),
+        (PUBLISHES % "a", "{topic: /a, type: std_msgs/msg/Float64}", [Code.TOPIC_TYPE_CLASH]),
+        (SUBSCRIBES % "a", "{topic: /a, type: std_msgs/msg/Float64}", [Code.TOPIC_TYPE_CLASH]),
+        (PUBLISHES % "/a", "{topic: /a, type: std_msgs/msg/Float32, queue_depth: 3}", [Code.QOS_CONFLICT]),
+        (SUBSCRIBES % "/a", "{topic: /a, type: std_msgs/msg/Float32, queue_depth: 3}", []),
+        (
+            SUBSCRIBES % "/a",
+            "{topic: /a, type: std_msgs/msg/Float32, qos: {reliability: best_effort}}",
+            [Code.QOS_CONFLICT],
+        ),
+    ],
+)
+def test_clients_publish_as_routes_do(check_text: CheckText, routes: str, inbound: str, found: list[Code]) -> None:
+    assert codes(check_text, f"it: {{{TCP}, inbound: [{inbound}]}}", routes) == found
+
+
+@pytest.mark.parametrize(("second", "found"), [("Float32", []), ("Float64", [Code.TOPIC_TYPE_CLASH])])
+def test_gateways_that_let_in_one_topic_agree_on_its_type(
+    check_text: CheckText, second: str, found: list[Code]
+) -> None:
+    a = f"a: {{{TCP}, inbound: [{{topic: /a, type: std_msgs/msg/Float32}}]}}"
+    b = f"b: {{{ZENOH}, inbound: [{{topic: a, type: std_msgs/msg/{second}}}]}}"
+    assert codes(check_text, f"{a}, {b}") == found
+
+
+def test_inbound_topics_are_planned_by_absolute_names_and_published_once(check_text: CheckText) -> None:
+    twist = "type: geometry_msgs/msg/Twist"
+    a = f"a: {{{UDP}, inbound: [{{topic: cmd_vel, {twist}, ttl: 300ms, max_rate: 20 Hz}}, {{topic: ~/x, {twist}}}]}}"
+    b = f"b: {{{TCP}, inbound: [{{topic: /ns/cmd_vel, {twist}}}]}}"
+    program = checked(check_text, f"{a}, {b}", node="{name: router, namespace: /ns}").program
+    assert program
+    first, second = program.gateways
+    assert list(first.inbound) == ["/ns/cmd_vel", "/ns/router/x"]
+    plan = first.inbound["/ns/cmd_vel"]
+    assert (plan.topic, plan.type.name, plan.ttl, plan.max_rate) == (
+        "/ns/cmd_vel",
+        "geometry_msgs/msg/Twist",
+        300_000_000,
+        20.0,
+    )
+    assert list(second.inbound) == ["/ns/cmd_vel"]
+    assert [topic.topic for topic in program.publishers] == ["/ns/cmd_vel", "/ns/router/x"]
+    assert "geometry_msgs/msg/Vector3" in program.publishers[0].definitions
+
+
+@pytest.mark.parametrize(
+    ("type_name", "send", "cdr"),
+    [
+        ("std_msgs/msg/Empty", "{}", "00010000 00"),
+        ("std_msgs/msg/Float64", "{}", "00010000 0000000000000000"),
+        ("std_msgs/msg/Float64", "{data: -0.5}", "00010000 000000000000e0bf"),
+        ("geometry_msgs/msg/Vector3", "{y: 1.0}", "00010000 0000000000000000 000000000000f03f 0000000000000000"),
+        ("std_msgs/msg/String", "{data: \"'halt'\"}", "00010000 05000000 68616c7400"),
+        ("std_msgs/msg/String", "{}", "00010000 01000000 00"),
+        ("std_msgs/msg/UInt8MultiArray", "{data: [1, 2]}", "00010000 00000000 00000000 02000000 0102"),
+        ("sensor_msgs/msg/NavSatStatus", "{status: NavSatStatus.STATUS_NO_FIX}", "00010000 ff00 0000"),
+    ],
+)
+def test_what_a_deadman_publishes_is_known_before_the_start(
+    check_text: CheckText, type_name: str, send: str, cdr: str
+) -> None:
+    inbound = f"{{topic: /a, type: {type_name}, deadman: {{timeout: 1s, send: {send}, repeat: 50ms}}}}"
+    program = checked(check_text, f"it: {{{TCP}, inbound: [{inbound}]}}").program
+    assert program
+    deadman = program.gateways[0].inbound["/a"].deadman
+    assert deadman
+    assert (deadman.route, deadman.timeout, deadman.repeat) == ("it:/a", 10**9, 50_000_000)
+    assert [(topic, data.hex()) for topic, data in deadman.datagrams] == [("/a", cdr.replace(" ", ""))]
+    assert program.deadmen == ()
+
+
+def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText) -> None:
+    deadman = "deadman: {timeout: 1s, send: {}}"
+    program = checked(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, {deadman}}}]}}").program
+    assert program
+    topic, watch = "/cmd_vel", "it:/cmd_vel"
+    expected = {
+        ("datagrams_received", "it"),
+        ("received_bytes", "it"),
+        *(("datagrams_rejected", "it", reason) for reason in GATEWAY_REJECT_REASONS),
+        ("messages_received", "it", "ros"),
+        ("messages_received", "it", CLIENTS),
+        ("messages_published", "it", topic),
+        *(("messages_dropped", "it", topic, reason) for reason in INBOUND_DROP_REASONS),
+        ("messages_sent", "it", CLIENTS),
+        ("messages_filtered", "it", CLIENTS),
+        *(("messages_dropped", "it", CLIENTS, reason) for reason in GATEWAY_DROP_REASONS),
+        ("datagrams_sent", "it", "udp"),
+        ("sent_bytes", "it", "udp"),
+        ("gateway_clients", "it"),
+        *(("gateway_topics", "it", state) for state in TOPIC_STATES),
+        *(("client_messages_dropped", "it", reason) for reason in CLIENT_DROP_REASONS),
+        ("route_seconds", "it"),
+        ("route_last_message_timestamp_seconds", "it"),
+        *(("qos_incompatible", "it", topic, policy) for policy in QOS_POLICIES),
+        ("deadman_active", watch),
+        ("deadman_trips", watch),
+        ("deadman_datagrams_sent", watch, topic),
+        ("deadman_send_errors", watch, topic),
+    }
+    series = {(each.metric, *each.labels) for each, _ in program.books.series()}
+    assert {each for each in series if re.match("it(:|$)", each[1])} == expected
