@@ -1,4 +1,4 @@
-"""What the gateway's JSON has in common, whichever way it goes: the two styles and what is unreadable. Imports nothing."""
+"""What JSON has in common whichever way it goes: the two styles, and what is unreadable. Imports nothing."""
 
 from __future__ import annotations
 

@@ -1,0 +1,149 @@
+"""What generated code calls for strings and lists: JSON text from bytes that were cut out of a message.
+
+The bytes may be anything: UnreadableError and UnicodeError are for those that mean nothing. Texts of short ones are
+kept by their bytes, since most come again (frame names, covariances). Of long ones, no single call into C that holds
+the interpreter's lock takes more than 4096 elements, so that a message of megabytes holds up no other thread.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import NoReturn
+
+from router.gateway.numbers import DOUBLES, FLOATS
+from router.gateway.style import UnreadableError
+
+_MOST = 4096
+"""Elements a call."""
+_LONGEST, _KEPT = 512, 2048
+"""Bytes of what is kept, and how many of a kind."""
+_LARGEST_UNIT = 0xFFFF
+_quote = json.JSONEncoder(ensure_ascii=False).encode
+_Convert = Callable[[bytes], str]
+ListText = Callable[[bytes, int, int], str]
+"""Takes a message and where in it the elements begin and end; the text is without brackets."""
+
+
+class KnownTexts(dict[bytes, str]):
+    """Texts by their bytes, made when first asked for; forgets all when it holds many."""
+
+    def __init__(self, convert: _Convert) -> None:
+        super().__init__()
+        self._convert = convert
+
+    def __missing__(self, data: bytes) -> str:
+        text = self._convert(data)
+        if len(data) <= _LONGEST:
+            if len(self) >= _KEPT:
+                self.clear()
+            self[data] = text
+        return text
+
+
+def cut_off(cdr: bytes) -> NoReturn:
+    raise UnreadableError(f"the message ends after {len(cdr)} bytes, within a string or list")
+
+
+def joined(texts: Sequence[str]) -> str:
+    """With commas between them."""
+    if len(texts) <= _MOST:
+        return ",".join(texts)
+    return ",".join([",".join(texts[start : start + _MOST]) for start in range(0, len(texts), _MOST)])
+
+
+def _string(data: bytes) -> str:
+    """A string from its bytes with the final NUL. Some writers leave it out where the string is empty."""
+    if data and data[-1]:
+        raise UnreadableError("a string does not end with NUL")
+    return _quoted(data[:-1].decode())
+
+
+def _quoted(text: str) -> str:
+    if len(text) <= _MOST:
+        return _quote(text)
+    return "".join(['"', *(_quote(text[start : start + _MOST])[1:-1] for start in range(0, len(text), _MOST)), '"'])
+
+
+def _wide_string(data: bytes) -> str:
+    """A wstring, which has its UTF-16 units in 32 bits each, as a string."""
+    units = b"".join([struct.pack(f"<{len(part)}H", *part) for part in _units(data)])
+    return _quoted(units.decode("utf-16-le"))
+
+
+def _wide_list(data: bytes) -> str:
+    """The same as a list of its units."""
+    return ",".join([_plain(part) for part in _units(data)])
+
+
+def _units(data: bytes) -> list[tuple[int, ...]]:
+    size = 4 * _MOST
+    parts = [_unpack("I", 4, data[start : start + size]) for start in range(0, len(data) & ~3, size)]
+    if any(max(part) > _LARGEST_UNIT for part in parts):
+        raise UnreadableError("a wstring has units that are no UTF-16")
+    return parts
+
+
+def _unpack(letter: str, size: int, data: bytes) -> tuple[int, ...]:
+    return struct.unpack_from(f"<{len(data) // size}{letter}", data)
+
+
+def _plain(numbers: Sequence[int]) -> str:
+    return repr(list(numbers))[1:-1].replace(" ", "")
+
+
+def _bytes(data: bytes) -> str:
+    """Two at a time: that halves the work, and a table of all pairs takes 4 MB."""
+    pairs = _pairs()
+    texts = [pairs[pair] for pair in _unpack("H", 2, data)]
+    return ",".join([*texts, str(data[-1])] if len(data) & 1 else texts)
+
+
+@cache
+def _pairs() -> list[str]:
+    return [f"{pair & 0xFF},{pair >> 8}" for pair in range(1 << 16)]
+
+
+def _bools(data: bytes) -> str:
+    return ",".join(["true" if byte else "false" for byte in data])
+
+
+def _doubles(data: bytes) -> str:
+    return ",".join([DOUBLES[bits] for bits in _unpack("Q", 8, data)])
+
+
+def _floats(data: bytes) -> str:
+    return ",".join([FLOATS[bits] for bits in _unpack("I", 4, data)])
+
+
+def _integers(letter: str) -> _Convert:
+    size = struct.calcsize(f"<{letter}")
+    return lambda data: _plain(_unpack(letter, size, data))
+
+
+_CONVERT: dict[str, _Convert] = {
+    **{letter: _integers(letter) for letter in "bhHiIqQ"}, "B": _bytes, "?": _bools, "f": _floats, "d": _doubles,
+}  # fmt: skip
+
+STRINGS = KnownTexts(_string)
+WIDE_STRINGS = KnownTexts(_wide_string)
+WIDE_LISTS = KnownTexts(_wide_list)
+SHORT_LISTS = {letter: KnownTexts(convert) for letter, convert in _CONVERT.items()}
+"""By the struct letter of the elements; texts are without brackets."""
+
+
+def list_text(letter: str) -> ListText:
+    """For lists of scalars of any length; raises UnreadableError when they end behind the message."""
+    short, convert = SHORT_LISTS[letter], _CONVERT[letter]
+    size = _MOST * struct.calcsize(f"<{letter}")
+
+    def text(cdr: bytes, start: int, end: int) -> str:
+        if end > len(cdr):
+            cut_off(cdr)
+        if end - start <= _LONGEST:
+            return short[cdr[start:end]]
+        return ",".join([convert(cdr[at : min(at + size, end)]) for at in range(start, end, size)])
+
+    return text
