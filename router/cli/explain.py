@@ -1,4 +1,4 @@
-"""`router explain`: a route as the router understands it, down to the code that serves it.
+"""`router explain`: a route or a gateway as the router understands it, down to the code that serves it.
 
 Prints what the compiler found out; finds out nothing itself.
 """
@@ -8,34 +8,40 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
+from router.cli.explain_gateway import explained_gateway, known_topics, seen_topics
+from router.cli.explain_words import duration, quality
 from router.cli.findings import is_coloured, print_findings
+from router.cli.tool_options import positive
 from router.compiler import Checked, check_table
 from router.compiler.books import Books
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
-from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.link import compile_handlers
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
-from router.compiler.topics import qos_of
 from router.errors import did_you_mean
 from router.table.model import ANY, ROS, Destination, Route, RouteTable, Topic
 from router.types.sizes import framed_size
 
 _WIDEST_CELL = 48
 _DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides,
-largest sizes, and the code that the router runs."""
+largest sizes, and the code that the router runs. Of a gateway, show what it sends how often, and what it lets in: with
+a ~ in front each topic that its patterns match, of those that the table names, or with --live of all that there are."""
+_LIVE = 2.0
+"""Seconds that ROS takes at most, as a rule, until a new node knows the others."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser("explain", help=VERBS["explain"], description=_DESCRIPTION)
-    parser.add_argument("cases", nargs="*", metavar="CASE", help="payload cases; all of the table when none is named")
+    everything = "payload cases and gateways; all of the table when none is named"
+    parser.add_argument("names", nargs="*", metavar="NAME", help=everything)
     parser.add_argument("--table", type=Path, default=DEFAULT_TABLE, help="route table (default: %(default)s)")
     parser.add_argument("--no-code", action="store_true", help="leave the generated code out")
+    live = f"look for topics in the ROS network as well, for so long (default: {_LIVE:g})"
+    parser.add_argument("--live", nargs="?", type=positive, const=_LIVE, metavar="SECONDS", help=live)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,18 +52,29 @@ def run(args: argparse.Namespace) -> int:
     routes: dict[str, list[CheckedRoute]] = {}
     for route in checked.routes:
         routes.setdefault(route.case.name, []).append(route)
-    for name in args.cases:
-        if name not in routes:
-            print(f"router explain: {args.table} has no route '{name}'; {did_you_mean(name, routes)}", file=sys.stderr)
+    gateways = {gateway.settings.name: gateway for gateway in checked.gateways}
+    known = [*routes, *gateways]
+    for name in args.names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            print(f"router explain: {args.table} has no route or gateway '{name}'; {hint}", file=sys.stderr)
             return BAD_USAGE
-    for route in (route for name in args.cases or routes for route in routes[name]):
-        for line in _explained(route, checked):
-            print(line)
-        if not args.no_code and not route.route.ignore:
-            for handler in compile_handlers(route, checked.table, Books()):
-                _print_code(handler.source)
-        print()
+    topics = known_topics(checked.table) if args.live is None else seen_topics(checked.table, args.live)
+    for name in args.names or known:
+        for route in routes.get(name, ()):
+            _print_route(route, checked, args.no_code)
+        if name in gateways:
+            print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
     return OK
+
+
+def _print_route(route: CheckedRoute, checked: Checked, no_code: bool) -> None:
+    assert checked.table is not None  # noqa: S101 - a table without errors is one
+    print(*_explained(route, checked), sep="\n")
+    if not no_code and not route.route.ignore:
+        for handler in compile_handlers(route, checked.table, Books()):
+            _print_code(handler.source)
+    print()
 
 
 def _explained(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
@@ -79,7 +96,7 @@ def _explained(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
     for feed in checked.feeds:
         yield ""
         yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
-        yield _qos(feed.topic)
+        yield quality(feed.topic)
         if feed.topic.when is not None:
             yield f"    when {feed.topic.when.text}"
         for served in feed.targets:
@@ -91,19 +108,19 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
     """What holds for the whole route."""
     route, deadman = checked.route, checked.deadman
     if route.ttl is not None:
-        yield f"  dropped when older than {_duration(route.ttl.value)}"
+        yield f"  dropped when older than {duration(route.ttl.value)}"
     if route.for_each is not None:
         yield f"  one datagram for each of {route.for_each.text}"
     if route.collect is not None:
         collect = route.collect
         yield (
             f"  frames by {collect.by.text}, of {collect.count.text} datagrams in the order of {collect.order.text}, "
-            f"complete within {_duration(collect.timeout.value)}"
+            f"complete within {duration(collect.timeout.value)}"
         )
     if deadman is not None:
         yield (
             f"  deadman: {deadman.case.name} to {', '.join(deadman.to)} when no command came for "
-            f"{_duration(deadman.timeout)}, again every {_duration(deadman.repeat)}"
+            f"{duration(deadman.timeout)}, again every {duration(deadman.repeat)}"
         )
         if deadman.hands_over_to:
             yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
@@ -117,10 +134,6 @@ def _source(name: str, table: RouteTable) -> str:
     endpoint = table.endpoints[name]
     port = f":{endpoint.source_port.value}" if endpoint.source_port else ""
     return f"{name} ({endpoint.address.value.host}{port})"
-
-
-def _duration(ns: int) -> str:
-    return f"{ns / 1e9:g} s" if ns >= NS_PER_SECOND else f"{ns / 1e6:g} ms"
 
 
 def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:
@@ -140,16 +153,11 @@ def _topic(served: CheckedTarget) -> Iterator[str]:
     target, topic = served.target, served.topic
     assert topic is not None  # noqa: S101 - the caller's choice
     yield f"  topic {target.name}: {topic.type.value}  ({target.span})"
-    yield _qos(topic)
+    yield quality(topic)
     if target.plan is not None:
         size, exact = message_size(target.plan)
         yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
     yield from _served(served, topic)
-
-
-def _qos(topic: Topic) -> str:
-    qos = {name: value for name, value in asdict(qos_of(topic)).items() if value is not None}
-    return f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"
 
 
 def _served(served: CheckedTarget, named: Destination | Topic) -> Iterator[str]:

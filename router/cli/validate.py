@@ -81,8 +81,10 @@ def _is_table(file: Path) -> bool:
 
 
 def summary(table: RouteTable) -> str:
-    """`26 payload cases, 31 topics, 8 endpoints`."""
+    """`26 payload cases, 31 topics, 8 endpoints, 1 gateway`."""
     topics = sum(len(route.topics) for route in table.routes)
     cases = {route.case.value for route in table.routes}
-    counts = (len(cases), "payload case"), (topics, "topic"), (len(table.endpoints), "endpoint")
+    counts = [(len(cases), "payload case"), (topics, "topic"), (len(table.endpoints), "endpoint")]
+    if table.gateways:
+        counts.append((len(table.gateways), "gateway"))
     return ", ".join(plural(count, noun) for count, noun in counts)

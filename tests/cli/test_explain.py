@@ -96,7 +96,7 @@ def test_without_a_case_all_are_explained(table: Path, capsys: pytest.CaptureFix
 
 def test_an_unknown_case_is_wrong_usage(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", "imu", "--table", str(table)]) == BAD_USAGE
-    assert f"{table} has no route 'imu'" in capsys.readouterr().err
+    assert f"{table} has no route or gateway 'imu'" in capsys.readouterr().err
 
 
 def test_a_bad_table_is_told_instead(table: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,6 +28,13 @@ def test_a_good_table_is_ok_in_one_line(routes: Path, capsys: pytest.CaptureFixt
     assert capsys.readouterr().out == "routes/good.yaml: ok (3 payload cases, 1 topic, 2 endpoints)\n"
 
 
+def test_gateways_are_counted_where_there_are_some(routes: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with (routes / "good.yaml").open("a") as more:
+        more.write("gateways: {dashboard: {transport: {websocket: 127.0.0.1:8765}}}\n")
+    assert main(["validate", "routes/good.yaml"]) == OK
+    assert capsys.readouterr().out.endswith("2 endpoints, 1 gateway)\n")
+
+
 def test_the_tables_of_the_repository_have_no_errors(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,19 @@
+"""How `router explain` says what routes and gateways have in common."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from router.compiler.implementations import NS_PER_SECOND
+from router.compiler.topics import qos_of
+from router.table.model import Topic
+
+
+def duration(ns: int) -> str:
+    return f"{ns / 1e9:g} s" if ns >= NS_PER_SECOND else f"{ns / 1e6:g} ms"
+
+
+def quality(topic: Topic) -> str:
+    """A line with the whole QoS of a topic."""
+    qos = {name: value for name, value in asdict(qos_of(topic)).items() if value is not None}
+    return f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"

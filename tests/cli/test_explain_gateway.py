@@ -1,0 +1,125 @@
+"""What `router explain` says of gateways."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+
+BASE = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
+TABLE = """\
+extends: {base}
+gateways:
+  vr_headset:
+    transport: {{udp: 127.0.0.9:8502}}
+    receive: 127.0.0.1:8500
+    format: gateway_v2
+    topics: {{include: [/*_data, {{regex: "/imu.*"}}], exclude: [/x_data]}}
+    compression: {{zstd: 3}}
+    rates: {{/tf: each, "/imu*": 50 Hz}}
+    inbound:
+      - topic: cmd_vel
+        type: geometry_msgs/msg/Twist
+        ttl: 300ms
+        max_rate: 20 Hz
+        deadman: {{timeout: 500ms, send: {{linear.x: 0.0}}}}
+      - {{topic: /stop, type: std_msgs/msg/Empty, deadman: {{timeout: 1s, send: {{}}}}}}
+  dashboard: {{transport: {{websocket: 127.0.0.1:8765}}, publish_period: each}}
+  net: {{transport: {{zenoh: {{key: a/b, connect: [tcp/127.0.0.1:7447]}}}}, topics: {{include: [/greeting]}}}}
+"""
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    path = tmp_path / "table.yaml"
+    path.write_text(TABLE.format(base=BASE))
+    return path
+
+
+def explained(capsys: pytest.CaptureFixture[str], table: Path, *words: str) -> str:
+    assert main(["explain", *words, "--table", str(table)]) == OK
+    return capsys.readouterr().out
+
+
+def test_a_gateway_is_told_with_its_patterns_what_they_match_and_what_it_lets_in(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert explained(capsys, table, "vr_headset") == (
+        f"vr_headset: gateway, udp to 127.0.0.9:8502 on 127.0.0.1:8500, gateway_v2  ({table}:3:3)\n"
+        "  the latest value every 500 ms; schemas again every 5 s, looks for topics every 5 s\n"
+        "  messages of up to 16777216 bytes, compressed with zstd 3, in datagrams of up to 1400 bytes\n"
+        "  sends /*_data, regex /imu.*, but not /x_data\n"
+        "    /tf: every message\n"
+        "    /imu*: the latest value every 20 ms\n"
+        "  ~ /imu_data  comms/msg/ImuSensorInformation  the latest value every 20 ms  by /*_data, rate of /imu*\n"
+        "\n"
+        f"  from clients /cmd_vel: geometry_msgs/msg/Twist  ({table}:11:9)\n"
+        "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
+        "    dropped when older than 300 ms\n"
+        "    at most 20 Hz\n"
+        "    deadman: linear.x 0.0 when no message came for 500 ms, again every 100 ms\n"
+        "\n"
+        f"  from clients /stop: std_msgs/msg/Empty  ({table}:16:10)\n"
+        "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
+        "    deadman: all fields at their defaults when no message came for 1 s, again every 100 ms\n"
+        "\n"
+    )
+
+
+def test_without_patterns_all_topics_of_the_table_are_matched_also_those_of_other_gateways(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert explained(capsys, table, "dashboard") == (
+        f"dashboard: gateway, websocket on 127.0.0.1:8765, 1024 clients at most, json  ({table}:17:3)\n"
+        "  every message; looks for topics every 5 s\n"
+        "  messages of up to 16777216 bytes\n"
+        "  sends every topic that is not hidden\n"
+        "  ~ /cmd_vel   geometry_msgs/msg/Twist         every message  by /**\n"
+        "  ~ /imu_data  comms/msg/ImuSensorInformation  every message  by /**\n"
+        "  ~ /stop      std_msgs/msg/Empty              every message  by /**\n"
+        "\n"
+    )
+
+
+def test_a_gateway_may_match_nothing(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert explained(capsys, table, "net") == (
+        f"net: gateway, zenoh peer under a/b, connects to tcp/127.0.0.1:7447, gateway_v1  ({table}:18:3)\n"
+        "  the latest value every 500 ms; schemas again every 5 s, looks for topics every 5 s\n"
+        "  messages of up to 16777216 bytes\n"
+        "  sends /greeting\n"
+        "\n"
+    )
+
+
+def test_without_a_name_routes_and_gateways_are_told(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = explained(capsys, table, "--no-code")
+    assert told.index("imu_info: ") < told.index("vr_headset: gateway") < told.index("dashboard: gateway")
+
+
+def test_an_unknown_gateway_is_wrong_usage(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "vr_handset", "--table", str(table)]) == BAD_USAGE
+    assert "did you mean 'vr_headset'?" in capsys.readouterr().err
+
+
+def test_a_bad_gateway_is_told_instead(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table.write_text(table.read_text().replace("/*_data", "data"))
+    assert main(["explain", "--table", str(table)]) == BAD_TABLE
+    assert "error[bad-value]: 'data' does not begin with '/'" in capsys.readouterr().err
+
+
+def test_live_shows_topics_of_the_network_with_who_publishes_them(
+    table: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    from tests.edges.ros_publisher import Publisher
+
+    with closing(Publisher("greeting", "std_msgs/msg/String")):
+        while "~" not in (told := explained(capsys, table, "net", "--live", "0.5")):
+            pass
+    assert "  ~ /greeting  std_msgs/msg/String of 1  the latest value every 500 ms  by /greeting\n" in told
+    assert "/imu_data  comms/msg/ImuSensorInformation, no publisher  " in explained(
+        capsys, table, "vr_headset", "--live", "0.1"
+    )
