@@ -1,0 +1,66 @@
+"""What a gateway's websocket port says to a browser: one page, and which pages may open a websocket."""
+
+from __future__ import annotations
+
+import base64
+import re
+from hashlib import sha256
+from http import HTTPStatus
+
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+_HOST = re.compile(r"[A-Za-z0-9.:\[\]-]+")
+_INLINE = re.compile(rb"<(script|style)[^>]*>(.*?)</\1>", re.DOTALL)
+
+
+class Page:
+    """HTML that needs nothing from outside, and is let nothing."""
+
+    def __init__(self, html: bytes) -> None:
+        self._html = html
+        self._policy = _policy(html)
+
+    def answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """What is answered to a request; None goes on to a websocket."""
+        if any(value.lower() == "websocket" for value in request.headers.get_all("Upgrade")):
+            if _is_from_elsewhere(request.headers):
+                return connection.respond(HTTPStatus.FORBIDDEN, "a page of another host may not connect\n")
+            return None
+        if request.path.partition("?")[0] != "/":
+            return connection.respond(HTTPStatus.NOT_FOUND, "there is one page: /\n")
+        return Response(HTTPStatus.OK, "OK", self._headers(request.headers), self._html)
+
+    def _headers(self, asked: Headers) -> Headers:
+        host = _HOST.fullmatch("".join(asked.get_all("Host")))
+        # Older browsers do not take websockets of the same host for 'self'.
+        sockets = f" ws://{host.group()} wss://{host.group()}" if host else ""
+        return Headers(
+            {
+                "Content-Type": "text/html; charset=utf-8",
+                "Content-Length": str(len(self._html)),
+                "Cache-Control": "no-store",
+                "Content-Security-Policy": f"{self._policy}; connect-src 'self'{sockets}",
+                "X-Content-Type-Options": "nosniff",
+                "Connection": "close",
+            }
+        )
+
+
+def _is_from_elsewhere(headers: Headers) -> bool:
+    """Whether a browser says that a page of another host wants this: any page that is open there could publish."""
+    hosts = [host.lower() for host in headers.get_all("Host")]
+    return any([origin.lower().partition("://")[2]] != hosts for origin in headers.get_all("Origin"))
+
+
+def _policy(page: bytes) -> str:
+    """What a browser lets the page do: run what is written in it, and nothing else."""
+    sources: dict[bytes, list[str]] = {b"script": [], b"style": []}
+    for kind, text in _INLINE.findall(page):
+        sources[kind].append(f"'sha256-{base64.b64encode(sha256(text).digest()).decode()}'")
+    scripts, styles = (" ".join(hashes) or "'none'" for hashes in sources.values())
+    return (
+        f"default-src 'none'; script-src {scripts}; style-src {styles}; img-src data:; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )

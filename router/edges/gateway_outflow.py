@@ -1,0 +1,136 @@
+"""What one TCP or websocket client still has to get: pieces that all clients share, fed to its socket as it takes them.
+
+No more than one piece is in a buffer of the client's own: a thousand clients that stand still cost no more than one
+does. Knows no framing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections import deque
+from collections.abc import Callable, Sequence
+from time import monotonic
+from typing import NamedTuple, Union
+
+from router.edges.gateway_transport import HIGH_WATER, LOW_WATER
+
+PIECE = 64 * 1024
+"""Bytes that a client gets at a time: other clients have their turn between two pieces."""
+
+UNSENT = 128 * 1024
+"""Bytes that the kernel keeps unsent for a client: beyond that, the newest values are worth more than old ones."""
+
+STALLED_SECONDS = 60.0
+"""A client that takes nothing for so long, while something waits for it, is closed."""
+
+Piece = Union[bytes, memoryview]
+
+
+class Encoded(NamedTuple):
+    """Frames as they go to every client. Between pieces, others may be written (the library's pings)."""
+
+    pieces: Sequence[Piece]
+    size: int
+
+
+def prepare(transport: asyncio.Transport) -> socket.socket:
+    """Sets up a new client's connection, and returns its socket."""
+    transport.set_write_buffer_limits(0)  # so that each byte in the transport's own buffer is told
+    connected: socket.socket = transport.get_extra_info("socket")
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
+    # A client whose computer has gone without a word, whether something is sent to it or not.
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 20)
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10)
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED_SECONDS * 1000))
+    return connected
+
+
+def label(transport: asyncio.Transport) -> str:
+    """Who is at the other end, as 10.0.0.5:51234."""
+    host, port = transport.get_extra_info("peername") or ("a client that has gone", 0)
+    return f"{host}:{port}"
+
+
+class Outflow:
+    """What one client still has to get, while `is_open`. Its protocol passes on when it is paused and resumed."""
+
+    def __init__(self, transport: asyncio.Transport, is_open: Callable[[], bool], drained: Callable[[], None]) -> None:
+        self._transport = transport
+        self._is_open = is_open
+        self._drained = drained
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[Piece] = deque()
+        self._waiting_bytes = 0
+        self._is_paused = False
+        self._is_scheduled = False
+        self._was_high = False
+        self._pushed = 0
+        self._taken = 0  # by the kernel, when it was looked at last
+        self._taken_at = monotonic()
+
+    def push(self, encoded: Encoded) -> None:
+        if not self._can_write():
+            return
+        self._pushed += encoded.size
+        if len(encoded.pieces) == 1 and not self._waiting and not self._is_paused:
+            self._transport.write(encoded.pieces[0])
+            return
+        self._waiting.extend(encoded.pieces)
+        self._waiting_bytes += encoded.size
+        if not self._is_scheduled:
+            self._feed()
+        self._was_high = self._was_high or self.backlog() >= HIGH_WATER
+
+    def backlog(self) -> int:
+        return self._waiting_bytes + self._transport.get_write_buffer_size()
+
+    def paused(self) -> None:
+        self._is_paused = True
+
+    def resumed(self) -> None:
+        self._is_paused = False
+        if not self._is_scheduled:
+            self._feed()
+
+    def clear(self) -> None:
+        """Forgets what waits: the client has gone."""
+        self._waiting.clear()
+        self._waiting_bytes = 0
+
+    def is_stalled(self, now: float) -> bool:
+        """Whether the kernel has taken nothing for STALLED_SECONDS. To be asked now and then."""
+        backlog = self.backlog()
+        taken = self._pushed - backlog
+        if not backlog or taken != self._taken:
+            self._taken, self._taken_at = taken, now
+        return now - self._taken_at >= STALLED_SECONDS
+
+    def _feed(self) -> None:
+        """Writes one piece, or several small ones as one, and goes on in the next turn of the loop."""
+        self._is_scheduled = False
+        if not self._can_write():
+            return
+        if self._waiting and not self._is_paused:
+            pieces = [self._waiting.popleft()]
+            size = len(pieces[0])
+            while self._waiting and size + len(self._waiting[0]) <= PIECE:
+                size += len(self._waiting[0])
+                pieces.append(self._waiting.popleft())
+            self._waiting_bytes -= size
+            self._transport.write(pieces[0] if len(pieces) == 1 else b"".join(pieces))
+        if self._waiting and not self._is_paused:
+            self._is_scheduled = True
+            self._loop.call_soon(self._feed)
+        if self._was_high and self.backlog() < LOW_WATER:
+            self._was_high = False
+            self._loop.call_soon(self._tell_drained)
+
+    def _tell_drained(self) -> None:
+        if self._can_write():
+            self._drained()
+
+    def _can_write(self) -> bool:
+        return self._is_open() and not self._transport.is_closing()

@@ -1,0 +1,120 @@
+"""What the TCP and websocket transports of a gateway have in common: a listener, and clients that may stand still.
+
+Knows no framing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from time import monotonic
+
+from router.edges.gateway_binding import MOST_UNACCEPTED, Binding, listen_at
+from router.edges.gateway_outflow import STALLED_SECONDS, Encoded, Outflow
+from router.edges.gateway_transport import Client, Ears, Frame
+from router.edges.log import FloodLog, logger
+from router.table.model import Address
+
+LOOK_SECONDS = 5.0
+"""Between looks for clients that stand still."""
+
+ACCEPTED_PER_TURN = 16
+"""Connections that are accepted before other work of the loop has its turn."""
+
+
+class StreamClient(Client):
+    """A client that has an outflow. `encode` is its transport's."""
+
+    label: str
+    outflow: Outflow
+    encode: Callable[[Sequence[Frame]], Encoded]
+
+    def write(self, frames: Sequence[Frame]) -> None:
+        self.outflow.push(self.encode(frames))
+
+    def backlog(self) -> int:
+        return self.outflow.backlog()
+
+
+class StreamTransport:
+    """Listens at `address`, and closes clients that stand still."""
+
+    def __init__(self, address: Address, ears: Ears, max_clients: int) -> None:
+        self.address: Address | None = None
+        self._wanted = address
+        self.ears = ears
+        self._max_clients = max_clients
+        self._clients: set[StreamClient] = set()
+        self._binding = Binding("tcp", address, self._bind)
+        self._watching: asyncio.TimerHandle | None = None
+        self._log = FloodLog()
+
+    @property
+    def is_ready(self) -> bool:
+        return self._binding.is_ready
+
+    async def open(self) -> None:
+        await self._binding.open()
+        self._watch()
+
+    async def close(self) -> None:
+        await self._binding.close()
+        if self._watching is not None:
+            self._watching.cancel()
+        await self._stop()
+        self._log.flush(final=True)
+
+    def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
+        encoded = self.encode(frames)
+        for client in clients:
+            assert isinstance(client, StreamClient)  # noqa: S101 - they came from here
+            client.outflow.push(encoded)
+
+    @abstractmethod
+    def encode(self, frames: Sequence[Frame]) -> Encoded: ...
+
+    @abstractmethod
+    async def _serve(self, listening: socket.socket) -> None: ...
+
+    @abstractmethod
+    async def _stop(self) -> None: ...
+
+    async def _bind(self) -> None:
+        listening = listen_at(self._wanted)
+        await self._serve(listening)
+        listening.listen(MOST_UNACCEPTED)
+        self.address = Address(*listening.getsockname())
+
+    def came(self, client: StreamClient) -> bool:
+        """Whether there is room for one more; if there is not, that is logged."""
+        if len(self._clients) >= self._max_clients:
+            self._log.note("full", logger.warning, "a client was turned away: there are too many", client=client.label)
+            return False
+        self._clients.add(client)
+        self.ears.joined(client)
+        return True
+
+    def went(self, client: StreamClient, error: Exception | None) -> None:
+        """Does nothing for one that was turned away."""
+        if client in self._clients:
+            self._clients.remove(client)
+            client.outflow.clear()
+            logger.debug("a client went", client=client.label, why=str(error or "it ended the connection"))
+            self.ears.left(client)
+
+    def _watch(self) -> None:
+        now = monotonic()
+        for client in [each for each in self._clients if each.outflow.is_stalled(now)]:
+            self._log.note(
+                ("stalled", client.label),
+                logger.warning,
+                "a client was closed: send stalled",
+                client=client.label,
+                seconds=STALLED_SECONDS,
+                waiting=client.backlog(),
+            )
+            client.close()
+        self._log.flush()
+        self._watching = asyncio.get_running_loop().call_later(LOOK_SECONDS, self._watch)
