@@ -30,6 +30,7 @@ VERBS = {
     "explain": "show what a route does, field by field, and the code that does it",
     "send": "send envelopes with payloads of your choice",
     "tap": "show what arrives on a UDP port or a ROS topic",
+    "listen": "show what a gateway sends",
     "sim": "play the boards and the basestation",
     "schema": "keep the field numbers of the wire types",
 }

@@ -1,0 +1,126 @@
+"""What a gateway sends, heard one by one and counted: the reference for those who write clients.
+
+A source brings bytes. Datagrams are taken apart and put together (`gateway.fragments`), then each packet or document is
+read (`listening_reading`). A client asks for schemas until it has one; a schema comes before the messages of its type.
+Knows no sockets and no command line.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from router.gateway.fragments import Reassembler
+from router.gateway.packets import PacketError
+from router.tools.listening_reading import Heard, Message, Problem, Remark, Schema, Shape, read
+
+PATIENCE = 0.2
+"""Seconds that a source waits at most, so that what is to end does."""
+
+ASK_AGAIN = 1.0
+"""Seconds after which schemas are asked for again."""
+
+
+class Arrival(NamedTuple):
+    """A datagram, packet or document. Fragments and schemas count for those of the same `sender` alone."""
+
+    data: bytes
+    sender: Hashable
+
+
+class Source(Protocol):
+    """Where bytes come from. `place` says it in words; `lost` counts what is known to be missing."""
+
+    place: str
+
+    @property
+    def lost(self) -> int: ...
+
+    def ask(self) -> None:
+        """Ask for schemas and latest values, where a gateway does not send them unasked."""
+
+    def arrivals(self, timeout: float) -> Sequence[Arrival]:
+        """What came in, after at most so many seconds."""
+
+    def close(self) -> None: ...
+
+
+@dataclass(slots=True)
+class Tally:
+    """How many there were. `early` messages came before their schema, `unwanted` ones are of other topics."""
+
+    messages: int = 0
+    schemas: int = 0
+    undecodable: int = 0
+    lost: int = 0
+    early: int = 0
+    unwanted: int = 0
+
+    def __str__(self) -> str:
+        text = f"{self.messages} messages, {self.schemas} schemas, {self.undecodable} undecodable, {self.lost} lost"
+        if self.early:
+            text += f", {self.early} before their schema"
+        return text + (f", {self.unwanted} of other topics" if self.unwanted else "")
+
+
+class Listening:
+    """Makes sense of what arrives. `wants` says whether a topic is to be shown."""
+
+    def __init__(self, wants: Callable[[str], bool]) -> None:
+        self._wants = wants
+        self._tally = Tally()
+        self._reassembler = Reassembler()
+        self._shapes: dict[tuple[Hashable, str], Mapping[str, Shape]] = {}
+
+    def tally(self, source: Source) -> Tally:
+        self._tally.lost = self._reassembler.lost + source.lost
+        return self._tally
+
+    def hear(self, source: Source, seconds: float) -> Iterator[Heard]:
+        """One after the other, for so many seconds."""
+        ends, asks = time.monotonic() + seconds, 0.0
+        while (now := time.monotonic()) < ends:
+            if not self._tally.schemas and now >= asks:
+                source.ask()
+                asks = now + ASK_AGAIN
+            for arrival in source.arrivals(min(PATIENCE, ends - now)):
+                yield from self.take(arrival, time.monotonic_ns())
+            self._reassembler.look(time.monotonic_ns())
+
+    def take(self, arrival: Arrival, now: int) -> Iterator[Heard]:
+        """What one arrival says; `now` in monotonic ns."""
+        try:
+            packets = self._reassembler.feed(arrival.data, arrival.sender, now)
+        except PacketError as error:
+            yield self._problem(error, arrival.data)
+            return
+        for packet in packets:
+            try:
+                heard = self._counted(read(packet), arrival.sender)
+            except PacketError as error:
+                yield self._problem(error, packet)
+            else:
+                if heard is not None:
+                    yield heard
+
+    def _counted(self, heard: Message | Schema | Remark, sender: Hashable) -> Heard | None:
+        """None where nobody wants to see it."""
+        if isinstance(heard, Remark):
+            return heard
+        if isinstance(heard, Schema):
+            self._tally.schemas += 1
+            self._shapes[sender, heard.type_name] = heard.shape
+            return heard if not heard.topic or self._wants(heard.topic) else None
+        if not self._wants(heard.topic):
+            self._tally.unwanted += 1
+            return None
+        shape = self._shapes.get((sender, heard.type_name))
+        self._tally.messages += 1
+        self._tally.early += shape is None
+        return heard._replace(shape=shape)
+
+    def _problem(self, error: PacketError, data: bytes) -> Problem:
+        self._tally.undecodable += 1
+        return Problem(str(error), data)

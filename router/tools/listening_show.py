@@ -1,0 +1,113 @@
+"""How a person and a program see what was heard: a line with the values, or a JSON object as received.
+
+Knows no terminal; a line comes as pieces of text, each with a style.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from router.tools.listening_reading import Heard, Message, Problem, Remark, Schema, Shape
+from router.tools.show import one_line
+
+Piece = tuple[str, str]
+"""Text, and a style of rich."""
+
+_MOST_SHOWN = 6
+"""Elements of a list, before it is cut short."""
+
+_LONGEST_TEXT = 120
+"""Characters of a string, and of what is no packet."""
+
+_NO_SHAPE: Mapping[str, Shape] = {}
+
+
+def json_line(heard: Heard) -> str:
+    """One JSON object, of what was received as it was received."""
+    return json.dumps(_as_json(heard), separators=(",", ":"))
+
+
+def _as_json(heard: Heard) -> Mapping[str, object]:
+    if isinstance(heard, Remark):
+        return heard.document
+    if isinstance(heard, Problem):
+        return {"problem": heard.reason, "bytes": len(heard.data), "hex": heard.data.hex()}
+    if isinstance(heard, Message):
+        return {"time": heard.time, "topic": heard.topic, "type": heard.type_name, "data": heard.data}
+    topic = {"topic": heard.topic} if heard.topic else {}
+    return {"time": heard.time, **topic, "type": heard.type_name, "schema": heard.schema}
+
+
+def pieces(heard: Heard) -> list[Piece]:
+    """`12:00:00.123 /imu/data sensor_msgs/msg/Imu x=0.01`."""
+    if isinstance(heard, Message):
+        values = _line(_members(heard.data, heard.shape or _NO_SHAPE, "", heard.is_wrapped))
+        return [(_clock(heard.time), "dim"), _name(heard.topic, "green"), _name(heard.type_name, "dim"), (values, "")]
+    if isinstance(heard, Schema):
+        fields = _line(f"{name}:{_type_text(shape)}" for name, shape in heard.shape.items())
+        where = [_name(heard.topic, "green")] if heard.topic else []
+        return [(_clock(heard.time), "dim"), *where, _name(heard.type_name, "dim"), (f"schema {fields}", "cyan")]
+    if isinstance(heard, Problem):
+        return [("undecodable", "red"), (f"({heard.reason}):", ""), (_cut(heard.data.hex()) or "no bytes", "")]
+    words = _line(_members(heard.document, _NO_SHAPE, "", is_wrapped=False))
+    return [(words, "yellow" if heard.document.get("op") == "rejected" else "dim")]
+
+
+def _clock(seconds: float) -> str:
+    """Local time of day; a sender's clock may say anything."""
+    try:
+        return f"{dt.datetime.fromtimestamp(seconds).astimezone():%H:%M:%S.%f}"[:-3]
+    except (OverflowError, OSError, ValueError):
+        return f"time={seconds}"
+
+
+def _name(text: str, style: str) -> Piece:
+    return one_line([text]), style
+
+
+def _line(words: Iterable[str]) -> str:
+    listed = list(words)
+    return one_line(listed) if listed else "(empty)"
+
+
+def _type_text(shape: Shape) -> str:
+    return shape.type_name + "[]" * shape.is_array
+
+
+def _members(values: Mapping[str, Any], shapes: Mapping[str, Shape], prefix: str, is_wrapped: bool) -> Iterator[str]:
+    for name, value in values.items():
+        yield from _words(value, shapes.get(name), prefix + name, is_wrapped)
+
+
+def _words(value: Any, shape: Shape | None, path: str, is_wrapped: bool) -> Iterator[str]:
+    """`path=value`, or several where a message has members. A single value is taken out of its list."""
+    if is_wrapped and shape is not None and not shape.is_array and isinstance(value, list) and len(value) == 1:
+        [value] = value
+    if isinstance(value, dict):
+        members = shape.members if shape is not None else _NO_SHAPE
+        yield from _members(value, members, f"{path}.", is_wrapped) if value else [f"{path}="]
+    elif isinstance(value, list) and any(isinstance(element, dict) for element in value):
+        for index, element in enumerate(value[:_MOST_SHOWN]):
+            yield from _words(element, shape, f"{path}[{index}]", is_wrapped)
+        if len(value) > _MOST_SHOWN:
+            yield f"{path}[...{len(value)}]"
+    else:
+        yield f"{path}={_text(value, shape)}"
+
+
+def _text(value: Any, shape: Shape | None) -> str:
+    if isinstance(value, list):
+        shown = [_text(element, shape) for element in value[:_MOST_SHOWN]]
+        return f"[{','.join(shown)}{f',...{len(value)}' if len(value) > _MOST_SHOWN else ''}]"
+    if isinstance(value, str):
+        return _cut(value)
+    if isinstance(value, float) and shape is not None and shape.type_name == "float32":
+        return f"{value:.7g}"  # what it was before it was widened
+    return json.dumps(value)
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}...({len(text)})"
