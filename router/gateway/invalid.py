@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_MOST_SHOWN = 40
+_MOST_SHOWN = 60
 """Characters of a client's text that are repeated to it."""
 
 
@@ -26,7 +26,8 @@ def shown(value: object) -> str:
         case None | bool():
             return {None: "null", False: "false", True: "true"}[value]
         case str():
-            return repr(value) if len(value) <= _MOST_SHOWN else repr(value[:_MOST_SHOWN]) + "..."
+            text = repr(value[:_MOST_SHOWN])
+            return text if len(value) < _MOST_SHOWN >= len(text) else f"{text[:_MOST_SHOWN]}..."
         case int() if value.bit_length() > 128:
             return "a huge number"
         case int() | float():

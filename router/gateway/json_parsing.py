@@ -16,7 +16,7 @@ from router.gateway.invalid import InvalidMessageError, shown
 _MOST_DEEP = 64
 """Lists and objects within each other."""
 _MOST_HOLDERS = 500_000
-"""Lists and objects in one text: they may take 60 times the memory of their characters."""
+"""Lists and objects in one text: they take up to 30 times the memory of their characters."""
 _MOST_DIGITS = 25
 """Of an integer. The largest of 64 bits has 20."""
 _SHORT = 1 << 16
