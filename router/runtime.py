@@ -26,12 +26,11 @@ from router.engine.binding import Guarded, Outlets
 from router.engine.deadman import Deadman, Feed, feeder
 from router.engine.pacing import Pacer
 from router.errors import StartError
-from router.gateway.inlet import InletOutlets
 from router.table.model import Address
-from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:
     from router.edges.ros import RosEdge
+    from router.gateway.subscriber import Subscriber
     from router.gateway.thread import GatewayThread
 
 _TOTALS = (
@@ -245,39 +244,20 @@ class Router:
             return None
         from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
 
-        inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
-        outlets = InletOutlets(
-            publish=ros.publish,
-            publish_errors=ros.publish_errors,
-            feed_deadman={
-                each.deadman.route: feed(each.deadman.route, (each.deadman.route,)) for each in inbound if each.deadman
-            },
-            report=reporter.report,
-            clock_ns=monotonic_ns,
-            wall_ns=wall_ns,
-        )
-        return GatewayThread(
-            program.gateways,
-            ros.topics,
-            ros_interfaces(),
-            program.books,
-            self._fresh_counts(),
-            outlets,
-            reporter.failed,
-        )
+        return GatewayThread(program, ros, self._fresh_counts(), feed, reporter.report, reporter.failed)
 
     def _asked(self, gateways: GatewayThread | None) -> dict[str, Asked]:
         """Series that nobody counts in a slot."""
-        drops = [([name], listener.kernel_drops) for name, listener in self.listeners.items()]
+        drops = {name: listener.kernel_drops for name, listener in self.listeners.items()}
 
-        def of_clients(column: int) -> Asked:
-            return lambda: (([row[0], row[1]], row[column]) for row in (gateways.clients() if gateways else ()))
+        def of_clients(value: Callable[[Subscriber], float]) -> Asked:
+            return lambda: gateways.clients(value) if gateways else ()
 
         return {
-            "kernel_drops": lambda: ((labels, drops()) for labels, drops in drops),
-            "gateway_client_lag_seconds": of_clients(2),
-            "gateway_client_sent": of_clients(3),
-            "gateway_client_dropped": of_clients(4),
+            "kernel_drops": lambda: (((name,), dropped()) for name, dropped in drops.items()),
+            "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),
+            "gateway_client_sent": of_clients(lambda client: client.sent),
+            "gateway_client_dropped": of_clients(lambda client: client.dropped),
         }
 
     def _open_metrics(self, opening: ExitStack, gateways: GatewayThread | None) -> None:

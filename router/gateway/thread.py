@@ -7,25 +7,30 @@ import threading
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from router.compiler.books import Books
-from router.compiler.program import GatewayPlan
+from router.compiler.program import GatewayPlan, Program
+from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.gateway_tcp import TcpTransport
 from router.edges.gateway_transport import Ears, Transport
 from router.edges.gateway_udp import UdpTransport
 from router.edges.gateway_websocket import WebsocketTransport
-from router.edges.ros_topics import RosTopics
+from router.engine import Report
+from router.engine.deadman import Feed
 from router.errors import StartError
 from router.gateway.feeds import Hub
 from router.gateway.inlet import Inlet, InletOutlets
 from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
 from router.gateway.style import Style
+from router.gateway.subscriber import Subscriber
 from router.gateway.topics import Surroundings
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as Way
-from router.types.ros import RosInterfaces
+from router.types.ros import ros_interfaces
+
+if TYPE_CHECKING:  # which imports rclpy
+    from router.edges.ros import RosEdge
 
 T = TypeVar("T")
 
@@ -35,40 +40,42 @@ PAGE = Path(__file__).with_name("page.html")
 class GatewayThread:
     """Opens the gateways of a program when it is made, and serves them from `start` on. Raises StartError.
 
-    `counts` belong to its thread, in which all that `outlets` has is called.
+    `counts` belong to its thread, in which all that it is given is called. `feed` makes what tells deadmen.
     """
 
     def __init__(
         self,
-        plans: Sequence[GatewayPlan],
-        ros: RosTopics,
-        interfaces: RosInterfaces,
-        books: Books,
+        program: Program,
+        ros: RosEdge,
         counts: list[int],
-        outlets: InletOutlets,
+        feed: Callable[[str, Sequence[str]], Feed],
+        report: Callable[[Report], None],
         failed: Callable[[Exception], None],
     ) -> None:
         self._failed = failed
+        self._books = program.books
+        self._counts = counts
+        self._outlets = _outlets(program, ros, feed, report)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="gateway bulk")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
         self._services: list[GatewayService] = []
-        self._hub = Hub(ros, interfaces, self._loop)
-        self._around = Surroundings(self._hub, self._worker, outlets.report, failed, outlets.clock_ns, outlets.wall_ns)
+        self._hub = Hub(ros.topics, ros_interfaces(), self._loop)
+        self._around = Surroundings(self._hub, self._worker, report, failed, monotonic_ns, wall_ns)
         self._thread.start()
         try:
-            for plan in plans:
-                self._call(self._open(plan, books, counts, outlets))
+            for plan in program.gateways:
+                self._call(self._open(plan))
         except BaseException:
             self.stop()
             raise
 
-    async def _open(self, plan: GatewayPlan, books: Books, counts: list[int], outlets: InletOutlets) -> None:
+    async def _open(self, plan: GatewayPlan) -> None:
         settings = plan.settings
         style = Style.PLAIN if settings.format in (GatewayFormat.JSON, GatewayFormat.JSON_LINES) else Style.WRAPPED
-        ledger = Ledger(settings, books, counts, outlets.report)
-        inlet = Inlet(plan, style, books, counts, outlets)
+        ledger = Ledger(settings, self._books, self._counts, self._outlets.report)
+        inlet = Inlet(plan, style, self._books, self._counts, self._outlets)
         service = GatewayService(plan, self._around, ledger, inlet, lambda ears: _transport(settings, ears))
         try:
             await service.open()
@@ -85,12 +92,11 @@ class GatewayThread:
         for service in self._services:
             service.start()
 
-    def clients(self) -> Iterator[tuple[str, str, float, int, int]]:
-        """Of each client now: gateway, number, lag in seconds, frames sent and dropped. For any thread."""
-        now = self._around.clock_ns()
+    def clients(self, value: Callable[[Subscriber], float]) -> Iterator[tuple[tuple[str, str], float]]:
+        """Gateway and number of each client, and what `value` makes of it. For any thread."""
         for service in self._services:
             for each in list(service.audience.subscribers.values()):
-                yield service.name, str(each.number), each.lag(now) / 1e9, each.sent, each.dropped
+                yield (service.name, str(each.number)), value(each)
 
     def stop(self) -> None:
         """Nothing is received any more when this returns, nor sent."""
@@ -112,6 +118,21 @@ class GatewayThread:
         """What a callback of the loop raised: a fault of ours."""
         error = context.get("exception")
         self._failed(error if isinstance(error, Exception) else RuntimeError(context["message"]))
+
+
+def _outlets(
+    program: Program, ros: RosEdge, feed: Callable[[str, Sequence[str]], Feed], report: Callable[[Report], None]
+) -> InletOutlets:
+    inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
+    guarded = [each.deadman.route for each in inbound if each.deadman]
+    return InletOutlets(
+        publish=ros.publish,
+        publish_errors=ros.publish_errors,
+        feed_deadman={route: feed(route, (route,)) for route in guarded},
+        report=report,
+        clock_ns=monotonic_ns,
+        wall_ns=wall_ns,
+    )
 
 
 def _transport(settings: Gateway, ears: Ears) -> Transport:
