@@ -81,10 +81,13 @@ class Code(enum.Enum):
     UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that the envelope does not have.")
     UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
     UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that `endpoints` does not have.")
-    ADDRESS_CLASH = ("address-clash", "Two listeners want one address, or two endpoints could not be told apart.")
-    FORWARDING_LOOP = ("forwarding-loop", "A destination is the message's own source, or a listener of this router.")
+    ADDRESS_CLASH = (
+        "address-clash",
+        "Two want one local address or Zenoh key, or two endpoints could not be told apart.",
+    )
+    FORWARDING_LOOP = ("forwarding-loop", "A destination is the message's own source, or this router.")
     BAD_TOPIC_NAME = ("bad-topic-name", "Not a ROS topic name.")
-    TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes give one topic different types.")
+    TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes or gateways give one topic different types.")
     UNKNOWN_ROS_TYPE = ("unknown-ros-type", "No installed package, nor `schemas/`, has this interface.")
     UNKNOWN_FIELD = ("unknown-field", "A field that the source message or the target does not have.")
     UNKNOWN_ENUM_VALUE = ("unknown-enum-value", "An enum, or a ROS type's constants, have no such name.")

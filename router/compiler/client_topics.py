@@ -24,7 +24,7 @@ def check_client_topics(lookup: Lookup, gateway: Gateway) -> tuple[CheckedInboun
     for inbound in gateway.inbound:
         name = resolved(inbound.topic.topic.value, lookup.table.node)
         if name in found:
-            message = f"clients of '{gateway.name}' may publish on '{name}' twice"
+            message = f"'{name}' is let in twice"
             lookup.report(inbound.topic.topic.span, Code.BAD_VALUE, message, "name it once")
         found[name] = _checked(lookup, inbound, name)
     return tuple(checked for checked in found.values() if checked)

@@ -27,13 +27,16 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
         try:
             re.compile(pattern.text)
         except (re.error, OverflowError) as error:
-            return PatternProblem(f"'{pattern.text}' is not a regular expression: {error}", "they are Python's")
+            return PatternProblem(
+                f"'{pattern.text}' is not a regular expression: {error}",
+                "regular expressions are Python's, and match whole names",
+            )
         return None
     if not pattern.text.startswith("/"):
         hint = f"patterns are for absolute topic names; did you mean '/{pattern.text}' or '/**/{pattern.text}'?"
         return PatternProblem(f"'{pattern.text}' does not begin with '/'", hint)
     if wrong := [part for part in _parts(pattern.text) if not _PART.fullmatch(part)]:
-        what = f"'{wrong[0]}' is no part of a topic's name" if wrong[0] else "there is nothing between two '/'"
+        what = f"'{wrong[0]}' is no part of a topic's name" if wrong[0] else "a part of it is empty"
         hint = "parts are letters, digits, '_', '*' and '?', or '**' alone; {regex: ...} can say more"
         return PatternProblem(f"'{pattern.text}' matches no topic: {what}", hint)
     return None

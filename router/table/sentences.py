@@ -28,6 +28,10 @@ _LONGEST = 60
 _ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
 """Keys under which an address stands."""
 _NAME_DEPTH = len(("endpoints", "name"))
+_HINTS_FOR_MISSING = {
+    "source": "or say 'ignore: why'",
+    "receive": "what its client publishes has to arrive somewhere",
+}
 NAME_FIELDS = ("fields", "send")
 """Keys under which the names of fields stand, each with an expression."""
 
@@ -130,8 +134,8 @@ def _missing_key(misfit: Misfit, tree: Node) -> Diagnostic:
     missing = misfit.message.split("'")[1]  # jsonschema has one error for each key and names it nowhere else
     key = key_at(tree, misfit.path)
     span = key.span if key else _first_line(node_at(tree, misfit.path))
-    is_whole_case = missing == "source" and len(misfit.path) == _NAME_DEPTH
-    hint = "or say 'ignore: why'" if is_whole_case else ""
+    is_whole_part = len(misfit.path) == _NAME_DEPTH
+    hint = _HINTS_FOR_MISSING.get(missing, "") if is_whole_part else ""
     return Diagnostic(span, Code.MISSING_KEY, f"{subject(misfit.path)} lacks the key '{missing}'", hint)
 
 

@@ -110,14 +110,18 @@ def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnost
         raise TypeError("only a mapping has keys")
     for name, entry in node.entries.items():
         if name not in known and not entry.key.broken:
-            elsewhere = "" if nearest(name, known) else _owners(name)
+            elsewhere = "" if nearest(name, known) else _owners(name, path)
             hint = elsewhere or did_you_mean(name, known)
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{subject(path)} has no key '{name}'", hint)
 
 
-def _owners(name: str) -> str:
-    """A hint for a key that there is, but elsewhere in a table; empty where there is no such key."""
-    owners = [owner for owner, schema in table_schema()["definitions"].items() if _has(schema, name)]
+def _owners(name: str, path: Path) -> str:
+    """A hint for a key that there is, but elsewhere in a table; empty where there is no such key.
+
+    Others that are called as what stands at `path` (deadmen are of two kinds) would make no hint.
+    """
+    definitions = table_schema()["definitions"]
+    owners = [owner for owner, schema in definitions.items() if _has(schema, name) and owner not in path[-1:]]
     return f"that is a key of: {', '.join(owners)}" if owners else ""
 
 

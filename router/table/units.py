@@ -71,12 +71,18 @@ def parse_message_size(text: str) -> int:
 
 def parse_period(text: str) -> int:
     """`500ms` as nanoseconds, or `each` as 0."""
-    return 0 if text == EACH else _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION, MIN_PERIOD)
+    period = 0 if text == EACH else parse_duration(text)
+    if 0 < period < MIN_PERIOD:
+        raise ValueError(f"'{text}' is shorter than {MIN_PERIOD // 10**6}ms; 'each' sends every message")
+    return period
 
 
 def parse_interval(text: str) -> int:
     """`5s` as nanoseconds, for what is done now and then."""
-    return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION, MIN_INTERVAL)
+    interval = parse_duration(text)
+    if interval < MIN_INTERVAL:
+        raise ValueError(f"'{text}' is shorter than {MIN_INTERVAL // 10**6}ms")
+    return interval
 
 
 def parse_data_rate(text: str) -> int:

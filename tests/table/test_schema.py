@@ -7,6 +7,7 @@ from typing import Any
 
 import jsonschema
 
+from router.table import build_gateways
 from router.table.build import DEFAULT_NODE, DEFAULT_RECEIVE_BUFFER
 from router.table.build_routes import DEFAULT_REPEAT
 from router.table.shape import table_schema
@@ -57,3 +58,28 @@ def test_documented_defaults_are_those_of_the_code() -> None:
     assert parse_size(buffer["default"]) == DEFAULT_RECEIVE_BUFFER
     repeat = table_schema()["definitions"]["deadman"]["else"]["properties"]["repeat"]
     assert parse_duration(repeat["default"]) == DEFAULT_REPEAT
+
+
+def test_documented_defaults_of_gateways_are_those_of_the_code() -> None:
+    definitions = table_schema()["definitions"]
+    given = {key: schema.get("default") for key, schema in definitions["gateway"]["properties"].items()}
+    assert parse_duration(given["publish_period"]) == build_gateways.DEFAULT_PUBLISH_PERIOD
+    assert parse_duration(given["schema_period"]) == build_gateways.DEFAULT_INTERVAL
+    assert parse_duration(given["discovery_period"]) == build_gateways.DEFAULT_INTERVAL
+    assert parse_size(given["max_datagram"]) == build_gateways.DEFAULT_MAX_DATAGRAM
+    assert parse_size(given["max_message"]) == build_gateways.DEFAULT_MAX_MESSAGE
+    assert given["max_clients"] == build_gateways.DEFAULT_MAX_CLIENTS
+    assert definitions["zenoh"]["properties"]["mode"]["default"] == build_gateways.DEFAULT_MODE
+    repeat = definitions["inbound_deadman"]["properties"]["repeat"]
+    assert parse_duration(repeat["default"]) == DEFAULT_REPEAT
+
+
+def test_documented_default_formats_are_those_of_the_code() -> None:
+    conditions = table_schema()["definitions"]["gateway"]["allOf"]
+    formats = {}
+    for condition in conditions:
+        for part in condition.get("then", {}).get("allOf", ()):
+            if "properties" in part:
+                [transport] = condition["if"]["properties"]["transport"]["required"]
+                formats[transport] = part["properties"]["format"]["default"]
+    assert formats == {transport.value: default.value for transport, default in build_gateways.DEFAULT_FORMATS.items()}

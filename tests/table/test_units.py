@@ -4,7 +4,18 @@ from collections.abc import Callable
 
 import pytest
 
-from router.table.units import parse_coalesce, parse_data_rate, parse_duration, parse_rate, parse_size
+from router.table.units import (
+    parse_coalesce,
+    parse_data_rate,
+    parse_datagram_size,
+    parse_duration,
+    parse_interval,
+    parse_message_size,
+    parse_period,
+    parse_rate,
+    parse_size,
+    parse_topic_rate,
+)
 
 
 @pytest.mark.parametrize(
@@ -44,6 +55,25 @@ def test_coalescing_may_be_never(text: str, nanoseconds: int) -> None:
     assert parse_coalesce(text) == nanoseconds
 
 
+@pytest.mark.parametrize(("text", "nanoseconds"), [("500ms", 500_000_000), ("1ms", 1_000_000), ("each", 0)])
+def test_a_period_may_be_each(text: str, nanoseconds: int) -> None:
+    assert parse_period(text) == nanoseconds
+
+
+@pytest.mark.parametrize(
+    ("value", "nanoseconds"),
+    [("50 Hz", 20_000_000), ("0.5Hz", 2 * 10**9), (1000, 1_000_000), (3, 333_333_333), ("each", 0)],
+)
+def test_a_topics_rate_is_a_period(value: str | float, nanoseconds: int) -> None:
+    assert parse_topic_rate(value) == nanoseconds
+
+
+def test_an_interval_and_sizes_of_messages_have_bounds() -> None:
+    assert parse_interval("10ms") == 10_000_000
+    assert [parse_datagram_size(text) for text in ("576B", "65507B")] == [576, 65507]
+    assert [parse_message_size(text) for text in ("1kB", "256MiB")] == [1000, 256 << 20]
+
+
 @pytest.mark.parametrize(
     ("parse", "text"),
     [
@@ -68,6 +98,19 @@ def test_coalescing_may_be_never(text: str, nanoseconds: int) -> None:
         (parse_data_rate, "0kB/s"),
         (parse_data_rate, "0.5B/s"),
         (parse_data_rate, "999999999999999MB/s"),
+        (parse_period, "999us"),
+        (parse_period, "never"),
+        (parse_interval, "9.9ms"),
+        (parse_interval, "each"),
+        (parse_datagram_size, "575B"),
+        (parse_datagram_size, "65508B"),
+        (parse_message_size, "999B"),
+        (parse_message_size, "257MiB"),
+        (parse_topic_rate, 1001),
+        (parse_topic_rate, "1001 Hz"),
+        (parse_topic_rate, 1e-12),
+        (parse_topic_rate, 0),
+        (parse_topic_rate, "never"),
         (parse_rate, "30"),
         (parse_rate, "0 Hz"),
         (parse_rate, 0),
