@@ -1,0 +1,88 @@
+"""Packets as the existing gateway's stand-in sent them, and ours for the same bytes."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from router.gateway.compression import decompress
+from router.gateway.json_code import json_writer
+from router.gateway.packets import Packet, pack, unpack
+from router.gateway.schema_text import schema_text
+from router.gateway.style import Style, UnreadableError
+from router.types.model import MessageType
+from router.types.ros import RosInterfaces
+from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+from tests.compiler.interface_package import MESSAGES, NAME
+
+TIME = 1795276800.25
+STAMP = struct.pack("<d", TIME)
+GOLDEN: list[dict[str, Any]] = [
+    json.loads(line) for line in Path(__file__).with_name("golden").joinpath("packets.jsonl").open(encoding="utf-8")
+]
+UNENDED = "text_unended"
+"""Fast CDR takes a string without its NUL, which nothing in ROS sends. We do not."""
+
+SENT = [golden for golden in GOLDEN if golden["data"] is not None and golden["case"] != UNENDED]
+
+
+def name_of(golden: Mapping[str, Any]) -> str:
+    return str(golden["case"])
+
+
+@pytest.fixture(scope="module")
+def interfaces(tmp_path_factory: pytest.TempPathFactory) -> RosInterfaces:
+    share = tmp_path_factory.mktemp("share")
+    folder = share / NAME / "msg"
+    folder.mkdir(parents=True)
+    for name, text in MESSAGES.items():
+        folder.joinpath(f"{name}.msg").write_text(text + "\n")
+    schemas = Path(__file__).parents[2] / "schemas"
+    return RosInterfaces(MsgFiles([share, Path(sys.prefix, "share"), schemas]), RosbagsDefinitions())
+
+
+def declared(interfaces: RosInterfaces, golden: Mapping[str, Any]) -> MessageType:
+    found = interfaces.get(golden["type"])
+    assert found is not None
+    return found
+
+
+def packed(golden: Mapping[str, Any], text: str) -> str:
+    """Ours, after its time stamp."""
+    packet = Packet(TIME, False, f"/golden/{golden['case']}", golden["type"], text.encode())
+    return pack(packet)[len(STAMP) :].decode()
+
+
+@pytest.mark.parametrize("golden", SENT, ids=name_of)
+def test_data_packet_is_that_of_the_existing_gateway(interfaces: RosInterfaces, golden: Mapping[str, Any]) -> None:
+    write = json_writer(declared(interfaces, golden), Style.WRAPPED)
+    assert packed(golden, write(bytes.fromhex(golden["cdr"]))) == golden["data"]
+
+
+@pytest.mark.parametrize("golden", [golden for golden in GOLDEN if golden["data"] is None], ids=name_of)
+def test_nothing_is_written_where_the_existing_gateway_sends_nothing(
+    interfaces: RosInterfaces, golden: Mapping[str, Any]
+) -> None:
+    write = json_writer(declared(interfaces, golden), Style.WRAPPED)
+    with pytest.raises(UnreadableError):
+        write(bytes.fromhex(golden["cdr"]))
+
+
+@pytest.mark.parametrize("golden", [golden for golden in GOLDEN if "schema" in golden], ids=name_of)
+def test_schema_packet_is_that_of_the_existing_gateway(interfaces: RosInterfaces, golden: Mapping[str, Any]) -> None:
+    assert packed(golden, schema_text(declared(interfaces, golden))) == golden["schema"]
+
+
+@pytest.mark.parametrize("golden", [golden for golden in GOLDEN if "compressed" in golden], ids=name_of)
+def test_packet_that_the_existing_gateway_compressed_is_read(golden: Mapping[str, Any]) -> None:
+    packet = unpack(STAMP + bytes.fromhex(golden["compressed"]))
+    plain = unpack(STAMP + golden["data"].encode())
+    assert packet.is_compressed
+    assert not plain.is_compressed
+    assert packet._replace(is_compressed=False, payload=decompress(packet.payload, 1 << 20)) == plain
