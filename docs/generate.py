@@ -11,7 +11,16 @@ from pathlib import Path
 from textwrap import fill
 
 from benchmarks.versus.report import page
-from router.compiler.books import DROP_REASONS, HISTOGRAM_BOUNDS_NS, METRICS, REJECT_REASONS
+from router.compiler.books import (
+    CLIENT_DROP_REASONS,
+    DROP_REASONS,
+    GATEWAY_DROP_REASONS,
+    GATEWAY_REJECT_REASONS,
+    HISTOGRAM_BOUNDS_NS,
+    METRICS,
+    REJECT_REASONS,
+    TOPIC_STATES,
+)
 from router.compiler.functions import FUNCTIONS
 from router.errors import Code
 
@@ -24,6 +33,11 @@ Every series exists at 0 from the start. The books balance. Per listener, receiv
 target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames, the queue of a
 budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element is a message. What a
 deadman sends is in its own metrics alone, and its bytes in none."""
+_GATEWAYS = """\
+A [gateway](table.md#gateways) has its name as `listener` and as `route`. What it sends has `clients` as its target, and
+its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
+For what is not published of that, the reasons are those of routes. A deadman of a topic that is let in has gateway and
+topic for its route: `vr_headset:/cmd_vel`."""
 _LOG = """\
 The log writes the first drop of a kind (route, target, reason) at once, then at most a line in 10 s. That line shows
 the last one, and how many there were: `more`, in the `in_seconds` before the line. So a flood may have ended when its
@@ -59,6 +73,16 @@ def metrics_page() -> str:
         "",
         *_reasons("router_datagrams_rejected_total", REJECT_REASONS),
         *_reasons("router_messages_dropped_total", DROP_REASONS),
+        "## Gateways",
+        "",
+        fill(_GATEWAYS, WIDTH),
+        "",
+        *_reasons("router_datagrams_rejected_total", GATEWAY_REJECT_REASONS),
+        *_reasons("router_messages_dropped_total", GATEWAY_DROP_REASONS),
+        *_reasons("router_client_messages_dropped_total", CLIENT_DROP_REASONS),
+        *_reasons("router_gateway_topics", TOPIC_STATES, "state"),
+        "## Log and time",
+        "",
         fill(_LOG, WIDTH),
         "",
         fill(f"Upper bounds of `router_route_seconds`, in microseconds: {bounds}.", WIDTH),
@@ -67,9 +91,9 @@ def metrics_page() -> str:
     return "\n".join(lines)
 
 
-def _reasons(metric: str, reasons: Mapping[str, str]) -> list[str]:
+def _reasons(metric: str, reasons: Mapping[str, str], label: str = "reason") -> list[str]:
     rows = (f"| `{reason}` | {meaning} |" for reason, meaning in reasons.items())
-    return [f"| reason of `{metric}` | |", "|---|---|", *rows, ""]
+    return [f"| {label} of `{metric}` | |", "|---|---|", *rows, ""]
 
 
 def findings_page() -> str:
