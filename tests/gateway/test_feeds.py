@@ -1,0 +1,403 @@
+"""Topics followed by gateways, with real publishers in processes of their own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import ExitStack, asynccontextmanager, closing
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from router.compiler.program import TopicPlan
+from router.errors import StartError
+from router.gateway.compression import decompress
+from router.gateway.feeds import TURN, Feed, Hub, Sample
+from router.gateway.following import Choice
+from router.gateway.samples import ReadyType
+from router.gateway.style import Style, UnreadableError
+from router.types.ros import ros_interfaces
+from tests.edges.ros_opening import HELLO, STRING, cdr, open_ros, string_topic
+from tests.edges.ros_publisher import Publisher
+
+INT32 = "std_msgs/msg/Int32"
+FIVE = bytes.fromhex("0001000005000000")
+INTERFACES = ros_interfaces()
+PLAIN = Choice(STRING, is_reliable=True, keeps=False, others=())
+PATIENCE_S = 20.0
+
+Publish = Callable[..., Publisher]
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publish]:
+    """Opens `Publisher("greeting", type, *options)`."""
+    with ExitStack() as peers:
+        yield lambda *arguments: peers.enter_context(closing(Publisher("greeting", *arguments)))
+
+
+def run(story: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(story, 2 * PATIENCE_S))
+
+
+@asynccontextmanager
+async def opened(*publishers: TopicPlan) -> AsyncIterator[Hub]:
+    """A hub on a node that publishes on these."""
+    with (
+        closing(open_ros(*publishers)) as ros,
+        closing(Hub(ros.topics, INTERFACES, asyncio.get_running_loop())) as hub,
+    ):
+        yield hub
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    deadline = asyncio.get_running_loop().time() + PATIENCE_S
+    while not condition():
+        assert asyncio.get_running_loop().time() < deadline, "it never happened"
+        await asyncio.sleep(0.01)
+
+
+async def seen(hub: Hub, condition: Callable[[Choice], bool] = lambda _: True) -> Choice:
+    """What is seen of /greeting as soon as it is published so."""
+    deadline = asyncio.get_running_loop().time() + PATIENCE_S
+    while True:
+        choice = (await hub.look((), lambda topic: topic == "/greeting")).get("/greeting")
+        if choice and condition(choice):
+            return choice
+        assert asyncio.get_running_loop().time() < deadline, f"it was never published like that: {choice}"
+        await asyncio.sleep(0.01)
+
+
+async def matched(peer: Publisher) -> None:
+    assert await asyncio.to_thread(peer.line) == "matched"
+
+
+def latest(feed: Feed) -> bytes | None:
+    sample = feed.latest()
+    return sample.cdr if sample else None
+
+
+async def heard(peer: Publisher, cdr: bytes, feed: Feed) -> None:
+    """It publishes until it is heard: whoever was subscribed to anew is not told in any other way."""
+
+    def came() -> bool:
+        peer.publish([cdr])
+        return latest(feed) == cdr
+
+    await until(came)
+
+
+def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: Publish) -> None:
+    publisher(STRING, "--transient-local")
+
+    async def story() -> None:
+        async with opened(string_topic(topic="own")) as hub:
+            await seen(hub)
+            assert await hub.look((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
+                "/greeting": Choice(STRING, is_reliable=True, keeps=True, others=()),
+                "/own": PLAIN,
+            }
+            assert await hub.look((), lambda _: False) == {}
+
+    run(story())
+
+
+def test_what_only_we_publish_on_a_topic_that_is_let_in_is_not_seen() -> None:
+    async def story() -> None:
+        async with opened(string_topic()) as hub:
+            assert await seen(hub) == PLAIN
+            assert await hub.look(["/greeting"], lambda topic: topic == "/greeting") == {}
+
+    run(story())
+
+
+def test_looking_lets_others_have_their_turn_between_topics() -> None:
+    async def story() -> None:
+        turns = 0
+
+        async def other() -> None:
+            nonlocal turns
+            while True:
+                turns += 1
+                await asyncio.sleep(0)
+
+        async with opened(*(string_topic(topic=f"number_{number}") for number in range(20))) as hub:
+            await hub.look((), lambda _: True)  # the type is ready from here on
+            task = asyncio.get_running_loop().create_task(other())
+            assert len(await hub.look((), lambda topic: topic.startswith("/number_"))) == 20
+            assert turns >= 20
+            task.cancel()
+
+    run(story())
+
+
+def test_the_latest_value_is_the_newest_and_stays_until_another_one_comes(publisher: Publish) -> None:
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", PLAIN, None)
+            assert (feed.topic, feed.type_name, feed.message) == ("/greeting", STRING, INTERFACES.get(STRING))
+            assert json.loads(feed.schema)["name"] == "String"
+            assert feed.latest() is None
+            peer = publisher(STRING)
+            await matched(peer)
+            peer.publish(cdr(str(number)) for number in range(50))
+            await until(lambda: feed.arrived == 50)
+            sample = feed.latest()
+            assert sample
+            assert (sample.topic, sample.type_name, sample.cdr) == ("/greeting", STRING, cdr("49"))
+            assert feed.latest() is sample
+            peer.publish([HELLO])
+            await until(lambda: latest(feed) == HELLO)
+            assert feed.arrived == 51
+
+    run(story())
+
+
+def test_every_message_is_handed_on_in_order_and_a_turn_is_short(publisher: Publish) -> None:
+    texts = [cdr(str(number)) for number in range(100)]
+    samples: list[bytes] = []
+    turns: list[int] = []
+
+    def turn() -> None:
+        turns.append(len(samples))
+        if len(samples) < len(texts):
+            asyncio.get_running_loop().call_soon(turn)
+
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+            peer = publisher(STRING)
+            await matched(peer)
+            peer.publish(texts)
+            peer.await_receipt()  # while the loop stands still, so that they all wait
+            turn()
+            await until(lambda: samples == texts)
+            assert max(after - before for before, after in pairwise(turns)) <= TURN
+            assert feed.arrived == len(texts)
+            assert latest(feed) == texts[-1]
+
+    run(story())
+
+
+def test_one_feed_serves_those_who_want_each_message_and_those_who_want_the_latest(publisher: Publish) -> None:
+    first: list[tuple[Feed, Sample]] = []
+    second: list[tuple[Feed, Sample]] = []
+
+    def each(feed: Feed, sample: Sample) -> None:
+        first.append((feed, sample))
+
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", PLAIN, None)
+            peer = publisher(STRING)
+            await matched(peer)
+            peer.publish([HELLO])
+            await until(lambda: latest(feed) == HELLO)
+            assert hub.join("/greeting", PLAIN, each) is feed
+            assert hub.join("/greeting", PLAIN, lambda *handed: second.append(handed)) is feed
+            assert latest(feed) == HELLO
+            await heard(peer, cdr("one"), feed)
+            peer.publish([cdr("two"), cdr("three")])
+            await until(lambda: latest(feed) == cdr("three"))
+            assert first == second
+            assert all(handed is feed for handed, _ in first)
+            assert [sample.cdr for _, sample in first][-2:] == [cdr("two"), cdr("three")]
+            assert feed.latest() is first[-1][1]
+            hub.leave(feed, each)
+            peer.publish([cdr("four")])
+            await until(lambda: latest(feed) == cdr("four"))
+            assert len(first) == len(second) - 1
+
+    run(story())
+
+
+def test_when_nobody_wants_each_message_any_more_the_latest_is_still_there(publisher: Publish) -> None:
+    samples: list[bytes] = []
+
+    def each(_: Feed, sample: Sample) -> None:
+        samples.append(sample.cdr)
+
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", PLAIN, each)
+            hub.join("/greeting", PLAIN, None)
+            hub.leave(feed, each)
+            peer = publisher(STRING)
+            await matched(peer)
+            peer.publish([HELLO, cdr("newer")])
+            await until(lambda: feed.arrived == 2)
+            hub.join("/greeting", PLAIN, each)  # gets what nobody has taken yet
+            await until(lambda: samples == [HELLO, cdr("newer")])
+
+    run(story())
+
+
+def test_a_fault_of_one_follower_loses_nothing_else(publisher: Publish) -> None:
+    samples: list[bytes] = []
+    faults: list[object] = []
+
+    def fails(_: Feed, sample: Sample) -> None:
+        raise RuntimeError("no")
+
+    async def story() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
+        async with opened() as hub:
+            hub.join("/greeting", PLAIN, fails)
+            hub.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+            peer = publisher(STRING)
+            await matched(peer)
+            peer.publish([HELLO, cdr("newer")])
+            await until(lambda: samples == [HELLO, cdr("newer")])
+            assert [str(fault) for fault in faults] == ["no", "no"]
+
+    run(story())
+
+
+def test_a_feed_is_closed_when_the_last_follower_leaves() -> None:
+    async def story() -> None:
+        with closing(open_ros()) as ros, closing(Hub(ros.topics, INTERFACES, asyncio.get_running_loop())) as hub:
+            feed = hub.join("/nobody", PLAIN, None)
+            assert hub.join("/nobody", PLAIN, None) is feed
+            hub.leave(feed, None)
+            assert "/nobody" in ros.topics.names()
+            hub.leave(feed, None)
+            await until(lambda: "/nobody" not in ros.topics.names())
+            assert feed.latest() is None
+            assert hub.join("/nobody", PLAIN, None) is not feed
+
+    run(story())
+
+
+def test_it_adapts_when_a_publisher_of_less_quality_joins(publisher: Publish) -> None:
+    async def story() -> None:
+        async with opened() as hub:
+            reliable = publisher(STRING)
+            feed = hub.join("/greeting", before := await seen(hub), None)
+            await matched(reliable)
+            lossy = publisher(STRING, "--best-effort")
+            after = await seen(hub, lambda choice: not choice.is_reliable)
+            assert hub.join("/greeting", after, None) is feed
+            hub.leave(feed, None)
+            assert before.is_reliable
+            await heard(lossy, HELLO, feed)
+            await heard(reliable, cdr("as well"), feed)
+
+    run(story())
+
+
+@pytest.mark.parametrize("is_each", [False, True])
+def test_what_was_kept_comes_to_a_late_feed(publisher: Publish, is_each: bool) -> None:
+    publisher(STRING, "--transient-local").publish([HELLO])
+
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", await seen(hub), (lambda *_: None) if is_each else None)
+            await until(lambda: latest(feed) == HELLO)
+
+    run(story())
+
+
+def test_another_type_is_another_feed_and_the_old_one_ends(publisher: Publish) -> None:
+    async def story() -> None:
+        async with opened() as hub:
+            text = publisher(STRING)
+            old = hub.join("/greeting", await seen(hub), None)
+            assert hub.join("/greeting", PLAIN, None) is old  # somebody else, who does not know yet
+            await matched(text)
+            text.publish([HELLO])
+            await until(lambda: latest(old) == HELLO)
+            publisher(INT32)
+            number = publisher(INT32)
+            several = await seen(hub, lambda choice: choice.type_name == INT32)
+            assert several.others == (STRING,)
+            new = hub.join("/greeting", several, None)
+            assert (new is old, new.type_name) == (False, INT32)
+            hub.leave(old, None)
+            await matched(number)
+            number.publish([FIVE])
+            await until(lambda: latest(new) == FIVE)
+            assert latest(old) == HELLO
+            assert hub.join("/greeting", several, None) is new
+            hub.leave(old, None)
+            assert latest(new) == FIVE
+
+    run(story())
+
+
+def test_a_publisher_that_was_killed_is_followed_by_its_successor() -> None:
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", PLAIN, None)
+            killed = Publisher("greeting", STRING)
+            await matched(killed)
+            killed.publish([HELLO])
+            await until(lambda: latest(feed) == HELLO)
+            killed.kill()
+            with closing(Publisher("greeting", STRING)) as successor:
+                await matched(successor)
+                successor.publish([cdr("again")])
+                await until(lambda: latest(feed) == cdr("again"))
+
+    run(story())
+
+
+@pytest.mark.parametrize("type_name", ["std_msgs/msg/NoSuch", "no_such/msg/Thing", "some::Idl_", "a/action/B_Feedback"])
+def test_a_type_that_is_not_installed_is_refused_each_time(type_name: str) -> None:
+    async def story() -> None:
+        async with opened() as hub:
+            for _ in range(2):
+                with pytest.raises(StartError, match=f"{type_name} is not installed"):
+                    hub.join("/greeting", PLAIN._replace(type_name=type_name), None)
+
+    run(story())
+
+
+def test_a_topic_that_a_route_has_with_another_type_is_refused_and_can_be_followed_with_its_own() -> None:
+    async def story() -> None:
+        async with opened(string_topic()) as hub:
+            with pytest.raises(StartError, match="'/greeting' cannot be subscribed to"):
+                hub.join("/greeting", PLAIN._replace(type_name=INT32), None)
+            assert hub.join("/greeting", PLAIN, None).type_name == STRING
+
+    run(story())
+
+
+class Counted(ReadyType):
+    """Counts conversions."""
+
+    conversions = 0
+
+    def text(self, style: Style, cdr: bytes) -> str:
+        self.conversions += 1
+        return super().text(style, cdr)
+
+
+def string_type() -> Counted:
+    message = INTERFACES.get(STRING)
+    assert message
+    return Counted(message, None)
+
+
+def test_each_form_of_a_sample_is_made_once() -> None:
+    ready = string_type()
+    sample = Sample("/greeting", ready, HELLO, 1)
+    assert not sample.has_payload(Style.WRAPPED, 3)
+    for _ in range(2):
+        assert sample.text(Style.PLAIN) == '{"data":"hello, rover"}'
+        assert sample.payload(Style.PLAIN, 0) == b'{"data":"hello, rover"}'
+        assert sample.payload(Style.WRAPPED, 0) == b'{"data":["hello, rover"]}'
+        assert decompress(sample.payload(Style.WRAPPED, 3), 1000) == b'{"data":["hello, rover"]}'
+        assert sample.payload(Style.WRAPPED, 3) is sample.payload(Style.WRAPPED, 3)
+    assert sample.has_payload(Style.WRAPPED, 3)
+    assert ready.conversions == 2
+
+
+def test_bytes_that_are_no_message_are_refused_each_time() -> None:
+    sample = Sample("/greeting", string_type(), HELLO[:6], 1)
+    for _ in range(2):
+        with pytest.raises(UnreadableError):
+            sample.payload(Style.WRAPPED, 0)

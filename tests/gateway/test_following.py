@@ -1,0 +1,78 @@
+"""Which type and QoS a topic is followed with, given its publishers."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.edges.ros_topics import SeenPublisher
+from router.gateway.following import Choice, choice
+
+RELIABLE = SeenPublisher("a/msg/A", is_reliable=True, keeps=False, is_ours=False)
+LATCHED = RELIABLE._replace(keeps=True)
+LOSSY = RELIABLE._replace(is_reliable=False)
+LOSSY_LATCHED = LATCHED._replace(is_reliable=False)
+OTHER = RELIABLE._replace(type_name="b/msg/B")
+THIRD = RELIABLE._replace(type_name="c/msg/C")
+
+seen = st.builds(SeenPublisher, st.sampled_from("abc"), st.booleans(), st.booleans(), st.booleans())
+
+
+@pytest.mark.parametrize(
+    ("publishers", "is_reliable", "keeps"),
+    [
+        ([RELIABLE], True, False),
+        ([LATCHED], True, True),
+        ([LOSSY], False, False),
+        ([LOSSY_LATCHED], False, False),
+        ([RELIABLE, LATCHED], True, False),
+        ([LATCHED, LATCHED], True, True),
+        ([LATCHED, LOSSY], False, False),
+        ([LATCHED, LATCHED, OTHER._replace(is_reliable=False)], True, True),
+    ],
+)
+def test_quality_is_what_every_publisher_of_the_type_offers(
+    publishers: list[SeenPublisher], is_reliable: bool, keeps: bool
+) -> None:
+    chosen = choice(publishers, is_let_in=False)
+    assert chosen
+    assert (chosen.is_reliable, chosen.keeps) == (is_reliable, keeps)
+
+
+@pytest.mark.parametrize(
+    ("publishers", "type_name", "others"),
+    [
+        ([RELIABLE], "a/msg/A", ()),
+        ([RELIABLE, OTHER, OTHER], "b/msg/B", ("a/msg/A",)),
+        ([OTHER, RELIABLE], "a/msg/A", ("b/msg/B",)),
+        ([OTHER, THIRD, THIRD, RELIABLE], "c/msg/C", ("a/msg/A", "b/msg/B")),
+    ],
+)
+def test_the_type_of_most_publishers_is_served(
+    publishers: list[SeenPublisher], type_name: str, others: tuple[str, ...]
+) -> None:
+    assert choice(publishers, is_let_in=False) == Choice(type_name, is_reliable=True, keeps=False, others=others)
+
+
+def test_a_topic_without_publishers_is_not_served() -> None:
+    assert choice([], is_let_in=False) is None
+
+
+def test_our_own_publishers_count_unless_the_topic_is_let_in() -> None:
+    ours = OTHER._replace(is_ours=True)
+    routed, let_in = choice([ours], is_let_in=False), choice([ours, ours, RELIABLE], is_let_in=True)
+    assert routed
+    assert routed.type_name == "b/msg/B"
+    assert let_in == Choice("a/msg/A", is_reliable=True, keeps=False, others=())
+    assert choice([ours], is_let_in=True) is None
+
+
+@given(st.lists(seen), st.booleans())
+def test_the_order_in_which_publishers_were_found_does_not_matter(
+    publishers: list[SeenPublisher], is_let_in: bool
+) -> None:
+    assert choice(publishers, is_let_in=is_let_in) == choice(sorted(publishers), is_let_in=is_let_in)
