@@ -89,12 +89,15 @@ def _is_schema(content: Mapping[str, Any]) -> bool:
 
 
 def _document(document: Mapping[str, Any]) -> Message | Schema | Remark:
-    if document.get("op") not in {"data", "schema"}:
+    op = document.get("op")
+    if not isinstance(op, str):
+        raise PacketError("a document that does not say what it is")
+    if op not in {"data", "schema"}:
         return Remark(document)
     time, type_name = document.get("time"), document.get("type")
     if not isinstance(time, (int, float)) or not isinstance(type_name, str):
         raise PacketError("a document without time or type")
-    if document["op"] == "schema":
+    if op == "schema":
         return Schema(time, "", type_name, document.get("schema", {}), shape(document.get("schema")))
     topic, data = document.get("topic"), document.get("data")
     if not isinstance(topic, str) or not isinstance(data, dict):

@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import count
+
+import pytest
+
+from router.gateway.documents import data_document, schema_document
+from router.gateway.fragments import datagrams
+from router.gateway.packets import Packet, pack
+from router.tools.listening import Arrival, Listening, Source
+from router.tools.listening_reading import Heard, Message, Problem, Schema, Shape
+from router.tools.listening_topics import topic_filter
+
+EVERY = topic_filter([])
+
+SCHEMA = json.dumps(
+    {
+        "name": "T",
+        "namespace": "p::msg",
+        "fields": [{"name": "x", "is_array": False, "type": "int32", "subtype": "primitive"}],
+    }
+)
+
+
+def packet(payload: str, topic: str = "/t") -> bytes:
+    return pack(Packet(5.0, False, topic, "p/msg/T", payload.encode()))
+
+
+class Played:
+    """A source of these arrivals, and the end of patience after them."""
+
+    place = "nowhere"
+
+    def __init__(self, *batches: Sequence[Arrival], lost: int = 0) -> None:
+        self.lost = lost
+        self.asked = 0
+        self._batches = list(batches)
+
+    def ask(self) -> None:
+        self.asked += 1
+
+    def arrivals(self, timeout: float) -> Sequence[Arrival]:
+        if not self._batches:
+            raise KeyboardInterrupt
+        return self._batches.pop(0)
+
+    def close(self) -> None: ...
+
+
+def heard(listening: Listening, source: Source) -> list[Heard]:
+    found: list[Heard] = []
+    try:
+        found.extend(listening.hear(source, 100.0))
+    except KeyboardInterrupt:
+        return found
+    raise AssertionError("the time was not over")
+
+
+def arrivals(*packets: bytes, sender: object = "a") -> list[Arrival]:
+    return [Arrival(data, sender) for data in packets]
+
+
+def test_batches_and_fragments_become_packets() -> None:
+    packets = [packet(SCHEMA), packet('{"x":[1]}'), packet(json.dumps({"x": ["y" * 5000]}))]
+    sent = arrivals(*datagrams(packets, 1400, 5.0, count()))
+    listening, source = Listening(EVERY), Played(sent)
+    assert [type(one) for one in heard(listening, source)] == [Schema, Message, Message]
+    assert str(listening.tally(source)) == "2 messages, 1 schemas, 0 undecodable, 0 lost"
+
+
+def test_a_message_before_its_schema_is_shown_and_counted() -> None:
+    sent = arrivals(packet('{"x":[1]}'), packet(SCHEMA), packet('{"x":[2]}'))
+    listening, source = Listening(EVERY), Played(sent)
+    first, _, second = heard(listening, source)
+    assert isinstance(first, Message)
+    assert isinstance(second, Message)
+    assert (first.shape, second.shape) == (None, {"x": Shape("int32", False, {})})
+    assert str(listening.tally(source)) == "2 messages, 1 schemas, 0 undecodable, 0 lost, 1 before their schema"
+
+
+def test_another_sender_has_to_send_its_schema_first() -> None:
+    documents = schema_document("p/msg/T", 5.0, SCHEMA), data_document("/t", "p/msg/T", 5.0, '{"x":1}')
+    listening, source = Listening(EVERY), Played(arrivals(*documents), arrivals(documents[1], sender="b"))
+    heard(listening, source)
+    assert listening.tally(source).early == 1
+
+
+def test_other_topics_are_counted_and_not_shown() -> None:
+    sent = arrivals(packet(SCHEMA, "/a"), packet('{"x":[1]}', "/a"), packet(SCHEMA, "/b"), packet('{"x":[2]}', "/b"))
+    listening, source = Listening(lambda topic: topic == "/b"), Played(sent)
+    assert [getattr(one, "topic", None) for one in heard(listening, source)] == ["/b", "/b"]
+    assert str(listening.tally(source)) == "1 messages, 2 schemas, 0 undecodable, 0 lost, 1 of other topics"
+
+
+def test_what_means_nothing_is_shown_with_its_bytes_and_ends_nothing() -> None:
+    batch = b"".join(datagrams([packet("no JSON"), packet('{"x":[1]}')], 1400, 5.0, count()))
+    listening, source = Listening(EVERY), Played(arrivals(b"", b"garbage and more", batch))
+    first, second, third, fourth = heard(listening, source)
+    assert first == Problem("0 bytes are no packet", b"")
+    assert isinstance(second, Problem)
+    assert second.data == b"garbage and more"
+    assert isinstance(third, Problem)
+    assert third.data == packet("no JSON")
+    assert isinstance(fourth, Message)
+    assert listening.tally(source).undecodable == 3
+
+
+def test_what_a_source_knows_to_be_lost_counts() -> None:
+    listening, source = Listening(EVERY), Played(lost=3)
+    heard(listening, source)
+    assert listening.tally(source).lost == 3
+
+
+def test_schemas_are_asked_for_at_the_start() -> None:
+    source = Played([], [], arrivals(packet(SCHEMA)))
+    heard(Listening(EVERY), source)
+    assert source.asked == 1
+
+
+def test_schemas_are_asked_for_until_one_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("router.tools.listening.ASK_AGAIN", 0.01)
+
+    class Patient(Played):
+        def arrivals(self, timeout: float) -> Sequence[Arrival]:
+            return super().arrivals(timeout) if self.asked > 2 else ()
+
+    source = Patient(arrivals(packet(SCHEMA)))
+    heard(Listening(EVERY), source)
+    assert source.asked == 3
+
+
+def test_listening_ends_when_its_time_is_over() -> None:
+    assert list(Listening(EVERY).hear(Played([], [], []), 0.0)) == []

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import datetime as dt
+import json
+from typing import Any
+
+import pytest
+
+from router.tools.listening_reading import Heard, Message, Problem, Remark, Schema, Shape
+from router.tools.listening_show import json_line, pieces
+
+NOON = dt.datetime(2026, 5, 1, 12, 0, 0, 123_000).timestamp()  # noqa: DTZ001 - local, as it is shown
+SHAPE = {
+    "x": Shape("float32", False, {}),
+    "list": Shape("float64", True, {}),
+    "header": Shape("Header", False, {"frame_id": Shape("string", False, {})}),
+    "points": Shape("Point", True, {"y": Shape("int32", False, {})}),
+}
+
+
+def line(heard: Heard) -> str:
+    return " ".join(text for text, _ in pieces(heard))
+
+
+def message(data: dict[str, Any], is_wrapped: bool = True, shape: Any = SHAPE) -> Message:
+    return Message(NOON, "/imu", "p/msg/T", data, is_wrapped, shape)
+
+
+def test_a_line_has_time_topic_type_and_values() -> None:
+    assert line(message({"x": [1.5]})) == "12:00:00.123 /imu p/msg/T x=1.5"
+
+
+@pytest.mark.parametrize(
+    ("data", "values"),
+    [
+        ({"x": [0.10000000149011612]}, "x=0.1"),
+        ({"x": [None]}, "x=null"),
+        ({"list": [0.5]}, "list=[0.5]"),
+        ({"list": []}, "list=[]"),
+        ({"list": list(range(1000))}, "list=[0,1,2,3,4,5,...1000]"),
+        ({"header": [{"frame_id": ["base"]}]}, "header.frame_id=base"),
+        ({"header": [{"frame_id": ["base link"]}]}, "'header.frame_id=base link'"),
+        ({"header": [{"frame_id": ["\x1b[31m"]}]}, r"'header.frame_id=\x1b[31m'"),
+        ({"header": [{"frame_id": ["x" * 200]}]}, f"header.frame_id={'x' * 120}...(200)"),
+        ({"header": [{}]}, "header="),
+        ({"points": [{"y": [1]}, {"y": [2]}]}, "points[0].y=1 points[1].y=2"),
+        ({"points": [{"y": [1]}] * 9}, " ".join(f"points[{n}].y=1" for n in range(6)) + " points[...9]"),
+        ({"unknown": [True]}, "unknown=[true]"),
+        ({}, "(empty)"),
+    ],
+)
+def test_single_values_stand_without_their_list_and_long_lists_are_cut(data: dict[str, Any], values: str) -> None:
+    assert line(message(data)).split(" ", 3)[3] == values
+
+
+def test_before_the_schema_values_are_shown_as_received() -> None:
+    assert line(message({"x": [1.5], "header": [{"frame_id": ["base"]}]}, shape=None)).endswith(
+        " x=[1.5] header[0].frame_id=[base]"
+    )
+
+
+def test_plain_data_is_shown_as_it_is() -> None:
+    data = {"x": 1.5, "list": [0.5], "header": {"frame_id": "base"}, "points": [{"y": 1}]}
+    assert line(message(data, is_wrapped=False)).endswith(" x=1.5 list=[0.5] header.frame_id=base points[0].y=1")
+
+
+def test_a_schema_is_shortened_to_its_fields() -> None:
+    assert line(Schema(NOON, "/imu", "p/msg/T", {}, SHAPE)) == (
+        "12:00:00.123 /imu p/msg/T schema x:float32 list:float64[] header:Header points:Point[]"
+    )
+    assert line(Schema(NOON, "", "p/msg/T", {}, {})) == "12:00:00.123 p/msg/T schema (empty)"
+
+
+def test_what_else_is_heard_is_shown_too() -> None:
+    refusal = {"op": "rejected", "reason": "invalid", "topic": "/imu"}
+    assert line(Remark(refusal)) == "op=rejected reason=invalid topic=/imu"
+    assert line(Problem("no JSON", b"\xff\xff")) == "undecodable (no JSON): ffff"
+    assert line(Problem("empty", b"")) == "undecodable (empty): no bytes"
+
+
+@pytest.mark.parametrize("time", [float("nan"), 1e300, -1e18])
+def test_a_time_beyond_every_calendar_is_shown_as_a_number(time: float) -> None:
+    assert line(message({})._replace(time=time)).startswith(f"time={time} /imu")
+
+
+def test_json_is_what_was_received() -> None:
+    data = {"x": [0.10000000149011612], "s": ["\u00e9\n"]}
+    said = {"time": NOON, "topic": "/imu", "type": "p/msg/T", "data": data}
+    assert json.loads(json_line(message(data))) == said
+    schema = {"name": "T", "namespace": "p::msg", "fields": []}
+    said = {"time": NOON, "topic": "/imu", "type": "p/msg/T", "schema": schema}
+    assert json.loads(json_line(Schema(NOON, "/imu", "p/msg/T", schema, {}))) == said
+    assert "topic" not in json.loads(json_line(Schema(NOON, "", "p/msg/T", schema, {})))
+    assert json.loads(json_line(Remark({"op": "topics"}))) == {"op": "topics"}
+    assert json.loads(json_line(Problem("no JSON", b"\xff"))) == {"problem": "no JSON", "bytes": 1, "hex": "ff"}
+    assert "\n" not in json_line(message(data))

@@ -1,0 +1,263 @@
+"""The sources of `listen` against senders of real sockets: none of them is the gateway itself."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+
+import pytest
+import zenoh
+from websockets.sync.server import ServerConnection, serve
+
+from router.gateway.packets import unpack
+from router.table.model import Address, GatewayFormat, Located, ZenohSettings
+from router.tools.listening import Source
+from router.tools.listening_places import open_source
+from router.tools.listening_tcp import TcpSource
+from router.tools.listening_udp import UdpSource
+from router.tools.listening_websocket import WebsocketSource
+from router.tools.listening_zenoh import ZenohSource
+from tests.ports import free_port
+
+Said = list[str]
+
+
+@pytest.fixture
+def said() -> Said:
+    return []
+
+
+def received(source: Source, number: int) -> list[bytes]:
+    """So many arrivals, however long they take: a test that hangs is ended by pytest's time limit."""
+    found: list[bytes] = []
+    while len(found) < number:
+        found.extend(arrival.data for arrival in source.arrivals(0.2))
+    return found
+
+
+def until(source: Source, condition: Callable[[], object]) -> None:
+    while not condition():
+        assert list(source.arrivals(0.05)) == []
+
+
+@contextmanager
+def udp_source(gateway: Address | None, said: Said) -> Iterator[tuple[UdpSource, Address]]:
+    port = free_port()
+    with closing(UdpSource(Address("127.0.0.1", port), gateway, said.append)) as source:
+        yield source, Address("127.0.0.1", port)
+
+
+def test_udp_takes_whole_datagrams_of_any_size(said: Said) -> None:
+    with udp_source(None, said) as (source, address), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
+        gateway.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+        assert list(source.arrivals(0.01)) == []
+        for data in (b"a", b"", b"x" * 65_507):
+            gateway.sendto(data, address)
+        assert received(source, 3) == [b"a", b"", b"x" * 65_507]
+        assert source.lost == 0
+
+
+def test_udp_asks_from_the_port_on_which_it_listens(said: Said) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
+        gateway.bind(("127.0.0.1", 0))
+        gateway.settimeout(5)
+        with udp_source(Address(*gateway.getsockname()), said) as (source, address):
+            source.ask()
+            data, peer = gateway.recvfrom(100)
+    assert peer == address
+    assert unpack(data)[1:] == (False, "", "", b"")
+
+
+def test_udp_tells_what_the_kernel_dropped_for_want_of_room(said: Said) -> None:
+    with udp_source(None, said) as (source, address), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
+        while not source.lost:
+            gateway.sendto(b"x" * 60_000, address)
+        assert source.lost > 0
+
+
+def test_udp_that_cannot_ask_says_why(said: Said) -> None:
+    with udp_source(Address("255.255.255.255", 9), said) as (source, _):
+        source.ask()
+    assert said == ["cannot ask 255.255.255.255:9: Permission denied"]
+
+
+@pytest.fixture
+def port() -> Iterator[socket.socket]:
+    """Of a TCP gateway, which the test plays."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        yield server
+
+
+@pytest.mark.parametrize(
+    ("form", "stream"),
+    [
+        (None, b'{"op":"x"}\n{"op":"y"}\n'),
+        (GatewayFormat.JSON_LINES, b'{"op":"x"}\n{"op":"y"}\n'),
+        (None, struct.pack("<I", 10) + b'{"op":"x"}' + struct.pack("<I", 10) + b'{"op":"y"}'),
+    ],
+)
+def test_tcp_splits_the_stream(port: socket.socket, said: Said, form: GatewayFormat | None, stream: bytes) -> None:
+    with closing(TcpSource(Address(*port.getsockname()), form, said.append)) as source:
+        assert list(source.arrivals(0.01)) == []
+        with port.accept()[0] as gateway:
+            gateway.sendall(stream)
+            assert received(source, 2) == [b'{"op":"x"}', b'{"op":"y"}']
+    assert said == []
+
+
+def test_tcp_connects_again_when_the_gateway_went_away(port: socket.socket, said: Said) -> None:
+    address = Address(*port.getsockname())
+    with closing(TcpSource(address, None, said.append)) as source:
+        assert list(source.arrivals(0.01)) == []
+        with port.accept()[0] as gateway:
+            gateway.sendall(b'{"n":1}\n{"half')
+            [first] = source.arrivals(5)
+        until(source, lambda: len(said) > 1)
+        with port.accept()[0] as gateway:
+            gateway.sendall(b'{"n":2}\n')
+            [second] = source.arrivals(5)
+    assert said == [
+        f"tcp {address} has gone, after 6 bytes of a message; trying again",
+        f"tcp {address} is connected",
+    ]
+    assert (first.data, second.data) == (b'{"n":1}', b'{"n":2}')
+    assert first.sender != second.sender
+
+
+def test_tcp_waits_for_a_gateway_that_is_not_there_and_says_so_once(said: Said) -> None:
+    address = Address("127.0.0.1", free_port(kind=socket.SOCK_STREAM))
+    with closing(TcpSource(address, None, said.append)) as source:
+        for _ in range(30):
+            source.arrivals(0.05)
+        with socket.create_server(address):
+            until(source, lambda: len(said) > 1)
+    assert said == [
+        f"tcp {address} cannot be reached (Connection refused); trying again",
+        f"tcp {address} is connected",
+    ]
+
+
+def test_tcp_leaves_a_gateway_whose_stream_makes_no_sense(port: socket.socket, said: Said) -> None:
+    with closing(TcpSource(Address(*port.getsockname()), None, said.append)) as source:
+        source.arrivals(0.01)
+        with port.accept()[0] as gateway:
+            gateway.sendall(struct.pack("<I", 3) + b"abc" + b"\xff" * 8)
+            assert received(source, 1) == [b"abc"]
+            until(source, lambda: said)
+            assert gateway.recv(1) == b""
+    assert "is left (a packet of 4294967295 bytes); trying again" in said[0]
+
+
+@contextmanager
+def websocket_gateway(handler: Callable[[ServerConnection], None], port: int = 0) -> Iterator[Address]:
+    with serve(handler, "127.0.0.1", port, compression=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield Address(*server.socket.getsockname())
+        server.shutdown()
+        thread.join()
+
+
+def test_a_websocket_carries_documents_as_text_and_packets_as_bytes(said: Said) -> None:
+    large = b"x" * 2_000_000
+
+    def handler(websocket: ServerConnection) -> None:
+        websocket.send('{"op":"x"}\n{"op":"\u00e9"}')
+        websocket.send(b"\n\n")
+        websocket.send(large)
+        for _ in websocket:
+            pass
+
+    with (
+        websocket_gateway(handler) as address,
+        closing(WebsocketSource(address, said.append)) as source,
+    ):
+        assert received(source, 4) == [b'{"op":"x"}', '{"op":"\u00e9"}'.encode(), b"\n\n", large]
+        assert list(source.arrivals(0.01)) == []
+        source.close()
+    assert said == []
+
+
+def test_a_websocket_is_connected_again_when_the_gateway_went_away(said: Said) -> None:
+    def handler(websocket: ServerConnection) -> None:
+        websocket.send("{}")
+
+    with websocket_gateway(handler) as address, closing(WebsocketSource(address, said.append)) as source:
+        assert received(source, 2) == [b"{}", b"{}"]
+    assert said[0].startswith(f"websocket {address} has gone (")
+    assert said[1] == f"websocket {address} is connected"
+
+
+def test_what_is_no_websocket_is_said(port: socket.socket, said: Said) -> None:
+    def answer() -> None:
+        with port.accept()[0] as gateway:
+            gateway.recv(4096)
+            gateway.sendall(b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n")
+
+    answering = threading.Thread(target=answer)
+    answering.start()
+    with closing(WebsocketSource(Address(*port.getsockname()), said.append)) as source:
+        assert list(source.arrivals(0.01)) == []
+        assert "cannot be reached (it is no websocket: " in said[0]
+        assert "404" in said[0]
+    answering.join()
+
+
+@pytest.fixture
+def rover() -> Iterator[tuple[zenoh.Session, str]]:
+    """A Zenoh session and the locator on which it listens."""
+    locator = f"tcp/127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
+    config = zenoh.Config()
+    config.insert_json5("scouting/multicast/enabled", "false")
+    config.insert_json5("listen/endpoints", f'["{locator}"]')
+    with zenoh.open(config) as session:
+        yield session, locator
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+def test_zenoh_answers_come_before_live_data_and_schemas_before_all(
+    rover: tuple[zenoh.Session, str], said: Said, mode: str
+) -> None:
+    session, locator = rover
+
+    def answer(query: zenoh.Query) -> None:
+        session.put("rovers/loki_1/data/imu", b"live")
+        query.reply("rovers/loki_1/data/imu", b"latest")
+        query.reply("rovers/loki_1/schema/p/msg/T", b"schema")
+
+    session.declare_queryable("rovers/loki_1/**", answer)
+    place = f"zenoh://rovers/loki_1?mode={mode}&connect={locator}"
+    with closing(open_source(place, None, None, said.append)) as source:
+        source.ask()
+        assert received(source, 3) == [b"schema", b"latest", b"live"]
+        session.put("rovers/loki_2/data/imu", b"of another")
+        session.put("rovers/loki_1/schema/p/msg/T", b"schema again")
+        assert received(source, 1) == [b"schema again"]
+    assert said == []
+
+
+def test_zenoh_without_a_gateway_waits_for_one(rover: tuple[zenoh.Session, str], said: Said) -> None:
+    session, locator = rover
+    settings = ZenohSettings(Located("rovers/loki_1", None), connect=(locator,))  # type: ignore[arg-type]
+    with closing(ZenohSource(settings, said.append)) as source:
+        source.ask()
+        assert list(source.arrivals(5)) == []
+        session.put("rovers/loki_1/data/imu", b"live")
+        assert received(source, 1) == [b"live"]
+
+
+def test_zenoh_tells_what_a_gateway_could_not_answer(rover: tuple[zenoh.Session, str], said: Said) -> None:
+    session, locator = rover
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply_err(b"not now")
+
+    session.declare_queryable("rovers/loki_1/**", answer)
+    with closing(open_source(f"zenoh://rovers/loki_1?connect={locator}", None, None, said.append)) as source:
+        source.ask()
+        until(source, lambda: said)
+    assert said == ["a gateway could not answer: not now"]
