@@ -55,10 +55,8 @@ def joined(texts: Sequence[str]) -> str:
 
 
 def _string(data: bytes) -> str:
-    """A string from its bytes with the final NUL. Some writers leave it out where the string is empty."""
-    if data and data[-1]:
-        raise UnreadableError("a string does not end with NUL")
-    return _quoted(data[:-1].decode())
+    """A string from its bytes, which end with NUL; whoever leaves that out is understood by Fast CDR too."""
+    return _quoted(data.removesuffix(b"\0").decode())
 
 
 def _quoted(text: str) -> str:

@@ -47,7 +47,7 @@ def _bare(declared: Type, value: Any, is_wrapped: bool) -> str:
         case Int():
             return str(int(value))
         case Float():
-            return reference_number(value)
+            return reference_number(float(value))
         case _:
             raise TypeError(f"ROS has no type {declared}")
 
