@@ -57,6 +57,36 @@ routes:
       collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
       deadman: nothing moves because of it
 """
+GATEWAYS = """\
+# yaml-language-server: $schema=../schemas/route-table.schema.json
+version: 1
+envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
+listen: {rover: {address: 0.0.0.0:5000}}
+routes: {}
+gateways:
+  vr_headset:
+    transport: {udp: "${HEADSET:-10.0.20.219:8502}"}
+    receive: 10.0.0.230:8500
+    format: gateway_v2
+    topics: {include: ["/rover/**", {regex: "/imu/.*"}], exclude: ["/rover/camera/**"]}
+    publish_period: each
+    schema_period: ${SCHEMAS:-5s}
+    compression: {zstd: 3}
+    rates: {"/rover/imu": 50 Hz, "/tf": each, "/slow": 0.5}
+    max_datagram: 1400B
+    inbound:
+      - {topic: /cmd_vel, type: geometry_msgs/msg/Twist, ttl: 300ms, max_rate: 20 Hz,
+        deadman: {timeout: 500ms, send: {linear: {x: 0.0}}}}
+  logger:
+    transport: {tcp: 0.0.0.0:8600}
+    format: json_lines
+    max_clients: 3
+  dashboard:
+    transport: {websocket: 0.0.0.0:8765}
+  far:
+    transport: {zenoh: {key: rovers/one, mode: client, connect: [tcp/10.0.0.1:7447]}}
+    format: json
+"""
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +121,10 @@ def place(text: str, part: str) -> tuple[int, int]:
 
 def test_a_good_table_is_underlined_nowhere(editor: LanguageServer) -> None:
     assert editor.open(new_table(), GOOD) == []
+
+
+def test_good_gateways_are_underlined_nowhere(editor: LanguageServer) -> None:
+    assert editor.open(new_table(), GATEWAYS) == []
 
 
 @pytest.mark.parametrize("table", sorted((REPOSITORY / "routes").glob("*.yaml")), ids=lambda path: path.name)
@@ -133,6 +167,75 @@ def test_a_mistake_is_underlined_where_it_is(
     found = editor.open(new_table(), text)
     assert [item for item in found if message in item["message"]], found
     assert {item["range"]["start"]["line"] for item in found} == {place(text, blamed)[0]}
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "blamed", "message"),
+    [
+        ("tcp: 0.0.0.0:8600", "tpc: 0.0.0.0:8600", "tpc", "must be one of udp, tcp"),
+        ("10.0.0.230:8500", "10.0.0.230", "receive", "must be an IPv4 address and a port"),
+        (
+            "json_lines",
+            "gateway_v2",
+            "format: gateway_v2\n    max_clients",
+            "must be 'gateway_v1' or 'json_lines' over tcp",
+        ),
+        ("8765}", "8765}\n    receive: 10.0.0.230:8501", "receive: 10.0.0.230:8501", "of a udp gateway"),
+        ("8765}", "8765}\n    compression: {zstd: 2}", "compression: {zstd: 2}", "'format' says JSON documents here"),
+        ("    receive: 10.0.0.230:8500\n", "", "vr_headset", 'Missing property "receive"'),
+        ("publish_period: each", "publish_period: never", "publish_period", "or 'each'"),
+        ("50 Hz", "50 Hertz", "rates", "such as '50 Hz', or 'each'"),
+        ("zstd: 3", "zstd: 30", "zstd", "maximum of 22"),
+        ("key: rovers/one", "key: /rovers/*", "key:", "must be names with '/' between them"),
+    ],
+)
+def test_a_mistake_in_a_gateway_is_underlined_where_it_is(
+    editor: LanguageServer, right: str, wrong: str, blamed: str, message: str
+) -> None:
+    text = GATEWAYS.replace(right, wrong)
+    found = editor.open(new_table(), text)
+    assert [item for item in found if message in item["message"]], found
+    assert {item["range"]["start"]["line"] for item in found} == {place(text, blamed)[0]}
+
+
+@pytest.mark.parametrize(
+    ("word", "title", "part"),
+    [
+        ("gateways", "Gateways", "neither ROS nor protobuf"),
+        ("transport", "Transport", "zenoh"),
+        ("udp", "UDP", "the one client"),
+        ("receive", "Receive", "hears nothing"),
+        ("include", "Include", "every topic that is not hidden"),
+        ("publish_period", "Publish period", "each: every message"),
+        ("rates", "Rates", "first glob that matches"),
+        ("inbound", "Inbound", "refused and counted"),
+        ("timeout", "Timeout", "before the deadman publishes"),
+        ("key: rovers", "Key", "different for each rover"),
+        ("max_clients", "Most clients", "at a time"),
+    ],
+)
+def test_hovering_over_a_key_of_a_gateway_tells_what_it_is_for(
+    editor: LanguageServer, word: str, title: str, part: str
+) -> None:
+    table = new_table()
+    editor.open(table, GATEWAYS)
+    line, character = place(GATEWAYS, word)
+    text = editor.hover(table, line, character + 1)
+    assert title in text
+    assert part in text.replace("\\", "")
+
+
+def test_completion_offers_the_keys_and_formats_of_a_gateway(editor: LanguageServer) -> None:
+    text = GATEWAYS + "    \n"
+    table = new_table()
+    editor.open(table, text)
+    offered = editor.completions(table, text.count("\n") - 1, 4)
+    assert {"topics", "publish_period", "rates", "inbound"} <= offered
+    text = GATEWAYS.replace("format: json_lines", "format: ")
+    table = new_table()
+    editor.open(table, text)
+    line, character = place(text, "format: \n")
+    assert editor.completions(table, line, character + len("format: ")) >= {"gateway_v1", "json_lines"}
 
 
 @pytest.mark.parametrize(
