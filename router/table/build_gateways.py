@@ -61,8 +61,8 @@ DEFAULT_MAX_CLIENTS = 1024
 
 def build_gateway(entry: Entry) -> Gateway:
     settings = mapping(entry.value)
-    (chosen,) = mapping(settings.get("transport")).entries.values()
-    transport = Transport(chosen.key.text)
+    ((name, chosen),) = mapping(settings.get("transport")).entries.items()
+    transport = Transport(name)
     topics = settings.get("topics")
     patterns = mapping(topics) if topics else None
     max_clients = integer(settings, "max_clients")

@@ -64,6 +64,31 @@ routes:
     - {source: ros, topics: [{topic: it, type: comms/msg/DetectedObject}], fields: auto, destinations: [basestation]}
 """
 
+GATEWAY = """\
+  vr_headset:
+    transport: {udp: "${HEADSET:-10.0.20.219:8502}"}
+    receive: 10.0.0.230:8500
+    format: gateway_v2
+    topics: {include: ["/rover/**", {regex: "/imu/.*"}], exclude: ["/rover/camera/**"]}
+    publish_period: each
+    schema_period: 1s
+    discovery_period: 2s
+    compression:
+      zstd: ${LEVEL:-3}
+    rates: {"/rover/imu": 50 Hz, "/tf": each, "/slow": 0.5}
+    max_datagram: 8kB
+    max_message: 1MiB
+    inbound:
+      - topic: /cmd_vel
+        type: geometry_msgs/msg/Twist
+        qos: {depth: 3}
+        ttl: 300ms
+        max_rate: 20 Hz
+        deadman: {timeout: 500ms, send: {linear.x: 0.0, angular: {z: 1}}}
+      - {topic: /stop, type: std_msgs/msg/Empty, deadman: {timeout: 1s, send: {}, repeat: 50ms}}
+"""
+"""A good gateway, to stand under the key `gateways`."""
+
 
 def load(
     folder: Path, text: str | bytes, environ: Mapping[str, str] | None = None

@@ -8,7 +8,7 @@ import pytest
 
 from router.errors import Code, Diagnostic
 from router.table.model import EACH, Address, Gateway, GatewayFormat, RouteTable, Transport, ZenohSettings
-from tests.table.tables import load, places
+from tests.table.tables import GATEWAY, load, places
 
 HEAD = """\
 version: 1
@@ -16,29 +16,6 @@ envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
 listen: {rover: {address: 0.0.0.0:5000}}
 routes: {}
 gateways:
-"""
-FULL = """\
-  vr_headset:
-    transport: {udp: "${HEADSET:-10.0.20.219:8502}"}
-    receive: 10.0.0.230:8500
-    format: gateway_v2
-    topics: {include: ["/rover/**", {regex: "/imu/.*"}], exclude: ["/rover/camera/**"]}
-    publish_period: each
-    schema_period: 1s
-    discovery_period: 2s
-    compression:
-      zstd: ${LEVEL:-3}
-    rates: {"/rover/imu": 50 Hz, "/tf": each, "/slow": 0.5}
-    max_datagram: 8kB
-    max_message: 1MiB
-    inbound:
-      - topic: /cmd_vel
-        type: geometry_msgs/msg/Twist
-        qos: {depth: 3}
-        ttl: 300ms
-        max_rate: 20 Hz
-        deadman: {timeout: 500ms, send: {linear.x: 0.0, angular: {z: 1}}}
-      - {topic: /stop, type: std_msgs/msg/Empty, deadman: {timeout: 1s, send: {}, repeat: 50ms}}
 """
 
 
@@ -55,7 +32,7 @@ def gateway(folder: Path, settings: str) -> Gateway:
 
 
 def test_a_gateway_is_typed(tmp_path: Path) -> None:
-    table, findings = table_with(tmp_path, FULL)
+    table, findings = table_with(tmp_path, GATEWAY)
     assert findings == []
     found = table.gateways["vr_headset"]
     assert (found.name, found.span.line, found.transport.value) == ("vr_headset", 6, Transport.UDP)
@@ -72,7 +49,7 @@ def test_a_gateway_is_typed(tmp_path: Path) -> None:
 
 
 def test_what_clients_may_publish_is_typed(tmp_path: Path) -> None:
-    first, second = table_with(tmp_path, FULL)[0].gateways["vr_headset"].inbound
+    first, second = table_with(tmp_path, GATEWAY)[0].gateways["vr_headset"].inbound
     assert (first.topic.topic.value, first.topic.type.value) == ("/cmd_vel", "geometry_msgs/msg/Twist")
     assert first.ttl
     assert first.max_rate
@@ -182,6 +159,12 @@ def test_the_sound_part_of_a_gateway_is_there_for_further_checks(tmp_path: Path)
     assert sorted(finding.code.value for finding in findings) == ["bad-value", "missing-key", "wrong-type"]
     [inbound] = table.gateways["it"].inbound
     assert (inbound.topic.topic.value, inbound.ttl) == ("/a", None)
+
+
+def test_a_misspelt_transport_is_read_as_the_one_that_was_meant(tmp_path: Path) -> None:
+    table, findings = table_with(tmp_path, "  it: {transport: {websoket: 127.0.0.1:8765}}\n")
+    assert [finding.code for finding in findings] == [Code.UNKNOWN_KEY]
+    assert table.gateways["it"].transport.value is Transport.WEBSOCKET
 
 
 def test_a_gateway_without_a_sound_transport_is_left_out(tmp_path: Path) -> None:

@@ -10,12 +10,26 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from router.errors import Diagnostic
-from tests.table.tables import GOOD, load
+from tests.table.tables import GATEWAY, GOOD, load
 
 LINES = GOOD.splitlines(keepends=True)
 WORDS = ["version", "extends", "envelope", "listen", "endpoints", "routes", "imu_info", "source", "topics", "fields"]
 WORDS += ["qos", "depth", "auto", "ros", "any", "address", "kind", "ignore", "when", "max_rate", "<<", "no", "0777"]
 WORDS += ["deadman", "timeout", "send", "to", "collect", "by", "for_each", "keep", "ttl", "budget", "latest", "1s"]
+GATEWAY_WORDS = [
+    "transport",
+    "udp",
+    "tcp",
+    "websocket",
+    "zenoh",
+    "receive",
+    "format",
+    "json",
+    "gateway_v1",
+    "gateway_v2",
+]
+GATEWAY_WORDS += ["include", "exclude", "regex", "rates", "publish_period", "each", "compression", "zstd", "inbound"]
+GATEWAY_WORDS += ["topics", "topic", "type", "deadman", "max_datagram", "127.0.0.1:8502", "key", "connect", "timeout"]
 
 scalars = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from([*WORDS, "${X"])
@@ -68,6 +82,29 @@ def test_any_tree_in_the_place_of_a_part(tmp_path: Path, tree: dict[str, object]
 @given(st.integers(0, len(GOOD) - 1), st.integers(0, 5), fragments)
 def test_any_change_of_a_good_table(tmp_path: Path, start: int, length: int, fragment: str) -> None:
     text = GOOD[:start] + fragment + GOOD[start + length :]
+    check(tmp_path, text.encode("utf-8", "surrogatepass"))
+
+
+gateway_trees = st.recursive(
+    scalars | st.sampled_from(GATEWAY_WORDS),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(GATEWAY_WORDS), inner, max_size=5),
+    max_leaves=30,
+)
+
+
+@quick
+@given(st.dictionaries(st.sampled_from(GATEWAY_WORDS), gateway_trees), st.sampled_from(GATEWAY_WORDS))
+def test_any_tree_in_the_place_of_a_gateway(tmp_path: Path, tree: dict[str, object], key: str) -> None:
+    (tmp_path / "base.yaml").write_text(f"{GOOD}gateways:\n{GATEWAY}")
+    check(tmp_path, json.dumps({"extends": "base.yaml", "gateways": {"vr_headset": tree, "other": {key: tree}}}))
+    transport = {"transport": {"tcp": "127.0.0.1:8600"}}
+    check(tmp_path, json.dumps({"extends": "base.yaml", "gateways": {"other": {**tree, **transport}}}))
+
+
+@quick
+@given(st.integers(0, len(GATEWAY) - 1), st.integers(0, 5), fragments)
+def test_any_change_of_a_good_gateway(tmp_path: Path, start: int, length: int, fragment: str) -> None:
+    text = f"{GOOD}gateways:\n{GATEWAY[:start]}{fragment}{GATEWAY[start + length :]}"
     check(tmp_path, text.encode("utf-8", "surrogatepass"))
 
 
