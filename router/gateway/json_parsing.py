@@ -16,7 +16,7 @@ from router.gateway.invalid import InvalidMessageError, shown
 _MOST_DEEP = 64
 """Lists and objects within each other."""
 _MOST_HOLDERS = 100_000
-"""Lists and objects in one text. They take up to 30 times the memory of their characters, and the garbage collector
+"""Lists and objects in one text. They take up to 40 times the memory of their characters, and the garbage collector
 looks at all of them at once: 10 ms in which no other thread runs."""
 _MOST_DIGITS = 25
 """Of an integer. The largest of 64 bits has 20."""

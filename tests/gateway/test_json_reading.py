@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from router.compiler.reference import initial
 from router.compiler.reference_cdr import cdr
+from router.gateway.json_code import json_writer
 from router.gateway.json_reading import InvalidMessageError, cdr_builder, example, parse_json
 from router.gateway.style import PLACEHOLDER, Style
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
@@ -263,3 +264,11 @@ def test_long_lists_are_written_as_short_ones() -> None:
             "last": -1,
         }
         assert build(declared, json.dumps(value)) == cdr(declared, value)
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@given(st.data(), st.sampled_from(Style))
+def test_what_a_gateway_sends_another_takes(data: st.DataObject, style: Style) -> None:
+    declared = data.draw(messages())
+    sent = cdr(declared, data.draw(values(declared)))
+    assert build(declared, json_writer(declared, style)(sent), style) == sent
