@@ -8,10 +8,11 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import explained, whole
+from router.errors import TransportError
 from router.tools import UsageError
 
 if TYPE_CHECKING:
@@ -57,20 +58,18 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.listening import Listening
     from router.tools.listening_places import open_source, remote
     from router.tools.listening_reading import Message
-    from router.tools.listening_show import json_line
     from router.tools.listening_topics import topic_filter
 
     listening = Listening(topic_filter(args.topic or ()))
     form = GatewayFormat(args.format) if args.format else None
     gateway = remote(args.ask) if args.ask else None
     show = _printer(args.json)
-    with _record(args.record) as record, closing(open_source(args.place, form, gateway, _say)) as source:
+    with _recorder(args.record) as record, closing(open_source(args.place, form, gateway, _say)) as source:
         _say(f"listening: {source.place}; Ctrl-C ends it")
         rest = args.count
         try:
             for heard in listening.hear(source, args.seconds or math.inf):
-                if record is not None:
-                    print(json_line(heard), file=record, flush=True)
+                record(heard)
                 show(heard)
                 if rest and isinstance(heard, Message):
                     rest -= 1
@@ -84,17 +83,27 @@ def run(args: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _record(path: Path | None) -> Iterator[TextIO | None]:
+def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
+    """A function that appends a line to the file, which has it when it returns."""
+    from router.tools.listening_show import json_line
+
     if path is None:
-        yield None
+        yield lambda _: None
         return
     if path == Path("-"):
         raise UsageError("--record takes a file; --json prints the same")
     try:
-        record = path.open("a", encoding="utf-8")
+        file = path.open("ab", buffering=0)
     except OSError as error:
         raise UsageError(f"--record {path}: {error.strerror}") from error
-    with record:
+
+    def record(heard: Heard) -> None:
+        try:
+            file.write(f"{json_line(heard)}\n".encode())
+        except OSError as error:
+            raise TransportError(f"--record {path}: {error.strerror}") from error
+
+    with file:
         yield record
 
 

@@ -52,8 +52,15 @@ def pieces(heard: Heard) -> list[Piece]:
         return [(_clock(heard.time), "dim"), *where, _name(heard.type_name, "dim"), (f"schema {fields}", "cyan")]
     if isinstance(heard, Problem):
         return [("undecodable", "red"), (f"({heard.reason}):", ""), (_cut(heard.data.hex()) or "no bytes", "")]
-    words = _line(_members(heard.document, _NO_SHAPE, "", is_wrapped=False))
-    return [(words, "yellow" if heard.document.get("op") == "rejected" else "dim")]
+    return [(_line(_remark(heard.document)), "yellow" if heard.document["op"] == "rejected" else "dim")]
+
+
+def _remark(document: Mapping[str, Any]) -> Iterable[str]:
+    """Of topics their names."""
+    if not isinstance(rows := document.get("topics"), list):
+        return _members(document, _NO_SHAPE, "", is_wrapped=False)
+    names = (str(row["topic"]) for row in rows if isinstance(row, dict) and "topic" in row)
+    return [document["op"], f"{len(rows)}:", *names]
 
 
 def _clock(seconds: float) -> str:

@@ -90,6 +90,14 @@ def test_json_lines_are_printed_and_appended_to_a_file(gateway: socket.socket, t
     assert err == "2 messages, 1 schemas, 0 undecodable, 0 lost, 1 of other topics\n"
 
 
+def test_a_file_that_takes_no_more_ends_it(gateway: socket.socket) -> None:
+    with listening("--record", "/dev/full") as (process, address):
+        gateway.sendto(packet({"x": [1]}), address)
+        _, err = process.communicate(timeout=30)
+    assert err.splitlines()[-1] == "router listen: --record /dev/full: No space left on device"
+    assert process.returncode == 1
+
+
 def test_schemas_are_asked_for_from_the_port_on_which_it_listens(gateway: socket.socket) -> None:
     host, port = gateway.getsockname()
     with listening("--ask", f"{host}:{port}", "--count", "1") as (process, address):

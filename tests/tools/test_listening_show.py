@@ -74,6 +74,8 @@ def test_a_schema_is_shortened_to_its_fields() -> None:
 def test_what_else_is_heard_is_shown_too() -> None:
     refusal = {"op": "rejected", "reason": "invalid", "topic": "/imu"}
     assert line(Remark(refusal)) == "op=rejected reason=invalid topic=/imu"
+    topics = {"op": "topics", "time": 5.0, "topics": [{"topic": "/a", "rate": 1.0}, {"topic": "/b", "rate": 1.0}, None]}
+    assert line(Remark(topics)) == "topics 3: /a /b"
     assert line(Problem("no JSON", b"\xff\xff")) == "undecodable (no JSON): ffff"
     assert line(Problem("empty", b"")) == "undecodable (empty): no bytes"
 
