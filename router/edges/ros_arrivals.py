@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler, SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -42,8 +43,14 @@ class RawSubscription:
         event_callbacks: SubscriptionEventCallbacks | None = None,
     ) -> None:
         """Raises one of `ros_node.RCL_ERRORS`."""
-        subscription = node.create_subscription(  # the callback is an executor's to call, and there is none
-            message_class, topic, lambda _: None, qos, raw=True, event_callbacks=event_callbacks
+        subscription = node.create_subscription(
+            message_class,
+            topic,
+            lambda _: None,  # an executor's to call, and there is none
+            qos,
+            callback_group=ReentrantCallbackGroup(),  # the node's own keeps a little of each subscription for ever
+            event_callbacks=event_callbacks,
+            raw=True,
         )
         self.events: list[EventHandler] = subscription.event_handlers
         self.capacity: int = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else MOST_KEPT
