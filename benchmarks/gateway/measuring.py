@@ -33,20 +33,21 @@ def _percentiles(name: str, seconds: Sequence[float]) -> Metrics:
     return {f"{name}_ms_{label}": 1e3 * ordered[round(part * (len(ordered) - 1))] for label, part in places.items()}
 
 
-def _metrics(topics: Sequence[Topic], arrivals: Sequence[Arrival], seconds: float) -> Metrics:
-    """What came from each topic, beside what should have come in so many seconds."""
+def metrics(topics: Sequence[Topic], arrivals: Sequence[Arrival], seconds: float) -> Metrics:
+    """What came, beside what should have come in so many seconds. Ages are those of values that came first then."""
     counts = Counter(arrival.topic for arrival in arrivals)
-    wanted = {topic.name: min(topic.hertz, HERTZ) * seconds for topic in topics}
-    values = len({(arrival.topic, arrival.published) for arrival in arrivals})
+    wanted = HERTZ * seconds
+    fresh = [*{(arrival.topic, arrival.published): arrival for arrival in reversed(arrivals)}.values()]
     found = {
         "topics": len(topics),
         "served": len(counts),
-        "at_rate": sum(abs(counts[name] - count) <= 1 + 0.05 * count for name, count in wanted.items()),
+        "at_rate": sum(abs(counts[topic.name] - wanted) <= 1 + 0.05 * wanted for topic in topics),
         "packets_per_s": len(arrivals) / seconds,
-        "repeated": 1 - values / len(arrivals) if arrivals else 0.0,
+        "repeated": 1 - len(fresh) / len(arrivals) if arrivals else 0.0,
     }
-    found |= _percentiles("age", [arrival.sent - arrival.published for arrival in arrivals])
-    return found | _percentiles("transit", [arrival.received - arrival.sent for arrival in arrivals])
+    found |= _percentiles("arrival", [arrival.received - arrival.published for arrival in fresh])
+    found |= _percentiles("age", [arrival.sent - arrival.published for arrival in fresh])
+    return found | _percentiles("transit", [arrival.received - arrival.sent for arrival in fresh])
 
 
 def measure(contender: Contender, topics: Sequence[Topic], seconds: float, folder: Path) -> Metrics:
@@ -72,6 +73,6 @@ def measure(contender: Contender, topics: Sequence[Topic], seconds: float, folde
     elapsed = ended - began
     receiver.keep(began, ended)
     found = {"cpu_percent": meter.cpu_ns / elapsed / 1e7, "memory_mb": memory, "noise": meter.noise}
-    found |= _metrics(topics, [*receiver.arrivals(kinds)], elapsed)
+    found |= metrics(topics, [*receiver.arrivals(kinds)], elapsed)
     found["cpu_us_per_packet"] = 1e4 * found["cpu_percent"] / max(found["packets_per_s"], 1e-9)
     return found | {"kB_per_s": receiver.bytes() / elapsed / 1e3, "load_late_ms": loaded["latest_ms"]}

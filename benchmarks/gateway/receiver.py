@@ -35,6 +35,7 @@ class Receiver(AbstractContextManager["Receiver"]):
     """Keeps every datagram that comes to a port, until its context ends."""
 
     def __init__(self, port: int) -> None:
+        self.port = port
         self._datagrams: list[tuple[int, bytes]] = []
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         for option in (socket.SO_RCVBUF, 33):  # SO_RCVBUFFORCE, which takes a privilege
