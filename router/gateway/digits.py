@@ -3,7 +3,8 @@
 Florian Loitsch, "Printing Floating-Point Numbers Quickly and Accurately with Integers", PLDI 2010. The number and its
 two neighbours' midpoints are scaled by a power of ten, in 64 bits, rounded; the interval between the midpoints is
 narrowed by what that can be wrong by; the shortest decimal in it is taken, and moved towards the number. So it is
-nearly always what `repr` prints, but about one random double in 200 comes out longer, or in its last digit different.
+nearly always what `repr` prints; 3 in 1000 random doubles and up to 20 in 1000 random float32 come out otherwise, longer
+or different in the last digit.
 
 Integers stand for the scaled numbers, with `scale.places` decimal places and `scale.binary` binary ones.
 """
@@ -58,7 +59,7 @@ def power(exponent: int) -> tuple[int, int, int]:
 
 
 @cache
-def scale(exponent: int, size: int = 53) -> Scale:
+def scale(exponent: int, size: int) -> Scale:
     """For significands of `size` bits times 2**exponent."""
     shift = 64 - size
     significand, binary, decimal = power(exponent - shift)
@@ -70,6 +71,17 @@ def scale(exponent: int, size: int = 53) -> Scale:
     return Scale(significand << shift, _HALF + half, _HALF - half, 10**places, point, -decimal - places, places)
 
 
+class _Scales(dict[int, Scale]):
+    """By the double's 11 bits of exponent; for all significands of 53 bits."""
+
+    def __missing__(self, biased: int) -> Scale:
+        self[biased] = made = scale(biased - 1075, 53)
+        return made
+
+
+_SCALES = _Scales()
+
+
 def digits(fraction: int, biased: int) -> tuple[int, int]:
     """Decimal digits and the power of ten that the last of them stands for.
 
@@ -77,25 +89,22 @@ def digits(fraction: int, biased: int) -> tuple[int, int]:
     """
     if not biased or not fraction:
         return _unusual(fraction, biased)
-    factor, above, below, ten, binary, exponent, _ = scale(biased - 1075)
+    factor, above, below, ten, binary, exponent, _ = _SCALES[biased]
     number = (fraction | _HIDDEN) * factor
     high = (number + above >> 64) - 1
     width = (high - (number + below >> 64) - 1) * ten
     scaled = high * ten
     found = scaled >> binary
-    hundreds = found // 100
-    if scaled - (hundreds * 100 << binary) <= width:
+    rest = scaled - (found << binary)
+    last = found % 100
+    if rest + (last << binary) <= width:
         # The interval is narrower than 100, so this is the only such decimal in it: it ends in all zeros there are.
-        return _without_zeros(hundreds, exponent + 2)
+        return _without_zeros(found // 100, exponent + 2)
     unit = 1 << binary
-    tens = found // 10
-    rest = scaled - (tens * 10 << binary)
-    if rest <= width:
-        found, unit, exponent = tens, unit * 10, exponent + 1
-    else:
-        rest = scaled - (found << binary)
-    distance = (high - (number + _HALF >> 64)) * ten
-    return _nearer(found, rest, distance, width, unit), exponent
+    last = last % 10 << binary
+    if rest + last <= width:
+        found, rest, unit, exponent = found // 10, rest + last, unit * 10, exponent + 1
+    return _nearer(found, rest, (high - (number + _HALF >> 64)) * ten, width, unit), exponent
 
 
 def _without_zeros(number: int, exponent: int) -> tuple[int, int]:

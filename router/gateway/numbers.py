@@ -7,6 +7,7 @@ that is read once is likely to be read again (constants, stuck sensors, zeros), 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 from router.gateway.digits import digits
 
@@ -22,27 +23,16 @@ _FLOAT, _FLOAT_BITS, _DOUBLE, _DOUBLE_BITS = (struct.Struct(f"<{letter}") for le
 class Texts(dict[int, str]):
     """Texts of numbers by their bits, made when first asked for; forgets all when it holds many."""
 
-    def _keep(self, bits: int, text: str) -> str:
+    def __init__(self, text: Callable[[int], str]) -> None:
+        super().__init__()
+        self._text = text
+
+    def __missing__(self, bits: int) -> str:
+        text = self._text(bits)
         if len(self) >= _KEPT:
             self.clear()
         self[bits] = text
         return text
-
-
-class _DoubleTexts(Texts):
-    def __missing__(self, bits: int) -> str:
-        return self._keep(bits, double_text(bits))
-
-
-class _FloatTexts(Texts):
-    def __missing__(self, bits: int) -> str:
-        (number,) = _FLOAT.unpack(_FLOAT_BITS.pack(bits))
-        (wide,) = _DOUBLE_BITS.unpack(_DOUBLE.pack(number))
-        return self._keep(bits, DOUBLES[wide])
-
-
-DOUBLES: Texts = _DoubleTexts()
-FLOATS: Texts = _FloatTexts()
 
 
 def double_text(bits: int) -> str:
@@ -62,3 +52,12 @@ def double_text(bits: int) -> str:
         return f"{sign}0.{'0' * -point}{text}"
     rest = f".{text[1:]}" if len(text) > 1 else ""
     return f"{sign}{text[0]}{rest}e{point - 1:+03d}"
+
+
+def float_text(bits: int) -> str:
+    """The same for a float32 of these 32 bits, which is widened first: 0.1 is 0.10000000149011612."""
+    return double_text(_DOUBLE_BITS.unpack(_DOUBLE.pack(*_FLOAT.unpack(_FLOAT_BITS.pack(bits))))[0])
+
+
+DOUBLES = Texts(double_text)
+FLOATS = Texts(float_text)
