@@ -24,6 +24,9 @@ UNSENT = 128 * 1024
 STALLED_SECONDS = 60.0
 """A client that takes nothing for so long, while something waits for it, is closed."""
 
+SILENCE_SECONDS = 60.0
+"""A client whose computer confirms nothing for so long has gone."""
+
 Piece = Union[bytes, memoryview]
 
 
@@ -34,8 +37,8 @@ class Encoded(NamedTuple):
     size: int
 
 
-def prepare(transport: asyncio.Transport) -> socket.socket:
-    """Sets up a new client's connection, and returns its socket."""
+def prepare(transport: asyncio.Transport) -> None:
+    """Sets up a new client's connection."""
     transport.set_write_buffer_limits(0)  # so that each byte in the transport's own buffer is told
     connected: socket.socket = transport.get_extra_info("socket")
     connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -44,8 +47,7 @@ def prepare(transport: asyncio.Transport) -> socket.socket:
     connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 20)
     connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10)
-    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED_SECONDS * 1000))
-    return connected
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(SILENCE_SECONDS * 1000))
 
 
 def label(transport: asyncio.Transport) -> str:

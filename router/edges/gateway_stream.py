@@ -24,8 +24,8 @@ ACCEPTED_PER_TURN = 16
 """Connections that are accepted before other work of the loop has its turn."""
 
 
-class StreamClient(Client):
-    """A client that has an outflow. `encode` is its transport's."""
+class StreamClient:
+    """A Client that has an outflow. `encode` is its transport's."""
 
     label: str
     outflow: Outflow
@@ -36,6 +36,9 @@ class StreamClient(Client):
 
     def backlog(self) -> int:
         return self.outflow.backlog()
+
+    @abstractmethod
+    def close(self) -> None: ...
 
 
 class StreamTransport:
