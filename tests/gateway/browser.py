@@ -1,0 +1,164 @@
+"""Headless Chromium over the DevTools protocol, as far as the tests of the gateway's page need it."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import itertools
+import json
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+PATIENCE = 10.0
+"""Seconds after which what a test waits for is taken to never come."""
+
+
+def executable() -> str | None:
+    """The browser's program; None where there is none."""
+    return next((path for path in map(shutil.which, NAMES) if path), None)
+
+
+class Browser:
+    """One running browser. Pages are opened in it; `profile` is a folder of its own."""
+
+    def __init__(self, program: str, profile: Path) -> None:
+        flags = ("--headless=new", "--no-sandbox", "--remote-debugging-port=0", f"--user-data-dir={profile}")
+        quiet = ("--no-first-run", "--disable-gpu", "--disable-background-networking", "--disable-dev-shm-usage")
+        log = (profile / "log.txt").open("wb")
+        with log:
+            self._process = subprocess.Popen([program, *flags, *quiet, "about:blank"], stdout=log, stderr=log)
+        self._stack = contextlib.ExitStack()
+        self._connection = self._stack.enter_context(self._connect(profile / "DevToolsActivePort"))
+        self._ids = itertools.count(1)
+        self.events: list[dict[str, Any]] = []
+
+    def _connect(self, file: Path) -> contextlib.AbstractContextManager[ClientConnection]:
+        """The browser writes its port, and the path to connect to, into a file when it is ready."""
+        until = time.monotonic() + PATIENCE
+        while not (file.exists() and file.read_text(encoding="ascii").count("\n")):
+            assert self._process.poll() is None, "the browser has ended"
+            assert time.monotonic() < until, "the browser does not start"
+            time.sleep(0.05)
+        port, path = file.read_text(encoding="ascii").splitlines()
+        return connect(f"ws://127.0.0.1:{port}{path}", max_size=None, proxy=None)
+
+    def call(self, method: str, session: str | None = None, /, **parameters: Any) -> dict[str, Any]:
+        """The answer to one command. What happens meanwhile is kept in `events`."""
+        number = next(self._ids)
+        request = {"id": number, "method": method, "params": parameters}
+        self._connection.send(json.dumps(request if session is None else {**request, "sessionId": session}))
+        while True:
+            answer = json.loads(self._connection.recv(timeout=PATIENCE))
+            if answer.get("id") == number:
+                assert "error" not in answer, f"{method}: {answer['error']}"
+                result: dict[str, Any] = answer["result"]
+                return result
+            self.events.append(answer)
+
+    def open(self, url: str, width: int = 1366, height: int = 768) -> Page:
+        """A new page with the size of a laptop's, in front of all others."""
+        target = self.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        page = Page(self, session, target)
+        for domain in ("Page", "Runtime", "Log"):
+            page.call(f"{domain}.enable")
+        page.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        page.call("Emulation.setFocusEmulationEnabled", enabled=True)
+        page.go(url)
+        return page
+
+    def close(self) -> None:
+        self._stack.close()
+        self._process.terminate()
+        self._process.wait(PATIENCE)
+
+
+class Page:
+    """One page of a browser. Expressions are JavaScript."""
+
+    def __init__(self, browser: Browser, session: str, target: str) -> None:
+        self._browser = browser
+        self._session = session
+        self._target = target
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        return self._browser.call(method, self._session, **parameters)
+
+    def go(self, url: str) -> None:
+        self.call("Page.navigate", url=url)
+        self.until(f"document.readyState === 'complete' && location.href.startsWith({json.dumps(url)})")
+
+    def evaluate(self, expression: str) -> Any:
+        """Its value, as JSON. An exception in the page is one here."""
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, f"{expression}: {answer['exceptionDetails']}"
+        return answer["result"].get("value")
+
+    def until(self, expression: str) -> Any:
+        """The expression's value as soon as it is true."""
+        until = time.monotonic() + PATIENCE
+        while not (value := self.evaluate(expression)):
+            assert time.monotonic() < until, f"never: {expression}\n{self.evaluate('document.body.innerText')}"
+            time.sleep(0.03)
+        return value
+
+    def text(self, selector: str) -> str:
+        """What a person reads there."""
+        return str(self.evaluate(f"document.querySelector({json.dumps(selector)}).innerText"))
+
+    def press_mouse(self, selector: str) -> None:
+        self._mouse("mousePressed", selector)
+
+    def release_mouse(self, selector: str) -> None:
+        self._mouse("mouseReleased", selector)
+
+    def click(self, selector: str) -> None:
+        self.press_mouse(selector)
+        self.release_mouse(selector)
+
+    def _mouse(self, kind: str, selector: str) -> None:
+        element = f"document.querySelector({json.dumps(selector)})"
+        self.until(f"{element}?.checkVisibility() ?? false")
+        place = f"(e => {{ e.scrollIntoView({{block: 'nearest'}}); return e.getBoundingClientRect().toJSON(); }})({element})"
+        box = self.evaluate(place)
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def key(self, key: str) -> None:
+        """One key pressed and released, by its name as of KeyboardEvent.key."""
+        text = {"text": "\r"} if key == "Enter" else {"text": key} if len(key) == 1 else {}
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, **(text if kind == "keyDown" else {}))
+
+    def type(self, selector: str, text: str) -> None:
+        """Types over what is in the field."""
+        self.click(selector)
+        self.evaluate(f"document.querySelector({json.dumps(selector)}).select()")
+        self.call("Input.insertText", text=text)
+
+    def prefer(self, scheme: str) -> None:
+        """`light` or `dark`."""
+        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+
+    def screenshot(self, file: Path) -> None:
+        file.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
+
+    def complaints(self) -> list[str]:
+        """Errors and exceptions that the browser reported for this page so far, a refused icon apart."""
+        self.evaluate("0")
+        mine = [event for event in self._browser.events if event.get("sessionId") == self._session]
+        logged = [event["params"]["entry"] for event in mine if event["method"] == "Log.entryAdded"]
+        errors = [f"{entry['text']} {entry.get('url', '')}" for entry in logged if entry["level"] == "error"]
+        thrown = [
+            str(event["params"]["exceptionDetails"]) for event in mine if event["method"] == "Runtime.exceptionThrown"
+        ]
+        return [error for error in errors if "favicon" not in error] + thrown
+
+    def close(self) -> None:
+        self._browser.call("Target.closeTarget", targetId=self._target)

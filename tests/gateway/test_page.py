@@ -1,0 +1,512 @@
+"""The page of a websocket gateway, in a real browser, as a person uses it."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.gateway.browser import Browser, Page, executable
+from tests.gateway.fake_gateway import MIXED, PAGE, FakeGateway, data_document, field, schema
+
+PROGRAM = executable()
+pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only")
+
+HOSTILE = '<img src=x onerror="window.hacked=1">'
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    assert PROGRAM is not None
+    running = Browser(PROGRAM, tmp_path_factory.mktemp("chromium"))
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[FakeGateway]:
+    """One for all tests: browsers hold a spare connection open, and closing a server waits for those."""
+    running = FakeGateway()
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def gateway(server: FakeGateway) -> FakeGateway:
+    server.reset()
+    return server
+
+
+@pytest.fixture
+def page(browser: Browser, gateway: FakeGateway) -> Iterator[Page]:
+    """The page, connected. Whatever a test does with it, nothing in it may fail or break its policy."""
+    opened = browser.open(gateway.url)
+    opened.until("document.querySelector('#state').textContent === 'connected'")
+    yield opened
+    complaints = [text for text in opened.complaints() if "WebSocket connection" not in text]
+    opened.close()
+    assert complaints == []
+
+
+def row(name: str) -> str:
+    """JavaScript for the row of a topic; null if there is none."""
+    return f"([...document.querySelectorAll('tbody tr')].find(r => r.querySelector('.name').textContent === {json.dumps(name)}) ?? null)"
+
+
+def choose(page: Page, name: str) -> None:
+    page.until(f"{row(name)} !== null")
+    page.evaluate(f"{row(name)}.querySelector('.name').click()")
+    page.until(f"document.querySelector('#chosen').textContent === {json.dumps(name)}")
+
+
+def tick(page: Page, topic: str, path: str) -> None:
+    """Clicks on the number in the tree, when it is there."""
+    box = f"[data-plot={json.dumps(topic + ':' + path)}]"
+    page.until(f"document.querySelector({json.dumps(box)}) !== null")
+    page.click(box)
+
+
+def received(gateway: FakeGateway) -> dict[str, Any]:
+    return gateway.received.get(timeout=20)
+
+
+# Topics
+
+
+def test_topics_are_listed_with_type_rate_age_and_value(gateway: FakeGateway, page: Page) -> None:
+    gateway.list_topics(["/imu"], rate=49.97)
+    gateway.data("/imu", {"linear": {"x": 0.10000000149011612}, "frame_id": "base"})
+    text = page.until(f"{row('/imu')}?.innerText.includes('linear') && {row('/imu')}.innerText")
+    assert "sensor_msgs/msg/Imu" in text
+    assert "50.0 Hz" in text
+    assert re.search(r"\d\.\d s", text)
+    assert '{linear: {x: 0.1}, frame_id: "base"}' in text
+
+
+def test_documents_of_one_message_are_separated_by_newlines(gateway: FakeGateway, page: Page) -> None:
+    gateway.say(data_document("/b", {"x": 1}), data_document("/a", {"x": 2}))
+    page.until(f"{row('/a')} !== null && {row('/b')} !== null")
+    names = page.evaluate("[...document.querySelectorAll('.name')].map(e => e.textContent)")
+    assert names == ["/a", "/b"]
+
+
+def test_a_document_with_its_keys_in_another_order_is_understood(gateway: FakeGateway, page: Page) -> None:
+    gateway.say('{"data": {"id": 18446744073709551615}, "time": 1.5, "type": "a/msg/B", "topic": "/a", "op": "data"}')
+    page.until(f"{row('/a')}?.innerText.includes('18446744073709551615')")
+
+
+def test_the_filter_wants_all_its_words_in_name_or_type(gateway: FakeGateway, page: Page) -> None:
+    gateway.list_topics(["/loki_1/imu", "/loki_1/odom", "/loki_2/imu"])
+    page.until("document.querySelectorAll('tbody tr').length === 3")
+    page.type("#filter", "ODOM loki_1")
+    page.until("document.querySelectorAll('tbody tr').length === 1")
+    assert page.text("tbody .name") == "/loki_1/odom"
+    assert page.text("#count") == "1 of 3"
+
+
+def test_a_topic_that_stops_is_stale_and_one_that_left_the_list_is_gone(gateway: FakeGateway, page: Page) -> None:
+    gateway.list_topics(["/imu", "/once"])
+    gateway.data("/once", {"x": 0})
+    for value in range(4):
+        gateway.data("/imu", {"x": value})
+        time.sleep(0.1)
+    page.until(f"{row('/imu')}.className === 'stale'")
+    assert page.evaluate(f"{row('/once')}.className") == ""
+    gateway.list_topics(["/once"])
+    page.until(f"{row('/imu')}.className === 'gone' && {row('/imu')}.innerText.includes('gone')")
+    gateway.list_topics(["/imu", "/once"])
+    gateway.data("/imu", {"x": 9})
+    page.until(f"{row('/imu')}.className === ''")
+
+
+def test_only_rows_in_sight_are_rendered(gateway: FakeGateway, page: Page) -> None:
+    names = [f"/topic_{number:03}" for number in range(300)]
+    gateway.list_topics(names)
+    gateway.say(*(data_document(name, {"x": 7}) for name in names))
+    page.until(f"{row(names[0])}?.innerText.includes('x: 7')")
+    assert page.evaluate("[...document.querySelectorAll('.preview')].filter(e => e.textContent).length") < 40
+    page.evaluate("document.querySelector('#rows').scrollTop = 1e6")
+    page.until(f"{row(names[-1])}.innerText.includes('x: 7')")
+
+
+# The tree and the plot
+
+
+def test_the_tree_shows_the_full_value_and_follows_it(gateway: FakeGateway, page: Page) -> None:
+    covariance = [0.5, None, 2.0]
+    value = {
+        "linear": {"x": 1.5},
+        "id": 2**63 + 1,
+        "on": True,
+        "covariance": covariance,
+        "text": "",
+        "points": [{"y": 3}],
+    }
+    gateway.data("/imu", value)
+    choose(page, "/imu")
+    page.until("document.querySelector('#tree').innerText.includes('x: 1.5')")
+    text = page.text("#tree")
+    for line in ("id: 9223372036854775809", "on: true", "[1]: null (NaN or infinite)", "[2]: 2", 'text: ""', "y: 3"):
+        assert line in text
+    gateway.data("/imu", {**value, "linear": {"x": 2.5}, "covariance": []})
+    page.until("document.querySelector('#tree').innerText.includes('x: 2.5')")
+    assert "[2]" not in page.text("#tree")
+
+
+def test_long_arrays_are_opened_in_parts(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/scan", {"ranges": [n / 8 for n in range(10_000)], "text": "x" * 100_000})
+    choose(page, "/scan")
+    page.until("document.querySelector('#tree').innerText.includes('[10000]')")
+    assert page.evaluate("document.querySelectorAll('#tree *').length") < 100
+    page.click("#tree details details summary")
+    page.until("document.querySelectorAll('#tree input').length === 100")
+    page.click("#tree .more:not([hidden])")
+    page.until("document.querySelectorAll('#tree input').length === 200")
+    assert "… (100000 characters)" in page.text("#tree")
+
+
+def coloured(page: Page, colour: str) -> list[int]:
+    """Columns of the canvas that have a pixel in one of the plot's colours, within the axes."""
+    page.evaluate("render()")
+    expression = f"""(() => {{
+        const canvas = document.querySelector('canvas'), probe = document.createElement('canvas').getContext('2d');
+        probe.fillStyle = getComputedStyle(canvas).getPropertyValue({json.dumps(colour)}); probe.fillRect(0, 0, 1, 1);
+        const [r, g, b] = probe.getImageData(0, 0, 1, 1).data, {{width, height}} = canvas;
+        const pixels = canvas.getContext('2d').getImageData(0, 0, width, height).data, columns = [];
+        for (let x = 0; x < width; x++) for (let y = 0; y < height; y++) {{
+            const at = 4 * (y * width + x);
+            if (pixels[at] === r && pixels[at + 1] === g && pixels[at + 2] === b) {{ columns.push(x); break; }}
+        }}
+        return columns;
+    }})()"""
+    columns: list[int] = page.evaluate(expression)
+    return columns
+
+
+def test_chosen_numbers_are_plotted_with_their_bounds(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/imu", {"linear": {"x": 1}, "ranges": [0, 8]})
+    choose(page, "/imu")
+    tick(page, "/imu", "linear.x")
+    tick(page, "/imu", "ranges[1]")
+    for value in range(6):
+        gateway.data("/imu", {"linear": {"x": value}, "ranges": [0, 8]})
+    page.until("document.querySelector('#legend').innerText.includes('/imu linear.x: 5 (min 0, max 5)')")
+    assert "/imu ranges[1]: 8 (min 8, max 8)" in page.text("#legend")
+    assert coloured(page, "--plot-0")
+    assert coloured(page, "--plot-1")
+    assert "linear.x: 5 (min 0, max 5)" in page.evaluate("document.querySelector('canvas').getAttribute('aria-label')")
+    page.click("#legend button")
+    page.until("document.querySelectorAll('#legend li').length === 1")
+    assert coloured(page, "--plot-0") == []
+    assert page.evaluate("document.querySelectorAll('#tree input:checked').length") == 1
+
+
+def test_a_gap_in_the_values_is_a_gap_in_the_plot(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/imu", {"x": 1.0})
+    choose(page, "/imu")
+    tick(page, "/imu", "x")
+    # Three stretches of a minute, without waiting for one: a value every half second, silence, values, NaN, values.
+    page.evaluate("""(() => {
+        const [series] = plots.values(), now = performance.now();
+        series.topic.period = 500;
+        Object.assign(series, { times: [], values: [], start: 0 });
+        for (let ago = 55; ago >= 0; ago -= 0.5) {
+            if (ago < 40 && ago > 30) continue;
+            series.times.push(now - ago * 1000);
+            series.values.push(ago === 10 ? NaN : 5);
+        }
+    })()""")
+    columns = coloured(page, "--plot-0")
+    steps = [after - before for before, after in zip(columns, columns[1:], strict=False)]
+    second = (columns[-1] - columns[0]) / 55
+    wide = [step / second for step in steps if step > 1]
+    assert [round(width) for width in wide] == [10, 1]
+
+
+def test_a_topic_plotted_stays_plotted_while_another_is_looked_at(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/a", {"x": 1})
+    gateway.data("/b", {"y": 1})
+    choose(page, "/a")
+    tick(page, "/a", "x")
+    choose(page, "/b")
+    gateway.data("/a", {"x": 4})
+    page.until("document.querySelector('#legend').innerText.includes('/a x: 4 (min 1, max 4)')")
+
+
+@pytest.mark.parametrize("values", [[1e308, -1e308], [5e-324, 0.0], [1e9, 1e9 + 1e-7], [None], [2**64 - 1]])
+def test_extreme_numbers_are_plotted(gateway: FakeGateway, page: Page, values: list[float]) -> None:
+    gateway.data("/a", {"x": values[0]})
+    choose(page, "/a")
+    tick(page, "/a", "x")
+    for value in values:
+        gateway.data("/a", {"x": value})
+    gateway.data("/done", {})
+    page.until(f"{row('/done')} !== null")
+    page.evaluate("render()")
+    assert "undefined" not in page.text("#legend")
+
+
+def test_the_address_keeps_what_is_chosen(browser: Browser, gateway: FakeGateway) -> None:
+    opened = browser.open(f"{gateway.url}?topic=/imu&field=linear.x&plot=/odom:list[1]")
+    opened.until("document.querySelector('#state').textContent === 'connected'")
+    gateway.list_topics(["/imu", "/odom"])
+    gateway.say(data_document("/imu", {"linear": {"x": 3}}), data_document("/odom", {"list": [1, 2]}))
+    opened.until("/linear.x: 3 .*list.1.: 2 /s.test(document.querySelector('#legend').innerText)")
+    tick(opened, "/imu", "linear.x")
+    opened.until("!location.hash.includes('field')")
+    opened.call("Page.reload")
+    opened.until(
+        "document.querySelector('#legend li') !== null && document.querySelector('#chosen').textContent === '/imu'"
+    )
+    assert opened.evaluate("[...plots.keys()]") == ["/odom:list[1]"]
+    opened.close()
+
+
+# Sending
+
+
+def test_the_form_starts_at_the_defaults_and_sends_what_was_typed(gateway: FakeGateway, page: Page) -> None:
+    before = time.time()
+    page.type("[data-field='linear.x']", "0,25")
+    page.type("[data-field='angular.z']", "-1")
+    page.click("[form=form]")
+    sent = received(gateway)
+    assert before - 1 <= sent.pop("time") <= time.time() + 1
+    data = {"linear": {"x": 0.25, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": -1}}
+    assert sent == {"op": "publish", "topic": "/cmd_vel", "type": "geometry_msgs/msg/Twist", "data": data}
+    page.until("document.querySelector('#sent').textContent.startsWith('Sent 1, none refused.')")
+
+
+def test_every_kind_of_field_can_be_filled_in_and_integers_are_exact(gateway: FakeGateway, page: Page) -> None:
+    choose_target(page, "/mode")
+    page.click("[data-field=is_armed]")
+    page.type("[data-field=name]", HOSTILE)
+    page.type("[data-field=level]", "007")
+    page.type("[data-field=id]", str(2**64 - 1))
+    page.type("[data-field=gains]", "[1, 2.5]")
+    page.key("Tab")
+    page.click("[form=form]")
+    expected = {"is_armed": True, "name": HOSTILE, "level": 7, "id": 2**64 - 1, "gains": [1, 2.5]}
+    assert received(gateway)["data"] == expected
+    page.click("#as-json")
+    assert json.loads(page.evaluate("document.querySelector('#json').value")) == expected
+    page.click("[form=form]")
+    assert received(gateway)["data"] == expected
+    page.click("#as-json")
+    page.click("[form=form]")
+    assert received(gateway)["data"] == expected
+
+
+def choose_target(page: Page, topic: str) -> None:
+    page.evaluate(
+        f"(e => {{ e.value = {json.dumps(topic)}; e.dispatchEvent(new Event('change')); }})(document.querySelector('#target'))"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "problem"),
+    [
+        ("level", "256", "level: must be from 0 to 255"),
+        ("level", "1.5", "level: must be a whole number"),
+        ("level", "", "level: must be a number"),
+        ("id", "18446744073709551616", "id: must be from 0 to 18446744073709551615"),
+        ("gains", "[1, 1e39]", "gains[1]: is too large for a float32"),
+        ("gains", "[1, null]", "gains[1]: must be a number"),
+        ("gains", "1", "gains: must be an array"),
+        ("gains", "[1", "gains: must be an array"),
+    ],
+)
+def test_what_does_not_fit_is_not_sent(gateway: FakeGateway, page: Page, name: str, text: str, problem: str) -> None:
+    choose_target(page, "/mode")
+    page.type(f"[data-field={name}]", text)
+    page.key("Enter") if name != "gains" else page.click("[form=form]")
+    page.until(f"document.querySelector('#sent').textContent.includes({json.dumps('Not sent. ' + problem)})")
+    assert page.evaluate(f"document.querySelector('[data-field={name}]').ariaInvalid") == "true"
+    assert gateway.received.empty()
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"extra": 1}, "extra: there is no such field"),
+        ({"name": 5}, "name: must be text"),
+        ({"is_armed": 1}, "is_armed: must be true or false"),
+    ],
+)
+def test_json_that_does_not_fit_is_not_sent(
+    gateway: FakeGateway, page: Page, change: dict[str, Any], problem: str
+) -> None:
+    choose_target(page, "/mode")
+    page.click("#as-json")
+    page.type("#json", json.dumps({**MIXED["example"], **change}))  # type: ignore[dict-item]
+    page.click("[form=form]")
+    page.until(f"document.querySelector('#sent').textContent.includes({json.dumps('Not sent. ' + problem)})")
+    assert gateway.received.empty()
+
+
+def test_a_message_is_repeated_while_the_box_is_ticked(gateway: FakeGateway, page: Page) -> None:
+    page.type("#rate", "50")
+    page.click("#repeat")
+    assert [received(gateway)["topic"] for _ in range(5)] == ["/cmd_vel"] * 5
+    page.click("#repeat")
+    assert page.evaluate("repeating") == 0
+
+
+def test_edits_are_repeated_only_when_they_are_complete(gateway: FakeGateway, page: Page) -> None:
+    page.type("#rate", "50")
+    page.click("#repeat")
+    page.type("[data-field='linear.x']", "15")
+    assert {received(gateway)["data"]["linear"]["x"] for _ in range(20)} == {0}
+    page.key("Tab")
+    while received(gateway)["data"]["linear"]["x"] != 15:
+        pass
+    page.type("[data-field='linear.x']", "oops")
+    page.key("Tab")
+    page.until("repeating === 0 && !document.querySelector('#repeat').checked")
+
+
+def test_a_message_is_repeated_while_the_button_is_held(gateway: FakeGateway, page: Page) -> None:
+    page.type("#rate", "50")
+    page.press_mouse("#hold")
+    for _ in range(5):
+        received(gateway)
+    page.release_mouse("#hold")
+    assert page.evaluate("repeating") == 0
+
+
+def test_a_refusal_is_shown_with_reason_and_detail(gateway: FakeGateway, page: Page) -> None:
+    page.click("[form=form]")
+    received(gateway)
+    gateway.say({"op": "rejected", "reason": "stale", "detail": f"0.5 s old {HOSTILE}", "topic": "/cmd_vel"})
+    page.until("document.querySelector('#sent').textContent.includes('refused 1. Refused: stale. 0.5 s old <img')")
+    assert page.evaluate("document.querySelector('#sent').className") == "bad"
+
+
+def test_a_wrong_clock_is_pointed_out(gateway: FakeGateway, page: Page) -> None:
+    gateway.clock_error = 30.0
+    page.until("document.querySelector('#clock').innerText.includes('30 s behind')")
+
+
+def test_a_gateway_that_lets_nothing_in_has_no_form(browser: Browser, gateway: FakeGateway) -> None:
+    gateway.inbound = []
+    opened = browser.open(gateway.url)
+    opened.until("document.querySelector('#state').textContent === 'connected'")
+    assert opened.evaluate("document.querySelector('#send').checkVisibility()") is False
+    opened.close()
+
+
+# The connection
+
+
+def test_the_page_reconnects_and_keeps_what_was_typed(gateway: FakeGateway, page: Page) -> None:
+    gateway.list_topics(["/imu"])
+    page.type("[data-field='linear.x']", "0.75")
+    page.click("#repeat")
+    received(gateway)
+    gateway.go_down()
+    page.until("document.querySelector('#state').textContent.startsWith('no connection')")
+    assert page.evaluate("document.querySelector('[form=form]').disabled") is True
+    assert page.evaluate("repeating") == 0
+    gateway.reset()
+    page.until("document.querySelector('#state').textContent === 'connected'")
+    page.click("[form=form]")
+    assert received(gateway)["data"]["linear"]["x"] == 0.75
+
+
+def test_a_connection_that_is_silent_is_opened_anew(gateway: FakeGateway, page: Page) -> None:
+    first = set(gateway.clients)
+    page.evaluate("heardAt -= 60000")
+    page.until("document.querySelector('#state').textContent === 'connected'")
+    page.evaluate("heardAt -= 60000; render()")
+    page.until("document.querySelector('#state').textContent === 'connected' && !retryAt")
+    assert not first & gateway.clients
+
+
+def test_what_cannot_be_read_is_counted_and_ends_nothing(gateway: FakeGateway, page: Page) -> None:
+    gateway.say(
+        "{",
+        "null",
+        '{"op":"topics"}',
+        '{"op":"unheard of"}',
+        '{"op":"data","topic":"/x","type":"t","time":1,"data":{x}}',
+    )
+    choose(page, "/x")
+    page.until("document.querySelector('#tree').innerText === 'This value cannot be read.'")
+    page.until("document.querySelector('#traffic').textContent.includes('3 unreadable so far')")
+
+
+# Safety, looks and hands
+
+
+def test_hostile_text_stays_text(browser: Browser, gateway: FakeGateway) -> None:
+    evil = {
+        "topic": f"/{HOSTILE}",
+        "type": HOSTILE,
+        "schema": schema(HOSTILE, field(HOSTILE, "string")),
+        "example": {HOSTILE: HOSTILE},
+    }
+    gateway.inbound = [evil]
+    page = browser.open(gateway.url)
+    page.until("document.querySelector('#state').textContent === 'connected'")
+    gateway.list_topics([HOSTILE], type_name=HOSTILE)
+    gateway.data(HOSTILE, {HOSTILE: HOSTILE, "n": {"__proto__": 1}, "constructor": [1]}, type_name=HOSTILE)
+    choose(page, HOSTILE)
+    tick(page, HOSTILE.replace('"', '\\"') and HOSTILE, "constructor[0]")
+    page.click("[form=form]")
+    gateway.say({"op": "rejected", "reason": HOSTILE, "detail": HOSTILE, "topic": HOSTILE})
+    page.until("document.querySelector('#sent').textContent.includes('onerror')")
+    assert page.evaluate("document.querySelectorAll('img').length") == 0
+    assert page.evaluate("window.hacked ?? null") is None
+    assert page.complaints() == []
+    page.close()
+
+
+def test_nothing_comes_from_elsewhere() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert not re.search(
+        r"https?://|\bsrc=|\bhref=|@import|url\(|\beval\(|innerHTML|insertAdjacentHTML|document\.write", text
+    )
+
+
+def test_topics_are_found_and_chosen_with_the_keyboard(gateway: FakeGateway, page: Page) -> None:
+    gateway.list_topics(["/a/imu", "/b/imu", "/b/odom"])
+    page.until("document.querySelectorAll('tbody tr').length === 3")
+    for key in ("/", "b", "ArrowDown", "ArrowDown", "Enter"):
+        page.key(key)
+    page.until("document.querySelector('#chosen').textContent === '/b/odom'")
+
+
+def test_every_control_has_a_name_for_assistive_technology(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/imu", {"x": 1, "list": [1]})
+    choose(page, "/imu")
+    choose_target(page, "/mode")
+    page.call("Accessibility.enable")
+    nodes = page.call("Accessibility.getFullAXTree")["nodes"]
+    controls = {"button", "checkbox", "combobox", "image", "searchbox", "spinbutton", "textbox"}
+    roles = [
+        (node["role"]["value"], node["name"]["value"])
+        for node in nodes
+        if node.get("role", {}).get("value") in controls
+    ]
+    assert {role for role, _ in roles} >= {
+        "button",
+        "checkbox",
+        "combobox",
+        "image",
+        "searchbox",
+        "spinbutton",
+        "textbox",
+    }
+    assert [role for role, name in roles if not name.strip()] == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_follows_the_colour_scheme(page: Page, scheme: str) -> None:
+    page.prefer(scheme)
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, re.findall(r"\d+", ground))) > 600) is (scheme == "light")
