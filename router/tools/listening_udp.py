@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import struct
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
-from router.edges.udp import SO_MEMINFO
+from router.edges.udp import SO_MEMINFO, SO_RCVBUFFORCE
 from router.gateway.packets import Packet, pack
 from router.table.model import Address
 from router.tools import places
@@ -15,6 +17,8 @@ from router.tools.listening import Arrival
 
 _RECEIVE_BUFFER = 4 << 20
 """Bytes that the kernel is asked to keep while we are busy; it may grant less."""
+
+_MOST_AT_ONCE = 1000
 
 _MEMINFO = struct.Struct("9I")
 _DROPS = 8
@@ -26,6 +30,8 @@ class UdpSource:
     def __init__(self, address: Address, gateway: Address | None, say: Callable[[str], None]) -> None:
         self._socket = places.open_udp(address, "listen")
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        with suppress(PermissionError):  # root gets all of it
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, _RECEIVE_BUFFER)
         self._gateway = gateway
         self._say = say
         self.place = f"udp {Address(*self._socket.getsockname())}"
@@ -47,12 +53,13 @@ class UdpSource:
             self._say(f"cannot ask {self._gateway}: {error.strerror}")
 
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
-        self._socket.settimeout(timeout)
-        try:
-            data, peer = self._socket.recvfrom(places.LARGEST_DATAGRAM)
-        except TimeoutError:
-            return ()
-        return (Arrival(data, peer),)
+        """All that is there at once: a large message comes as more datagrams than the kernel keeps."""
+        found: list[Arrival] = []
+        if select.select([self._socket], [], [], timeout)[0]:
+            with suppress(BlockingIOError):
+                while len(found) < _MOST_AT_ONCE:
+                    found.append(Arrival(*self._socket.recvfrom(places.LARGEST_DATAGRAM)))
+        return found
 
     def close(self) -> None:
         self._socket.close()
