@@ -26,7 +26,7 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
     if pattern.is_regex:
         try:
             re.compile(pattern.text)
-        except (re.error, OverflowError) as error:
+        except (re.error, OverflowError, RecursionError) as error:
             return PatternProblem(
                 f"'{pattern.text}' is not a regular expression: {error}",
                 "regular expressions are Python's, and match whole names",

@@ -168,6 +168,7 @@ def test_the_first_rate_that_matches_counts_and_others_have_the_publish_period()
         ("re:(", "is not a regular expression"),
         ("re:*", "is not a regular expression"),
         ("re:a{99999999999999999999}", "is not a regular expression"),
+        pytest.param(f"re:{'(' * 9000}{')' * 9000}", "is not a regular expression", id="deep"),
     ],
 )
 def test_what_is_no_pattern_is_said(text: str, what: str) -> None:
