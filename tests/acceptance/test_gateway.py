@@ -6,7 +6,7 @@ import json
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -227,7 +227,7 @@ def test_what_no_datagram_carries_is_counted_and_what_does_goes_on(tmp_path: Pat
         assert "gateway_v2" in now.router.text()
 
 
-def lines(opened: socket.socket) -> Iterator[dict[str, Any]]:
+def lines(opened: socket.socket) -> Generator[dict[str, Any], None, None]:
     with opened.makefile("r", encoding="utf-8") as text:
         for line in text:
             yield json.loads(line)
@@ -244,6 +244,7 @@ def test_a_logger_gets_every_message_in_order(tmp_path: Path) -> None:
                 now.speaker.say("/gw/number", {"data": number})
             assert next(received)["op"] == "schema"
             assert [next(received)["data"] for _ in range(100)] == [{"data": number} for number in range(100)]
+            received.close()  # which has the socket open as well
         wait_until(lambda: now.site.samples()['gateway_clients{route="logger"}'] == 0, "the client to be gone")
 
 
@@ -275,14 +276,15 @@ class Dashboard:
     """A client of the websocket gateway."""
 
     def __init__(self, scene: Scene) -> None:
-        self._connection = connect(f"ws://127.0.0.5:{scene.port}/", open_timeout=PATIENCE)
+        self._connecting = connect(f"ws://127.0.0.5:{scene.port}/", open_timeout=PATIENCE)
         self._waiting: list[dict[str, Any]] = []
 
     def __enter__(self) -> Dashboard:
+        self._connection = self._connecting.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._connection.close()
+        self._connecting.__exit__(None, None, None)
 
     def next(self, op: str, wanted: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
         deadline = time.monotonic() + PATIENCE
