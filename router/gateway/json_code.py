@@ -13,15 +13,13 @@ from typing import NoReturn
 
 from router.compiler.cdr.steps import CDR_LE, scalar_format
 from router.gateway.json_layout import CdrLines
-from router.gateway.json_lists import SHORT_LISTS, STRINGS, WIDE_LISTS, WIDE_STRINGS, cut_off, joined, list_text
+from router.gateway.json_lists import SHORT, SHORT_LISTS, STRINGS, WIDE_LISTS, WIDE_STRINGS, cut_off, joined, list_text
 from router.gateway.numbers import DOUBLES, FLOATS
 from router.gateway.style import PLACEHOLDER, Style, UnreadableError
 from router.types.model import Bool, Float, List, MessageType, String, Type
 
 JsonWriter = Callable[[bytes], str]
 
-_LONGEST_SHORT = 512
-"""Bytes of an array that is looked up as a whole."""
 _LETTERS = {"?": "bool", "b": "int8", "B": "uint8", "h": "int16", "H": "uint16", "i": "int32", "I": "uint32",
             "q": "int64", "Q": "uint64", "f": "float32", "d": "float64"}  # fmt: skip
 
@@ -123,7 +121,7 @@ class JsonCode:
             return self._elements(declared)
         letter = scalar_format(declared.element)
         name, size = _LETTERS[letter], struct.calcsize(letter)
-        if declared.length is not None and declared.length * size <= _LONGEST_SHORT:
+        if declared.length is not None and declared.length * size <= SHORT:
             return f"{{short_{name}[{self._out.take(f'{declared.length * size}s', size)}]}}"
         self._out.read()
         start = self._out.stretch(self._count() if declared.length is None else declared.length, size)

@@ -18,8 +18,10 @@ from router.gateway.style import UnreadableError
 
 _MOST = 4096
 """Elements a call."""
-_LONGEST, _KEPT = 512, 2048
-"""Bytes of what is kept, and how many of a kind."""
+SHORT = 320
+"""Bytes of a list that is looked up as a whole: so much takes a covariance of six by six."""
+_KEPT = 1024
+"""Texts of a kind."""
 _LARGEST_UNIT = 0xFFFF
 _quote = json.JSONEncoder(ensure_ascii=False).encode
 _Convert = Callable[[bytes], str]
@@ -36,7 +38,7 @@ class KnownTexts(dict[bytes, str]):
 
     def __missing__(self, data: bytes) -> str:
         text = self._convert(data)
-        if len(data) <= _LONGEST:
+        if len(data) <= SHORT:
             if len(self) >= _KEPT:
                 self.clear()
             self[data] = text
@@ -141,7 +143,7 @@ def list_text(letter: str) -> ListText:
     def text(cdr: bytes, start: int, end: int) -> str:
         if end > len(cdr):
             cut_off(cdr)
-        if end - start <= _LONGEST:
+        if end - start <= SHORT:
             return short[cdr[start:end]]
         return ",".join([convert(cdr[at : min(at + size, end)]) for at in range(start, end, size)])
 

@@ -1,0 +1,64 @@
+"""What rclpy has serialized becomes the text of the values that it was given, for every type of the packages in use."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from router.gateway.json_code import json_writer
+from router.gateway.reference_json import reference_text
+from router.gateway.style import Style
+from router.types.ros import RosInterfaces, ros_interfaces
+from tests.compiler.generated_types import values
+from tests.compiler.reading import field_values
+
+pytest.importorskip("rclpy")
+
+from tests.compiler.ros_objects import serialized
+
+PACKAGES = ("comms", "geometry_msgs", "sensor_msgs", "std_msgs")
+
+
+def is_installed(name: str) -> bool:
+    package, _, short = name.partition("/msg/")
+    if package not in PACKAGES or find_spec(f"{package}.msg") is None:
+        return False
+    return hasattr(__import__(f"{package}.msg").msg, short)
+
+
+def without_nul(value: Any) -> Any:
+    """rclpy cuts strings there."""
+    match value:
+        case dict():
+            return {name: without_nul(member) for name, member in value.items()}
+        case list():
+            return [without_nul(element) for element in value]
+        case str():
+            return value.replace("\0", "")
+        case _:
+            return value
+
+
+@pytest.fixture(scope="module")
+def interfaces() -> RosInterfaces:
+    return ros_interfaces()
+
+
+@pytest.mark.parametrize("name", sorted(filter(is_installed, ros_interfaces().names())))
+def test_type_is_written_as_the_oracle_does(interfaces: RosInterfaces, name: str) -> None:
+    declared = interfaces.get(name)
+    assert declared is not None
+    writers = {style: json_writer(declared, style) for style in Style}
+
+    @settings(max_examples=5, suppress_health_check=list(HealthCheck))
+    @given(values(declared))
+    def equal(drawn: object) -> None:
+        value = without_nul(field_values(drawn, declared))
+        data = serialized(name, value)
+        for style, write in writers.items():
+            assert write(data) == reference_text(declared, value, is_wrapped=style is Style.WRAPPED)
+
+    equal()
