@@ -6,7 +6,7 @@ Which topics those are, and what their bytes mean, is not known here.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any, NamedTuple
 
@@ -40,8 +40,7 @@ class RosTopics:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._handle = node.handle
-        self._name = node.get_name()
-        self._namespace = node.get_namespace()
+        self._name = node.get_name(), node.get_namespace()
 
     def names(self) -> list[str]:
         """Topics that somebody publishes or subscribes to."""
@@ -49,19 +48,23 @@ class RosTopics:
 
     def publishers(self, topic: str) -> list[SeenPublisher]:
         """Those of `topic`, whatever their types."""
-        # Node.get_publishers_info_by_topic() makes an object of each QoS, which takes three times as long.
-        with self._handle:
-            seen = rclpy_implementation.rclpy_get_publishers_info_by_topic(self._handle, topic, False)
-        return [self._publisher(publisher) for publisher in seen]
+        return [
+            SeenPublisher(
+                type_name=seen["topic_type"],
+                is_reliable=seen["qos_profile"]["reliability"] == ReliabilityPolicy.RELIABLE,
+                keeps=seen["qos_profile"]["durability"] == DurabilityPolicy.TRANSIENT_LOCAL,
+                is_ours=self._is_ours(seen),
+            )
+            for seen in self._ask(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic)
+        ]
 
-    def _publisher(self, seen: Mapping[str, Any]) -> SeenPublisher:
-        qos = seen["qos_profile"]
-        return SeenPublisher(
-            type_name=seen["topic_type"],
-            is_reliable=qos["reliability"] == ReliabilityPolicy.RELIABLE,
-            keeps=qos["durability"] == DurabilityPolicy.TRANSIENT_LOCAL,
-            is_ours=seen["node_name"] == self._name and seen["node_namespace"] == self._namespace,
-        )
+    def _ask(self, question: Callable[[Any, str, bool], list[dict[str, Any]]], topic: str) -> list[dict[str, Any]]:
+        """As rclpy's Node does, which makes an object of each QoS and takes three times as long."""
+        with self._handle:
+            return question(self._handle, topic, False)
+
+    def _is_ours(self, seen: Mapping[str, Any]) -> bool:
+        return (seen["node_name"], seen["node_namespace"]) == self._name
 
     def load(self, type_name: str, definitions: Mapping[str, Definition]) -> Any:
         """The class of a message, for `tap`, if it is installed as `definitions` say. Raises StartError.
@@ -76,8 +79,25 @@ class RosTopics:
         return message_class
 
     def tap(self, topic: str, message_class: Any, *, is_reliable: bool, keeps: bool, depth: int) -> TopicTap:
-        """Subscribes to `topic`. Raises StartError."""
-        return TopicTap(self._node, topic, message_class, hearing(is_reliable=is_reliable, keeps=keeps, depth=depth))
+        """Subscribes to `topic`. Raises StartError, also where our node has the topic with another type."""
+        type_name = f"{message_class.__module__.partition('.')[0]}/msg/{message_class.__name__}"
+        try:
+            others = self._our_types(topic) - {type_name}
+            if others:  # DDS has one for a topic in a process; it would say so in other words
+                raise StartError(f"topic '{topic}' is {others.pop()} in this router, and cannot be {type_name} too")
+            return TopicTap(
+                self._node, topic, message_class, hearing(is_reliable=is_reliable, keeps=keeps, depth=depth)
+            )
+        except RCL_ERRORS as error:
+            raise StartError(f"topic '{topic}' cannot be subscribed to: {error}") from error
+
+    def _our_types(self, topic: str) -> set[str]:
+        """With which our node publishes or subscribes to it."""
+        seen = [
+            *self._ask(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic),
+            *self._ask(rclpy_implementation.rclpy_get_subscriptions_info_by_topic, topic),
+        ]
+        return {endpoint["topic_type"] for endpoint in seen if self._is_ours(endpoint)}
 
 
 class TopicTap:
@@ -87,17 +107,14 @@ class TopicTap:
     """
 
     def __init__(self, node: Node, topic: str, message_class: Any, qos: QoSProfile) -> None:
-        """Raises StartError. A process has one type for a topic: while another one is open, this is refused."""
+        """Raises one of `ros_node.RCL_ERRORS`."""
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         with ExitStack() as opening:
             self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
             opening.callback(os.close, self.fd)
-            try:
-                subscription = RawSubscription(node, message_class, topic, qos, silent)
-                opening.callback(subscription.close)
-                subscription.announce_to(self.fd)  # what has come already is announced at once
-            except RCL_ERRORS as error:
-                raise StartError(f"topic '{topic}' cannot be subscribed to: {error}") from error
+            subscription = RawSubscription(node, message_class, topic, qos, silent)
+            opening.callback(subscription.close)
+            subscription.announce_to(self.fd)  # what has come already is announced at once
             opening.callback(subscription.announce_to, None)
             self._open = opening.pop_all()
         self.take = subscription.take
