@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
+from router.compiler.topics import resolved
 from router.edges.background import background_threads
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
@@ -181,9 +182,10 @@ class Router:
         except ImportError as error:
             remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
             raise StartError(f"{table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
-        topics = [topic.topic for route in table.routes for topic in route.topics]
-        topics += [inbound.topic.topic for gateway in table.gateways.values() for inbound in gateway.inbound]
-        spans = {topic.value: topic.span for topic in topics}
+        spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
+        for gateway in table.gateways.values():
+            for inbound in gateway.inbound:
+                spans[resolved(inbound.topic.topic.value, table.node)] = inbound.topic.topic.span
         ros = RosEdge(
             table.node,
             program.publishers,

@@ -8,14 +8,11 @@ from itertools import count
 
 from router.edges.gateway_transport import Client, Frame, Transport
 from router.edges.log import logger
-from router.gateway.encoding import Encoding
+from router.gateway.encoding import LARGE, Encoding
 from router.gateway.ledger import Ledger
 from router.gateway.outbox import Outbox
 from router.gateway.subscriber import Subscriber
 from router.gateway.tasks import Tasks
-
-LARGE = 64 << 10
-"""Bytes from which on a frame of `gateway_v2` is too many datagrams for one go."""
 
 PUMPED, PUMP_S = 32, 0.001
 """Datagrams of a large frame that go out at a time, and the seconds between: other topics pass between them."""

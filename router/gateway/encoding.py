@@ -16,6 +16,9 @@ from router.gateway.packets import HEAD, prefix, unpack
 from router.gateway.style import Style
 from router.table.model import Gateway, GatewayFormat
 
+LARGE = 64 << 10
+"""Bytes of a message that is converted in a thread of its own, so that smaller ones need not wait for it."""
+
 _IDS = 1 << 32
 
 
@@ -46,6 +49,10 @@ class Encoding(ABC):
     def request(self, data: bytes) -> Request:
         """Raises PacketError for what has not the format, InvalidMessageError for JSON that is none."""
 
+    def is_quick(self, data: bytes) -> bool:
+        """Whether `request` takes no time worth mentioning."""
+        return len(data) <= LARGE
+
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
         """The same frames as the transport is to send them."""
         return frames
@@ -65,6 +72,9 @@ class PacketEncoding(Encoding):
     def data(self, sample: Sample, time: float) -> bytes:
         payload = sample.payload(self.style, self.level)
         return HEAD.pack(time, self.level > 0) + prefix(sample.topic, sample.type_name) + payload
+
+    def is_quick(self, data: bytes) -> bool:
+        return super().is_quick(data) and data[HEAD.size - 1 : HEAD.size] == b"\0"  # a little may become a lot
 
     def request(self, data: bytes) -> Request:
         packet = unpack(data)

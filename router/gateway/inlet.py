@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from router.compiler.books import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Books
 from router.compiler.program import GatewayPlan, InboundPlan
@@ -52,6 +53,14 @@ class _Topic:
         }
 
 
+class Checked(NamedTuple):
+    """A message that may be published, as CDR bytes. `time` is when the client says that it was sent."""
+
+    topic: _Topic
+    cdr: bytes
+    time: float | None
+
+
 class Inlet:
     """Of one gateway, for the thread that owns `counts`."""
 
@@ -66,34 +75,12 @@ class Inlet:
         self._rejected = {reason: books.slot("datagrams_rejected", name, reason) for reason in GATEWAY_REJECT_REASONS}
 
     def reject(self, reason: str, detail: str = "") -> None:
-        """Counts something that never became a message."""
+        """Counts something that is not published."""
         self._counts[self._rejected[reason]] += 1
         self._outlets.report(Report("reject", self._gateway, "", reason, None, detail))
 
-    def publish(self, request: PublishRequest, arrived_ns: int) -> None:
-        """Publishes what was asked for, which arrived at `arrived_ns` of the wall clock. Raises RefusedError.
-
-        Everything is counted here, and reported where it is lost.
-        """
-        try:
-            topic, cdr = self._checked(request)
-        except RefusedError as refused:
-            self.reject(refused.reason, str(refused))
-            raise
-        self._counts[self._accepted] += 1
-        now = self._outlets.clock_ns()
-        self._want_fresh(topic, request, arrived_ns, now)
-        if topic.may_pass and not topic.may_pass(now):
-            raise self._lost(topic, "rate_limited", f"more often than {topic.plan.max_rate:g} Hz")
-        if topic.plan.deadman is not None:
-            self._outlets.feed_deadman[topic.plan.deadman.route](now)
-        try:
-            self._outlets.publish[topic.plan.topic](cdr)
-        except self._outlets.publish_errors as error:
-            raise self._lost(topic, "publish_error", str(error), error) from error
-        self._counts[topic.published] += 1
-
-    def _checked(self, request: PublishRequest) -> tuple[_Topic, bytes]:
+    def check(self, request: PublishRequest) -> Checked:
+        """Raises RefusedError, which is not counted yet. Any thread may call this."""
         topic = self._topics.get(request.topic)
         if topic is None:
             raise RefusedError("not_allowed", f"clients may not publish on '{request.topic[:80]}'", request.topic)
@@ -103,19 +90,39 @@ class Inlet:
         if topic.plan.ttl is not None and request.time is None:
             raise RefusedError("invalid", f"{request.topic} needs the time at which it was sent", request.topic)
         try:
-            return topic, topic.build(request.data)
+            return Checked(topic, topic.build(request.data), request.time)
         except InvalidMessageError as error:
             raise RefusedError("invalid", str(error), request.topic) from error
 
-    def _want_fresh(self, topic: _Topic, request: PublishRequest, arrived_ns: int, now: int) -> None:
+    def publish(self, checked: Checked, arrived_ns: int) -> None:
+        """Publishes what was checked, and arrived at `arrived_ns` of the wall clock.
+
+        Raises RefusedError, which is counted and reported.
+        """
+        topic = checked.topic
+        self._counts[self._accepted] += 1
+        now = self._outlets.clock_ns()
+        self._want_fresh(checked, arrived_ns, now)
+        if topic.may_pass and not topic.may_pass(now):
+            raise self._lost(topic, "rate_limited", f"more often than {topic.plan.max_rate:g} Hz")
+        if topic.plan.deadman is not None:
+            self._outlets.feed_deadman[topic.plan.deadman.route](now)
+        try:
+            self._outlets.publish[topic.plan.topic](checked.cdr)
+        except self._outlets.publish_errors as error:
+            raise self._lost(topic, "publish_error", str(error), error) from error
+        self._counts[topic.published] += 1
+
+    def _want_fresh(self, checked: Checked, arrived_ns: int, now: int) -> None:
         """Its age counts from when the client says that it was sent, or from its arrival if that is earlier."""
-        if topic.plan.ttl is None or request.time is None:
+        ttl = checked.topic.plan.ttl
+        if ttl is None or checked.time is None:
             return
-        stamp = round(min(max(request.time, 0.0), arrived_ns / 1e9) * 1e9)
+        stamp = round(min(max(checked.time, 0.0), arrived_ns / 1e9) * 1e9)
         age = now - self._freshness.born(stamp, self._outlets.wall_ns(), now)
-        if age > topic.plan.ttl:
-            detail = f"{age / 1e9:.3f} s old, and older than {topic.plan.ttl / 1e9:g} s; are both clocks right?"
-            raise self._lost(topic, "stale", detail)
+        if age > ttl:
+            detail = f"{age / 1e9:.3f} s old, and older than {ttl / 1e9:g} s; are both clocks right?"
+            raise self._lost(checked.topic, "stale", detail)
 
     def _lost(self, topic: _Topic, reason: str, detail: str, error: Exception | None = None) -> RefusedError:
         self._counts[topic.dropped[reason]] += 1

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Sequence
+from typing import Union
 
 from router.compiler.program import GatewayPlan
 from router.edges.gateway_transport import Client, Frame, Transport
@@ -14,8 +16,8 @@ from router.gateway.documents import (
     rejected_document,
     topics_document,
 )
-from router.gateway.encoding import encoding
-from router.gateway.inlet import Inlet, RefusedError
+from router.gateway.encoding import Encoding, encoding
+from router.gateway.inlet import Checked, Inlet, RefusedError
 from router.gateway.json_reading import InvalidMessageError, example
 from router.gateway.ledger import Ledger
 from router.gateway.packets import PacketError, TooLargeError
@@ -24,6 +26,9 @@ from router.gateway.style import Style
 from router.gateway.tasks import Tasks
 from router.gateway.topics import Surroundings, Topics
 from router.table.model import Transport as Way
+
+MOST_READING = 4
+"""Large messages from clients that are read at a time, or wait for that."""
 
 _TELL_S = 1.0
 _ANSWER_NS = 100_000_000
@@ -55,6 +60,7 @@ class GatewayService:
         )
         self._transport = transport(self)
         self._answered = -_ANSWER_NS
+        self._reading = 0
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
 
@@ -101,28 +107,39 @@ class GatewayService:
 
     def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
         self._ledger.arrived(len(data))
+        if self._encoding.is_quick(data):
+            self._settle(client, _understood(self._encoding, self._inlet, data), arrived_ns)
+        elif self._reading < MOST_READING:
+            self._reading += 1
+            self._tasks.run(self._read(client, data, arrived_ns))
+        else:
+            refused = RefusedError("rate_limited", f"{MOST_READING} other large messages are still being read")
+            self._settle(client, refused, arrived_ns)
+
+    async def _read(self, client: Client, data: bytes, arrived_ns: int) -> None:
+        """What takes long, in another thread."""
         try:
-            request = self._encoding.request(data)
-        except PacketError as error:
-            reason = "too_large" if isinstance(error, TooLargeError) else "malformed"
-            self._refuse(client, RefusedError(reason, str(error)))
-            return
-        except InvalidMessageError as error:
-            self._refuse(client, RefusedError("invalid", str(error)))
-            return
-        if isinstance(request, SchemaRequest):
-            self._show_schemas(client, request.type_name)
-            return
-        try:
-            self._inlet.publish(request, arrived_ns)
-        except RefusedError as refused:
-            self._tell(client, refused)
+            understood = await asyncio.get_running_loop().run_in_executor(
+                self._around.worker, _understood, self._encoding, self._inlet, data
+            )
+        finally:
+            self._reading -= 1
+        self._settle(client, understood, arrived_ns)
+
+    def _settle(self, client: Client, understood: Understood, arrived_ns: int) -> None:
+        match understood:
+            case RefusedError():
+                self._inlet.reject(understood.reason, str(understood))
+                self._tell(client, understood)
+            case SchemaRequest():
+                self._show_schemas(client, understood.type_name)
+            case Checked():
+                try:
+                    self._inlet.publish(understood, arrived_ns)
+                except RefusedError as refused:
+                    self._tell(client, refused)
 
     # -- answers -------------------------------------------------------------------------------------------------
-
-    def _refuse(self, client: Client, refused: RefusedError) -> None:
-        self._inlet.reject(refused.reason, str(refused))
-        self._tell(client, refused)
 
     def _tell(self, client: Client, refused: RefusedError) -> None:
         subscriber = self.audience.subscribers.get(client)
@@ -156,3 +173,21 @@ class GatewayService:
     def _document(self, data: bytes) -> Frame:
         """One that belongs to no topic; with a slow client, a newer one takes its place."""
         return Frame(data, "", "", is_schema=False, born=self._around.clock_ns())
+
+
+Understood = Union[Checked, SchemaRequest, RefusedError]
+
+
+def _understood(encoding: Encoding, inlet: Inlet, data: bytes) -> Understood:
+    """What a client wants. Any thread may ask."""
+    try:
+        request = encoding.request(data)
+        return request if isinstance(request, SchemaRequest) else inlet.check(request)
+    except RefusedError as refused:
+        return refused
+    except TooLargeError as error:
+        return RefusedError("too_large", str(error))
+    except PacketError as error:
+        return RefusedError("malformed", str(error))
+    except InvalidMessageError as error:
+        return RefusedError("invalid", str(error))

@@ -17,7 +17,7 @@ from router.edges.log import logger
 from router.engine import Report
 from router.errors import StartError
 from router.gateway.documents import TopicRow
-from router.gateway.encoding import Encoding
+from router.gateway.encoding import LARGE, Encoding
 from router.gateway.feeds import Feed, Hub, Sample
 from router.gateway.following import Choice
 from router.gateway.ledger import Ledger
@@ -28,9 +28,6 @@ from router.table.model import EACH, GatewayFormat, Transport
 
 RUN = 32
 """Topics that are served before other work of the loop has its turn."""
-
-LARGE = 64 << 10
-"""Bytes of a message that is converted in a thread of its own, so that smaller ones need not wait for it."""
 
 UDP_PAYLOAD = 65_507
 """The longest datagram that IPv4 carries."""
