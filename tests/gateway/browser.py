@@ -125,8 +125,8 @@ class Page:
     def _mouse(self, kind: str, selector: str) -> None:
         element = f"document.querySelector({json.dumps(selector)})"
         self.until(f"{element}?.checkVisibility() ?? false")
-        place = f"(e => {{ e.scrollIntoView({{block: 'nearest'}}); return e.getBoundingClientRect().toJSON(); }})({element})"
-        box = self.evaluate(place)
+        self.evaluate(f"{element}.scrollIntoView({{block: 'nearest'}})")
+        box = self.evaluate(f"{element}.getBoundingClientRect().toJSON()")
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 

@@ -1,4 +1,4 @@
-"""A gateway's websocket side without ROS: it serves the page, says what a test wants it to say, and keeps what it is told."""
+"""A gateway's websocket side without ROS: it serves the page, says what a test wants, and keeps what it is told."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
 import router.gateway
+from router.edges.gateway_http import Page
 
 PAGE = Path(router.gateway.__file__).with_name("page.html")
-POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src 'self' ws:"
 
 
 class FakeGateway:
@@ -28,8 +27,9 @@ class FakeGateway:
 
     def __init__(self) -> None:
         self.clients: set[ServerConnection] = set()
+        self._page = Page(PAGE.read_bytes())
         self.reset()
-        self._server: Server = serve(self._serve, "127.0.0.1", 0, process_request=self._page, compression=None)
+        self._server: Server = serve(self._serve, "127.0.0.1", 0, process_request=self._answer, compression=None)
         self.port = int(self._server.socket.getsockname()[1])
         self._closed = threading.Event()
         self._threads = [threading.Thread(target=work) for work in (self._server.serve_forever, self._list)]
@@ -48,13 +48,11 @@ class FakeGateway:
     def url(self) -> str:
         return f"http://127.0.0.1:{self.port}/"
 
-    def _page(self, connection: ServerConnection, request: Request) -> Response | None:
-        if request.headers.get("Upgrade"):
-            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "") if self.is_down else None
-        if request.path.partition("?")[0] != "/":
-            return connection.respond(http.HTTPStatus.NOT_FOUND, "no such page\n")
-        headers = {"Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": POLICY, "Connection": "close"}
-        return Response(200, "OK", Headers(headers), PAGE.read_bytes())
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """As the real one answers, with its policy of what the page may do."""
+        if self.is_down and request.headers.get("Upgrade"):
+            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "")
+        return self._page.answer(cast("Any", connection), request)
 
     def _serve(self, connection: ServerConnection) -> None:
         connection.send(json.dumps({"op": "inbound", "topics": self.inbound}))
