@@ -23,6 +23,10 @@ ASK_AGAIN = 1.0
 """Seconds after which schemas are asked for again."""
 
 
+_MOST_SHAPES = 10_000
+"""Schemas that are remembered. More have only those who make senders up."""
+
+
 class Arrival(NamedTuple):
     """A datagram, packet or document. Fragments and schemas count for those of the same `sender` alone."""
 
@@ -111,6 +115,8 @@ class Listening:
             return heard
         if isinstance(heard, Schema):
             self._tally.schemas += 1
+            if len(self._shapes) >= _MOST_SHAPES:
+                self._shapes.clear()
             self._shapes[sender, heard.type_name] = heard.shape
             return heard if not heard.topic or self._wants(heard.topic) else None
         if not self._wants(heard.topic):

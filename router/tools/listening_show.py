@@ -20,7 +20,10 @@ _MOST_SHOWN = 6
 """Elements of a list, before it is cut short."""
 
 _LONGEST_TEXT = 120
-"""Characters of a string, and of what is no packet."""
+"""Characters of a string."""
+
+_MOST_BYTES = 60
+"""Of what is no packet."""
 
 _NO_SHAPE: Mapping[str, Shape] = {}
 
@@ -51,7 +54,7 @@ def pieces(heard: Heard) -> list[Piece]:
         where = [_name(heard.topic, "green")] if heard.topic else []
         return [(_clock(heard.time), "dim"), *where, _name(heard.type_name, "dim"), (f"schema {fields}", "cyan")]
     if isinstance(heard, Problem):
-        return [("undecodable", "red"), (f"({heard.reason}):", ""), (_cut(heard.data.hex()) or "no bytes", "")]
+        return [("undecodable", "red"), (f"({heard.reason}):", ""), (_bytes_text(heard.data), "")]
     return [(_line(_remark(heard.document)), "yellow" if heard.document["op"] == "rejected" else "dim")]
 
 
@@ -69,6 +72,11 @@ def _clock(seconds: float) -> str:
         return f"{dt.datetime.fromtimestamp(seconds).astimezone():%H:%M:%S.%f}"[:-3]
     except (OverflowError, OSError, ValueError):
         return f"time={seconds}"
+
+
+def _bytes_text(data: bytes) -> str:
+    rest = f"...({len(data)} bytes)" if len(data) > _MOST_BYTES else ""
+    return data[:_MOST_BYTES].hex() + rest or "no bytes"
 
 
 def _name(text: str, style: str) -> Piece:

@@ -5,12 +5,15 @@ from collections.abc import Sequence
 from itertools import count
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from router.gateway.documents import data_document, schema_document
 from router.gateway.fragments import datagrams
 from router.gateway.packets import Packet, pack
 from router.tools.listening import Arrival, Listening, Source
 from router.tools.listening_reading import Heard, Message, Problem, Schema, Shape
+from router.tools.listening_show import json_line, pieces
 from router.tools.listening_topics import topic_filter
 
 EVERY = topic_filter([])
@@ -105,6 +108,33 @@ def test_what_means_nothing_is_shown_with_its_bytes_and_ends_nothing() -> None:
     assert third.data == packet("no JSON")
     assert isinstance(fourth, Message)
     assert listening.tally(source).undecodable == 3
+
+
+NAMES = ["op", "name", "namespace", "fields", "time", "topic", "type", "is_array", "subtype", "x", "data", "schema"]
+LEAVES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.sampled_from(["message", "float32"])
+JSON = st.dictionaries(
+    st.sampled_from(NAMES),
+    st.recursive(
+        LEAVES, lambda inner: st.lists(inner, max_size=9) | st.dictionaries(st.sampled_from(NAMES), inner), max_leaves=9
+    ),
+)
+HOSTILE = st.one_of(
+    st.binary(max_size=60),
+    JSON.map(lambda content: packet(json.dumps(content))),
+    JSON.map(lambda content: json.dumps(content).encode()),
+    st.builds(
+        lambda op, content: json.dumps(content | op).encode(), st.sampled_from([{"op": "data"}, {"op": "topics"}]), JSON
+    ),
+)
+
+
+@given(st.lists(HOSTILE, max_size=4))
+def test_whatever_arrives_can_be_shown(sent: list[bytes]) -> None:
+    listening = Listening(EVERY)
+    for arrival in arrivals(packet(SCHEMA), *sent):
+        for one in listening.take(arrival, 0):
+            assert all(text.isprintable() for text, _ in pieces(one))
+            assert "\n" not in json_line(one)
 
 
 def test_what_a_source_knows_to_be_lost_counts() -> None:

@@ -78,6 +78,7 @@ def test_what_else_is_heard_is_shown_too() -> None:
     assert line(Remark(topics)) == "topics 3: /a /b"
     assert line(Problem("no JSON", b"\xff\xff")) == "undecodable (no JSON): ffff"
     assert line(Problem("empty", b"")) == "undecodable (empty): no bytes"
+    assert line(Problem("long", b"x" * 61)) == f"undecodable (long): {'78' * 60}...(61 bytes)"
 
 
 @pytest.mark.parametrize("time", [float("nan"), 1e300, -1e18])
