@@ -60,6 +60,11 @@ class Feed:
         return self._arrived
 
     @property
+    def is_open(self) -> bool:
+        """Not so once somebody follows the topic as another type, or nobody does: then join again, or leave."""
+        return self._tap is not None
+
+    @property
     def is_followed(self) -> bool:
         return self._followers > 0
 

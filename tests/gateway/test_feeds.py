@@ -316,6 +316,7 @@ def test_another_type_is_another_feed_and_the_old_one_ends(publisher: Publish) -
             assert several.others == (STRING,)
             new = hub.join("/greeting", several, None)
             assert (new is old, new.type_name) == (False, INT32)
+            assert (new.is_open, old.is_open) == (True, False)
             hub.leave(old, None)
             await matched(number)
             number.publish([FIVE])
