@@ -15,7 +15,7 @@ _FRACTION = (1 << 52) - 1
 _NOT_FINITE = 0x7FF
 _SMALLEST, _LARGEST = -4, 15
 """Between which places the decimal point may be for a number to be printed without an exponent."""
-_KEPT = 1 << 14
+_KEPT = 1 << 13
 
 _FLOAT, _FLOAT_BITS, _DOUBLE, _DOUBLE_BITS = (struct.Struct(f"<{letter}") for letter in "fIdQ")
 

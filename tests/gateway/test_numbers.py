@@ -85,6 +85,6 @@ def test_well_known_float32(number: float, text: str) -> None:
 
 
 def test_texts_that_are_kept_stay_few() -> None:
-    for bits in range(40_000):
+    for bits in range(20_000):
         assert DOUBLES[bits << 30]
-    assert len(DOUBLES) <= 1 << 14
+    assert len(DOUBLES) <= 1 << 13
