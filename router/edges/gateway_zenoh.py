@@ -51,6 +51,8 @@ class ZenohTransport:
         self._key = settings.key.value
         self._session: zenoh.Session | None = None
         self._client: ZenohClient | None = None
+        self._session_thread = ThreadPoolExecutor(1, thread_name_prefix="zenoh session")
+        self._answering = ThreadPoolExecutor(1, thread_name_prefix="zenoh answers")
         self._is_closed = False
         self._retrying: asyncio.Task[None] | None = None
 
@@ -59,14 +61,12 @@ class ZenohTransport:
         self._loop = asyncio.get_running_loop()
         self._inbox = Inbox(self._ears, self._most)
         self._queries = Queries(self._answer)
-        self._session_thread = ThreadPoolExecutor(1, thread_name_prefix="zenoh session")
-        self._answering = ThreadPoolExecutor(1, thread_name_prefix="zenoh answers")
         try:
             await self._connect(config)
         except zenoh.ZError as error:
-            if "os error 98" in str(error):
+            if why := _why_in_vain(self._settings, str(error)):
                 await self.close()
-                raise StartError(_why_taken(self._settings, str(error))) from error
+                raise StartError(why) from error
             logger.warning("Zenoh cannot be reached yet: trying each second", key=self._key, why=_short(error))
             self._retrying = self._loop.create_task(self._retry(config))
 
@@ -224,15 +224,20 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
     return config
 
 
-def _why_taken(settings: ZenohSettings, error: str) -> str:
+def _why_in_vain(settings: ZenohSettings, error: str) -> str:
+    """What to do about an error that does not pass by itself; empty for others."""
+    if "not supported" in error:
+        return f"Zenoh cannot use one of these: {', '.join((*settings.connect, *settings.listen))}: {_short(error)}"
+    if "os error 98" not in error:
+        return ""
     for locator in settings.listen:
         port = re.search(r":(\d+)$", locator)
         if port and locator in error:
             holder = port_holder("tcp", int(port[1]))
             return f"{locator} cannot be used: {holder} has the port; stop it, or choose another port"
-    return f"Zenoh cannot listen: {error}"
+    return f"Zenoh cannot listen: {_short(error)}"
 
 
-def _short(error: zenoh.ZError) -> str:
+def _short(error: object) -> str:
     """Without the places in Zenoh's own source."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error))

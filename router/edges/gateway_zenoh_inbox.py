@@ -45,7 +45,7 @@ class Inbox:
 
     def hear(self, sample: zenoh.Sample) -> None:
         """For Zenoh's thread."""
-        if sample.kind is not zenoh.SampleKind.PUT:
+        if sample.kind != zenoh.SampleKind.PUT:  # never `is`: each is made anew
             return
         size = len(sample.payload)
         if size > self._most:

@@ -34,7 +34,7 @@ class Putter:
         self._key = key
         self._small = ThreadPoolExecutor(1, thread_name_prefix="zenoh puts")
         self._large = ThreadPoolExecutor(1, thread_name_prefix="zenoh large puts")
-        self._publishers: dict[tuple[str, zenoh.Priority], zenoh.Publisher] = {}
+        self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
         self._large_keys: set[str] = set()
         self._large_waiting: dict[str, bytes] = {}
         self._failed_large: list[Exception] = []
@@ -59,7 +59,7 @@ class Putter:
                 if key in self._large_keys:
                     self._put_aside(key, frame.data)
                 else:
-                    self._put(key, frame.data, zenoh.Priority.DATA)
+                    self._put(key, frame.data, is_large=False)
             except (zenoh.ZError, TransportError) as error:
                 lost.append(Lost(error, 1))
         with self._lock:
@@ -80,19 +80,19 @@ class Putter:
             key, data = next(iter(self._large_waiting.items()))
             del self._large_waiting[key]
         try:
-            self._put(key, data, zenoh.Priority.DATA_LOW)
-        except zenoh.ZError as error:
+            self._put(key, data, is_large=True)
+        except Exception as error:  # noqa: BLE001 - told with the next frames
             with self._lock:
                 self._failed_large.append(error)
 
-    def _put(self, key: str, data: bytes, priority: zenoh.Priority) -> None:
+    def _put(self, key: str, data: bytes, *, is_large: bool) -> None:
         """Raises ZError."""
-        publisher = self._publishers.get((key, priority))
+        publisher = self._publishers.get((key, is_large))
         if publisher is None:
-            publisher = self._session.declare_publisher(
-                key, congestion_control=zenoh.CongestionControl.DROP, priority=priority
-            )
-            self._publishers[key, priority] = publisher
+            priority = zenoh.Priority.DATA_LOW if is_large else zenoh.Priority.DATA
+            drop = zenoh.CongestionControl.DROP
+            publisher = self._session.declare_publisher(key, congestion_control=drop, priority=priority)
+            self._publishers[key, is_large] = publisher
         publisher.put(data)
 
 
