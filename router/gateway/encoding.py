@@ -5,19 +5,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterator, Sequence
 from itertools import count
+from math import inf
 
 from router.edges.gateway_transport import Frame
 from router.gateway.compression import decompress
 from router.gateway.documents import PublishRequest, Request, SchemaRequest, data_document, request, schema_document
 from router.gateway.feeds import Sample
-from router.gateway.fragments import datagrams
+from router.gateway.fragments import capacity, datagrams
 from router.gateway.json_reading import parse_json
 from router.gateway.packets import HEAD, prefix, unpack
 from router.gateway.style import Style
-from router.table.model import Gateway, GatewayFormat
+from router.table.model import Gateway, GatewayFormat, Transport
 
 LARGE = 64 << 10
 """Bytes of a message that is converted in a thread of its own, so that smaller ones need not wait for it."""
+
+UDP_PAYLOAD = 65_507
+"""The longest datagram that IPv4 carries."""
 
 _IDS = 1 << 32
 
@@ -29,6 +33,8 @@ class Encoding(ABC):
     level: int
     fragments = False
     """Whether what is longer than a datagram is spread over several."""
+    most: float = inf
+    """Bytes of the longest packet or document that can be sent."""
 
     def __init__(self, settings: Gateway) -> None:
         self.level = settings.compression
@@ -63,6 +69,11 @@ class PacketEncoding(Encoding):
 
     style = Style.WRAPPED
 
+    def __init__(self, settings: Gateway) -> None:
+        super().__init__(settings)
+        if settings.transport.value is Transport.UDP:
+            self.most = UDP_PAYLOAD
+
     def introduces(self, topic: str, type_name: str) -> Hashable:
         return topic, type_name  # each packet names both, and clients may keep schemas by either
 
@@ -92,6 +103,7 @@ class BatchEncoding(PacketEncoding):
     def __init__(self, settings: Gateway) -> None:
         super().__init__(settings)
         self._datagram = settings.max_datagram
+        self.most = capacity(self._datagram)
         self._ids: Iterator[int] = (number % _IDS for number in count())
 
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:

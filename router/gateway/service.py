@@ -87,7 +87,8 @@ class GatewayService:
 
     def joined(self, client: Client) -> None:
         subscriber = self.audience.joined(client)
-        self.audience.send_to(subscriber, self._hello() + self._topics.snapshot())
+        is_alone = len(self.audience.subscribers) == 1
+        self.audience.send_to(subscriber, self._hello() + self._topics.snapshot(is_for_all=is_alone))
 
     def left(self, client: Client) -> None:
         self.audience.left(client)

@@ -24,13 +24,10 @@ from router.gateway.ledger import Ledger
 from router.gateway.served import MOST_UNCONVERTED, Served
 from router.gateway.style import UnreadableError
 from router.gateway.tasks import Tasks
-from router.table.model import EACH, GatewayFormat, Transport
+from router.table.model import EACH, Transport
 
 RUN = 32
 """Topics that are served before other work of the loop has its turn."""
-
-UDP_PAYLOAD = 65_507
-"""The longest datagram that IPv4 carries."""
 
 FIRST_LOOKS_S = (0.2, 0.5, 1.0, 2.0)
 """Pauses between looks at the graph after the start, as far as they are shorter than `discovery_period`: DDS needs a
@@ -81,9 +78,8 @@ class Topics:
         self._pending: list[Frame] = []
         # Datagrams get lost, and the existing gateway's clients expect values to be repeated.
         self._repeats = settings.transport.value is Transport.UDP
-        is_one_datagram = self._repeats and settings.format is GatewayFormat.GATEWAY_V1
-        self._most = min(settings.max_message, UDP_PAYLOAD) if is_one_datagram else settings.max_message
-        self._remedy = "use compression or gateway_v2" if is_one_datagram else "see `max_message`"
+        self._most = min(settings.max_message, encoding.most)
+        self._remedy = "see `max_message`" if self._most < encoding.most else "use compression or gateway_v2"
 
     def start(self) -> None:
         settings = self._plan.settings
@@ -115,8 +111,9 @@ class Topics:
             self._forget(topic)
         for topic, choice in seen.items():
             served = self._served.get(topic)
-            if served is None or served.choice != choice:
+            if served is None or served.choice != choice or not served.feed.is_open:
                 self._serve(topic, choice)
+                await asyncio.sleep(0)
         several = sum(bool(served.choice.others) for served in self._served.values())
         self._ledger.topics(len(self._served) - several, several, len(self._not_installed))
 
@@ -282,8 +279,8 @@ class Topics:
 
     # -- for who asks --------------------------------------------------------------------------------------------
 
-    def snapshot(self, type_name: str | None = None) -> list[Frame]:
-        """Schemas and latest values of all topics, or of those of one type.
+    def snapshot(self, type_name: str | None = None, *, is_for_all: bool = False) -> list[Frame]:
+        """Schemas and latest values of all topics, or of those of one type. `is_for_all`: everybody will have got them.
 
         A large value that is not converted yet comes to everybody a little later.
         """
@@ -291,6 +288,8 @@ class Topics:
         for served in self._served.values():
             if type_name in (None, served.feed.type_name):
                 self._show(served, frames)
+        if is_for_all:
+            self._introduced |= {self._encoding.introduces(frame.topic, frame.type_name) for frame in frames}
         return frames
 
     def _show(self, served: Served, frames: list[Frame]) -> None:

@@ -7,15 +7,18 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 from backports import zstd
 from websockets.sync.client import connect
 
+from router.gateway.fragments import Reassembler
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.ros_speaker import Speaker
 from tests.acceptance.site import RouterProcess, Site, key, site, total, udp, wait_until
@@ -275,8 +278,8 @@ class Dashboard:
     """A client of the websocket gateway."""
 
     def __init__(self, scene: Scene) -> None:
-        self._connecting = connect(f"ws://127.0.0.5:{scene.port}/", open_timeout=PATIENCE)
-        self._waiting: list[dict[str, Any]] = []
+        self._connecting = connect(f"ws://127.0.0.5:{scene.port}/", open_timeout=PATIENCE, close_timeout=1, max_size=None)
+        self._documents = self.documents()
 
     def __enter__(self) -> Dashboard:
         self._connection = self._connecting.__enter__()
@@ -285,17 +288,14 @@ class Dashboard:
     def __exit__(self, *_: object) -> None:
         self._connecting.__exit__(None, None, None)
 
-    def next(self, op: str, wanted: Callable[[dict[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline:
-            while self._waiting:
-                document = self._waiting.pop(0)
-                if document["op"] == op and wanted(document):
-                    return document
+    def documents(self) -> Generator[dict[str, Any], None, None]:
+        while True:
             text = self._connection.recv(timeout=PATIENCE)
             assert isinstance(text, str)
-            self._waiting += map(json.loads, text.split("\n"))
-        raise AssertionError(f"no {op}")
+            yield from map(json.loads, text.split("\n"))
+
+    def next(self, op: str) -> dict[str, Any]:
+        return next(document for document in self._documents if document["op"] == op)
 
     def publish(self, topic: str, data: object, **others: object) -> None:
         self._connection.send(json.dumps({"op": "publish", "topic": topic, "data": data, **others}))
@@ -460,3 +460,99 @@ def test_the_books_of_a_gateway_balance(tmp_path: Path) -> None:
         counts = now.site.scrape()
         outcomes = ("messages_sent", "messages_filtered", "messages_dropped")
         assert sum(total(counts, metric, route="headset", target="clients") for metric in outcomes) == 200
+
+
+BATCHING = """\
+    format: gateway_v2
+    max_datagram: 1200B
+"""
+
+
+def test_small_messages_share_a_datagram_and_a_large_one_is_spread_without_delaying_them(tmp_path: Path) -> None:
+    with scene(tmp_path, HEADSET + BATCHING) as now, udp("127.0.0.9", now.port) as client:
+        for number in range(20):
+            now.speaker.open(f"/gw/number_{number}", "std_msgs/msg/Int32", keeps=True)
+            now.speaker.say(f"/gw/number_{number}", {"data": number})
+        now.speaker.open("/gw/image", "std_msgs/msg/UInt8MultiArray", keeps=True)
+        now.speaker.say("/gw/image", {"data": [7] * 2_000_000})
+        reassembler = Reassembler()
+        numbers, shared, image = set[str](), 0, b""
+        while len(numbers) < 20 or not image:
+            datagram = client.recv(65535)
+            assert len(datagram) <= 1200
+            packets = reassembler.feed(datagram, "the gateway", time.monotonic_ns())
+            shared += len(packets) > 1
+            for _, _, topic, _, payload in map(packet, packets):
+                if topic.startswith("/gw/number") and payload.startswith(b'{"data":['):
+                    numbers.add(topic)
+                elif topic == "/gw/image" and payload.startswith(b'{"data":[7,'):
+                    image = payload
+        assert shared
+        assert json.loads(image)["data"] == [7] * 2_000_000
+
+
+@pytest.mark.parametrize("gateway", [LOGGER, DASHBOARD], ids=["tcp", "websocket"])
+def test_a_message_of_two_megabytes_passes_and_small_ones_pass_it(tmp_path: Path, gateway: str) -> None:
+    with scene(tmp_path, gateway.replace("each", "50ms")) as now, ExitStack() as opened:
+        now.speaker.open("/gw/image", "std_msgs/msg/UInt8MultiArray")
+        now.speaker.open("/gw/number", "std_msgs/msg/Int32")
+        wait_until(lambda: now.speaker.heard_by("/gw/image") * now.speaker.heard_by("/gw/number") > 0, "both")
+        if gateway is LOGGER:
+            connection = opened.enter_context(socket.create_connection(("127.0.0.5", now.port), PATIENCE))
+            documents = lines(connection)
+        else:
+            documents = opened.enter_context(Dashboard(now)).documents()
+        now.speaker.say("/gw/image", {"data": [200] * 2_000_000})
+        now.speaker.say("/gw/number", {"data": 1})
+        came = list(islice(filter(_is_data, documents), 2))
+        assert [document["topic"] for document in came] == ["/gw/number", "/gw/image"]
+        assert came[1]["data"]["data"] == [200] * 2_000_000
+        documents.close()
+
+
+def _is_data(document: dict[str, Any]) -> bool:
+    return bool(document["op"] == "data")
+
+
+ZENOH = """\
+  earth:
+    transport: {zenoh: {key: rovers/loki, listen: ["tcp/127.0.0.1:PORT"]}}
+    topics: {include: ["/gw/**"]}
+    publish_period: 50ms
+    discovery_period: 200ms
+    inbound: [{topic: /gw/set, type: std_msgs/msg/Int32}]
+"""
+
+
+def test_a_late_joiner_on_zenoh_gets_schema_and_latest_value_at_once_and_can_send(tmp_path: Path) -> None:
+    with scene(tmp_path, ZENOH) as now, RosPeer({"/gw/set": "std_msgs/msg/Int32"}) as peer:
+        now.speaker.open("/gw/word", "std_msgs/msg/String")
+        wait_until(lambda: now.speaker.heard_by("/gw/word") > 0, "the subscription")
+        now.speaker.say("/gw/word", {"data": "latest"})
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{now.port}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        with zenoh.open(config) as session:
+            found: dict[str, bytes] = {}
+
+            def asked() -> bool:
+                for reply in session.get("rovers/loki/**"):
+                    found[str(reply.ok.key_expr)] = reply.ok.payload.to_bytes()
+                return len(found) == 2
+
+            wait_until(asked, "the answers")
+            assert packet(found["rovers/loki/data/gw/word"])[2:] == (
+                "/gw/word",
+                "std_msgs/msg/String",
+                b'{"data":["latest"]}',
+            )
+            assert b'"namespace":"std_msgs::msg"' in found["rovers/loki/schema/std_msgs/msg/String"]
+            heard: list[bytes] = []
+            session.declare_subscriber("rovers/loki/data/**", lambda sample: heard.append(sample.payload.to_bytes()))
+            time.sleep(0.5)  # until the router knows of it, or the next value would be lost
+            now.speaker.say("/gw/word", {"data": "next"})
+            wait_until(lambda: any(data.endswith(b'{"data":["next"]}') for data in heard), "the next value")
+            head = struct.pack("<dB", time.time(), 0) + b"/gw/set\0std_msgs/msg/Int32\0"
+            session.put("rovers/loki/inbound/gw/set", head + b'{"data":[5]}')
+            assert peer.receive() == ("/gw/set", {"data": 5})
