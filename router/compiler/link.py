@@ -12,7 +12,7 @@ from router.compiler.books import QOS_POLICIES, REJECT_REASONS, UNKNOWN_CASE, Bo
 from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedRoute
 from router.compiler.handlers import HandlerSource
 from router.compiler.link_gateways import link_gateway
-from router.compiler.lookup import nested_types
+from router.compiler.lookup import layout
 from router.compiler.namespace import NAMESPACE
 from router.compiler.program import (
     STRANGER,
@@ -28,7 +28,6 @@ from router.compiler.topics import qos_of
 from router.table.model import ANY, Located, RouteTable, Topic
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
-from router.types.ros import definition
 
 
 def link(
@@ -98,12 +97,8 @@ def _topics(used: Iterable[tuple[Topic | None, MessageType | None]]) -> tuple[To
     for topic, declared in used:
         if topic and declared:
             name = topic.topic.value
-            plans.setdefault(name, TopicPlan(name, declared.name, qos_of(topic), _definitions(declared)))
+            plans.setdefault(name, TopicPlan(name, declared.name, qos_of(topic), layout(declared)))
     return tuple(plans.values())
-
-
-def _definitions(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
-    return {nested.name: definition(nested) for nested in nested_types(message)}
 
 
 def _open_books(books: Books, table: RouteTable, envelope: Envelope) -> None:

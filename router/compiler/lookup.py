@@ -15,6 +15,7 @@ from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
 from router.table.model import Endpoint, Expression, Located, RouteTable, Topic
 from router.types.model import List, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
+from router.types.ros import definition
 
 NO_NAMES: Mapping[str, Typed] = {}
 
@@ -111,6 +112,11 @@ def nested_types(declared: Type) -> Iterable[MessageType]:
             found[current.name] = current
             waiting += [member.type for member in current.fields]
     return found.values()
+
+
+def layout(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
+    """What its bytes are laid out after: of the type and of all types in it, by name, the fields as rclpy spells them."""
+    return {nested.name: definition(nested) for nested in nested_types(message)}
 
 
 def _ros_type_hint(name: str, known: Collection[str]) -> str:

@@ -10,11 +10,11 @@ from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-from router.compiler.lookup import nested_types
+from router.compiler.lookup import layout
 from router.errors import StartError, TableError
 from router.gateway.following import Choice, choice
 from router.gateway.samples import ReadyType, Sample
-from router.types.ros import RosInterfaces, definition
+from router.types.ros import RosInterfaces
 
 if TYPE_CHECKING:  # which imports rclpy
     from router.edges.ros_topics import RosTopics, TopicTap
@@ -232,7 +232,6 @@ class Hub:
             message = self._interfaces.get(type_name)
             if message is None:
                 return f"{type_name} is not installed"
-            definitions = {part.name: definition(part) for part in nested_types(message)}
-            return ReadyType(message, self._topics.load(type_name, definitions))
+            return ReadyType(message, self._topics.load(type_name, layout(message)))
         except (StartError, TableError) as error:
             return str(error)
