@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import re
 import struct
 from collections.abc import Callable, Sequence
@@ -105,7 +106,7 @@ KINDS = (
 IMAGE = Kind(
     "sensor_msgs/msg/Image", "time",
     Image(header=_header("camera"), height=1000, width=2000, encoding="mono8", step=2000,
-          data=bytes(index * 7919 % 251 for index in range(IMAGE_BYTES))),
+          data=random.Random(IMAGE_BYTES).randbytes(IMAGE_BYTES)),
     _of_header,
 )  # fmt: skip
 
