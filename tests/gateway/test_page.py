@@ -119,7 +119,7 @@ def test_a_topic_that_stops_is_stale_and_one_that_left_the_list_is_gone(gateway:
     for value in range(4):
         gateway.data("/imu", {"x": value})
         time.sleep(0.1)
-    page.until(f"{row('/imu')}.className === 'stale'")
+    page.until(f"{row('/imu')}.className === 'stale' && {row('/imu')}.innerText.includes('stale')")
     assert page.evaluate(f"{row('/once')}.className") == ""
     gateway.list_topics(["/once"])
     page.until(f"{row('/imu')}.className === 'gone' && {row('/imu')}.innerText.includes('gone')")
@@ -444,7 +444,7 @@ def test_what_cannot_be_read_is_counted_and_ends_nothing(gateway: FakeGateway, p
     )
     choose(page, "/x")
     page.until("document.querySelector('#tree').innerText === 'This value cannot be read.'")
-    page.until("document.querySelector('#traffic').textContent.includes('3 unreadable so far')")
+    page.until("document.querySelector('#state').textContent === 'connected, 3 documents unreadable'")
 
 
 # Safety, looks and hands
