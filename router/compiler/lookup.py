@@ -115,7 +115,7 @@ def nested_types(declared: Type) -> Iterable[MessageType]:
 
 
 def layout(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
-    """What its bytes are laid out after: of the type and of all types in it, by name, the fields as rclpy spells them."""
+    """What its bytes are laid out after: the fields of the type and of each type in it, as rclpy spells them."""
     return {nested.name: definition(nested) for nested in nested_types(message)}
 
 
