@@ -146,7 +146,7 @@ class GatewayService:
         subscriber = self.audience.subscribers.get(client)
         if self._explains and subscriber is not None:
             document = rejected_document(refused.reason, str(refused), refused.topic)
-            self.audience.send_to(subscriber, [self._document(document)])
+            self.audience.send_to(subscriber, [self._document("rejected", document)])
 
     def _show_schemas(self, client: Client, type_name: str | None) -> None:
         now = self._around.clock_ns()
@@ -165,15 +165,15 @@ class GatewayService:
             InboundRow(inbound.topic, inbound.type.name, schema_text(inbound.type), example(inbound.type))
             for inbound in self._plan.inbound.values()
         ]
-        return [self._document(inbound_document(rows))]
+        return [self._document("inbound", inbound_document(rows))]
 
     async def _tell_topics(self) -> None:
         rows = list(self._topics.rates(_TELL_S))
-        self._deliver([self._document(topics_document(self._around.wall_s(), rows))])
+        self._deliver([self._document("topics", topics_document(self._around.wall_s(), rows))])
 
-    def _document(self, data: bytes) -> Frame:
-        """One that belongs to no topic; with a slow client, a newer one takes its place."""
-        return Frame(data, "", "", is_schema=False, born=self._around.clock_ns())
+    def _document(self, kind: str, data: bytes) -> Frame:
+        """One that belongs to no topic; with a slow client, a newer one of its kind takes its place."""
+        return Frame(data, kind, "", is_schema=False, born=self._around.clock_ns())
 
 
 Understood = Union[Checked, SchemaRequest, RefusedError]

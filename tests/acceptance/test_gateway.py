@@ -278,7 +278,9 @@ class Dashboard:
     """A client of the websocket gateway."""
 
     def __init__(self, scene: Scene) -> None:
-        self._connecting = connect(f"ws://127.0.0.5:{scene.port}/", open_timeout=PATIENCE, close_timeout=1, max_size=None)
+        self._connecting = connect(
+            f"ws://127.0.0.5:{scene.port}/", open_timeout=PATIENCE, close_timeout=1, max_size=None
+        )
         self._documents = self.documents()
 
     def __enter__(self) -> Dashboard:
