@@ -2,7 +2,7 @@
 
     make setup && .venv/bin/python -m tests.gateway.golden.capture
 
-Takes two minutes, g++, nlohmann-json3-dev and libzstd-dev: it builds benchmarks/peer/gateway_peer.cpp and, for C++,
+Takes one or two minutes, g++, nlohmann-json3-dev and libzstd-dev: it builds benchmarks/peer/gateway_peer.cpp and, for C++,
 the nasty messages of tests/compiler/interface_package.py. Each case of cases.py is published on a topic of its own;
 the packets come by UDP. The file has one line for each case:
 
@@ -13,6 +13,8 @@ the packets come by UDP. The file has one line for each case:
                 null: nothing is sent for these bytes
     schema      the schema packet in the same way; only with the first case of a type that has one
     compressed  the data packet with `compression_level` 3 after its time stamp, as hexadecimal digits; only if short
+
+Captured again, only the padding within `cdr` differs: rclpy leaves there what was in memory before.
 
 Knows nothing of the router.
 """
