@@ -2,7 +2,7 @@
 
     make setup && .venv/bin/python -m tests.gateway.golden.capture
 
-Takes one or two minutes, g++, nlohmann-json3-dev and libzstd-dev: it builds benchmarks/peer/gateway_peer.cpp and, for C++,
+Takes two minutes, g++, nlohmann-json3-dev and libzstd-dev: it builds benchmarks/peer/gateway_peer.cpp and, for C++,
 the nasty messages of tests/compiler/interface_package.py. Each case of cases.py is published on a topic of its own;
 the packets come by UDP. The file has one line for each case:
 
