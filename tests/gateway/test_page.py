@@ -387,7 +387,7 @@ def test_a_refusal_is_shown_with_reason_and_detail(gateway: FakeGateway, page: P
     page.click("[form=form]")
     received(gateway)
     gateway.say({"op": "rejected", "reason": "stale", "detail": f"0.5 s old {HOSTILE}", "topic": "/cmd_vel"})
-    page.until("document.querySelector('#sent').textContent.includes('1 refused. Refused: stale. 0.5 s old <img')")
+    page.until("document.querySelector('#sent').textContent.includes('1 refused. Refused (stale): 0.5 s old <img')")
     assert page.evaluate("document.querySelector('#sent').className") == "bad"
     page.click("[form=form]")
     page.until("document.querySelector('#sent').textContent.trim() === 'Sent 2, 1 refused.'")
