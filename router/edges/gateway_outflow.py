@@ -16,7 +16,11 @@ from typing import NamedTuple, Union
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER
 
 PIECE = 64 * 1024
-"""Bytes that a client gets at a time: other clients have their turn between two pieces."""
+"""Bytes that a client gets at a time at most: other clients have their turn between two pieces."""
+
+BYTES_PER_TURN = 256 * 1024
+BYTES_PER_CALL = 8 * 1024
+"""So much goes out in one turn of the loop, a system call counting as so many bytes at least: about 1 ms."""
 
 UNSENT = 128 * 1024
 """Bytes that the kernel keeps unsent for a client: beyond that, the newest values are worth more than old ones."""
@@ -56,18 +60,49 @@ def label(transport: asyncio.Transport) -> str:
     return f"{host}:{port}"
 
 
+class Feeder:
+    """Gives clients what waits for them, one after the other, and lets other work have its turn in between."""
+
+    def __init__(self) -> None:
+        self._ready: deque[Outflow] = deque()
+        self._is_scheduled = False
+
+    def add(self, outflow: Outflow) -> None:
+        self._ready.append(outflow)
+        self._schedule()
+
+    def _schedule(self) -> None:
+        if self._ready and not self._is_scheduled:
+            self._is_scheduled = True
+            asyncio.get_running_loop().call_soon(self._feed)
+
+    def _feed(self) -> None:
+        """One turn of the loop."""
+        self._is_scheduled = False
+        left = BYTES_PER_TURN
+        while self._ready and left > 0:
+            left -= max(self._ready.popleft().feed(), BYTES_PER_CALL)
+        self._schedule()
+
+
 class Outflow:
     """What one client still has to get, while `is_open`. Its protocol passes on when it is paused and resumed."""
 
-    def __init__(self, transport: asyncio.Transport, is_open: Callable[[], bool], drained: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        transport: asyncio.Transport,
+        feeder: Feeder,
+        is_open: Callable[[], bool],
+        drained: Callable[[], None],
+    ) -> None:
         self._transport = transport
+        self._feeder = feeder
         self._is_open = is_open
         self._drained = drained
-        self._loop = asyncio.get_running_loop()
         self._waiting: deque[Piece] = deque()
         self._waiting_bytes = 0
         self._is_paused = False
-        self._is_scheduled = False
+        self._is_queued = False
         self._was_high = False
         self._pushed = 0
         self._taken = 0  # by the kernel, when it was looked at last
@@ -77,14 +112,26 @@ class Outflow:
         if not self._can_write():
             return
         self._pushed += encoded.size
-        if len(encoded.pieces) == 1 and not self._waiting and not self._is_paused:
-            self._transport.write(encoded.pieces[0])
-            return
-        self._waiting.extend(encoded.pieces)
         self._waiting_bytes += encoded.size
-        if not self._is_scheduled:
-            self._feed()
+        self._waiting.extend(encoded.pieces)
         self._was_high = self._was_high or self.backlog() >= HIGH_WATER
+        self._queue()
+
+    def feed(self) -> int:
+        """Writes one piece, or several small ones as one, and returns how many bytes that was."""
+        self._is_queued = False
+        if self._is_paused or not self._waiting or not self._can_write():
+            return 0
+        pieces = [self._waiting.popleft()]
+        size = len(pieces[0])
+        while self._waiting and size + len(self._waiting[0]) <= PIECE:
+            size += len(self._waiting[0])
+            pieces.append(self._waiting.popleft())
+        self._waiting_bytes -= size
+        self._transport.write(pieces[0] if len(pieces) == 1 else b"".join(pieces))
+        self._queue()
+        self._look_at_level()
+        return size
 
     def backlog(self) -> int:
         return self._waiting_bytes + self._transport.get_write_buffer_size()
@@ -94,8 +141,8 @@ class Outflow:
 
     def resumed(self) -> None:
         self._is_paused = False
-        if not self._is_scheduled:
-            self._feed()
+        self._queue()
+        self._look_at_level()
 
     def clear(self) -> None:
         """Forgets what waits: the client has gone."""
@@ -110,25 +157,15 @@ class Outflow:
             self._taken, self._taken_at = taken, now
         return now - self._taken_at >= STALLED_SECONDS
 
-    def _feed(self) -> None:
-        """Writes one piece, or several small ones as one, and goes on in the next turn of the loop."""
-        self._is_scheduled = False
-        if not self._can_write():
-            return
-        if self._waiting and not self._is_paused:
-            pieces = [self._waiting.popleft()]
-            size = len(pieces[0])
-            while self._waiting and size + len(self._waiting[0]) <= PIECE:
-                size += len(self._waiting[0])
-                pieces.append(self._waiting.popleft())
-            self._waiting_bytes -= size
-            self._transport.write(pieces[0] if len(pieces) == 1 else b"".join(pieces))
-        if self._waiting and not self._is_paused:
-            self._is_scheduled = True
-            self._loop.call_soon(self._feed)
+    def _queue(self) -> None:
+        if self._waiting and not self._is_paused and not self._is_queued:
+            self._is_queued = True
+            self._feeder.add(self)
+
+    def _look_at_level(self) -> None:
         if self._was_high and self.backlog() < LOW_WATER:
             self._was_high = False
-            self._loop.call_soon(self._tell_drained)
+            asyncio.get_running_loop().call_soon(self._tell_drained)
 
     def _tell_drained(self) -> None:
         if self._can_write():

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
 
 from router.edges.gateway_binding import MOST_UNACCEPTED, Binding, listen_at
-from router.edges.gateway_outflow import STALLED_SECONDS, Encoded, Outflow
+from router.edges.gateway_outflow import STALLED_SECONDS, Encoded, Feeder, Outflow
 from router.edges.gateway_transport import Client, Ears, Frame
 from router.edges.log import FloodLog, logger
 from router.table.model import Address
@@ -48,6 +48,7 @@ class StreamTransport:
         self.address: Address | None = None
         self._wanted = address
         self.ears = ears
+        self.feeder = Feeder()
         self._max_clients = max_clients
         self._clients: set[StreamClient] = set()
         self._binding = Binding("tcp", address, self._bind)
@@ -99,12 +100,11 @@ class StreamTransport:
         self.ears.joined(client)
         return True
 
-    def went(self, client: StreamClient, error: Exception | None) -> None:
+    def went(self, client: StreamClient) -> None:
         """Does nothing for one that was turned away."""
         if client in self._clients:
             self._clients.remove(client)
             client.outflow.clear()
-            logger.debug("a client went", client=client.label, why=str(error or "it ended the connection"))
             self.ears.left(client)
 
     def _watch(self) -> None:

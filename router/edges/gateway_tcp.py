@@ -95,12 +95,12 @@ class _TcpClient(asyncio.BufferedProtocol, StreamClient):
         self._transport = transport
         self.label = label(transport)
         prepare(transport)
-        self.outflow = Outflow(transport, lambda: True, self._drained)
+        self.outflow = Outflow(transport, self._owner.feeder, lambda: True, self._drained)
         if not self._owner.came(self):
             transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._owner.went(self, exc)
+        self._owner.went(self)
 
     def pause_writing(self) -> None:
         self.outflow.paused()

@@ -112,7 +112,7 @@ class WebsocketTransport(StreamTransport):
             what = {"message": "a fault in the router itself ended a websocket", "exception": error}
             asyncio.get_running_loop().call_exception_handler(what)
         finally:
-            self.went(client, None)
+            self.went(client)
 
     async def _hear(self, connection: _Connection) -> None:
         """Raises ConnectionClosed in the end."""
@@ -128,7 +128,7 @@ class _WebsocketClient(StreamClient):
         owner = connection.owner
         self.encode = owner.encode
         self.label = label(connection.transport)
-        self.outflow = Outflow(connection.transport, self._is_open, lambda: owner.ears.drained(self))
+        self.outflow = Outflow(connection.transport, owner.feeder, self._is_open, lambda: owner.ears.drained(self))
         self._connection = connection
 
     def close(self) -> None:
