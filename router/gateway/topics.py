@@ -168,6 +168,8 @@ class Topics:
             for number, served in enumerate(due, 1):
                 self._poll(served, frames)
                 if number % RUN == 0:
+                    self._deliver(frames)
+                    frames = []
                     await asyncio.sleep(0)
             self._deliver(frames)
 
