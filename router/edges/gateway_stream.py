@@ -111,7 +111,7 @@ class StreamTransport:
         now = monotonic()
         for client in [each for each in self._clients if each.outflow.is_stalled(now)]:
             self._log.note(
-                ("stalled", client.label),
+                "stalled",
                 logger.warning,
                 "a client was closed: send stalled",
                 client=client.label,

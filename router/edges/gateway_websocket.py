@@ -18,7 +18,7 @@ from router.edges.clock import wall_ns
 from router.edges.gateway_http import Page
 from router.edges.gateway_outflow import PIECE, Encoded, Outflow, label, prepare
 from router.edges.gateway_stream import ACCEPTED_PER_TURN, StreamClient, StreamTransport
-from router.edges.gateway_transport import Ears, Frame
+from router.edges.gateway_transport import HIGH_WATER, Ears, Frame
 from router.edges.log import logger
 from router.table.model import Address
 
@@ -28,8 +28,9 @@ PING_SECONDS = 20.0
 CLOSING_SECONDS = 1.0
 """How long clients have to say goodbye."""
 
+READ_AT_ONCE = 4 * 1024
 TAKEN_PER_TURN = 32
-"""Messages of a client that are handed on before other work of the loop has its turn."""
+"""Bytes that are read, and messages that are handed on, of a client before other work of the loop has its turn."""
 
 STRANGERS = 64
 """Connections beyond `max_clients` that may be without a websocket: they fetch the page, or are about to ask."""
@@ -147,6 +148,8 @@ class _Connection(ServerConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
+        # What asyncio reads at once, the library handles at once: 256 KiB of tiny messages would take it 0.3 s.
+        self.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's, but not in its interface
         prepare(self.transport)
         self.client = _WebsocketClient(self)
         self.owner.connected(self)
@@ -154,6 +157,11 @@ class _Connection(ServerConnection):
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
         self.owner.disconnected(self)
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self.transport.get_write_buffer_size() > HIGH_WATER:  # pings without end, the answers to which are not read
+            self.transport.abort()
 
     def pause_writing(self) -> None:
         super().pause_writing()

@@ -223,6 +223,23 @@ def test_a_client_that_does_not_answer_pings_is_closed(monkeypatch: pytest.Monke
     asyncio.run(story())
 
 
+def test_a_client_that_pings_without_end_and_reads_nothing_is_closed() -> None:
+    pings = (b"\x89\xfdmask" + b"x" * 125) * 100
+
+    async def story() -> None:
+        ears = Ears()
+        transport = documents(ears)
+        async with opened(transport):
+            peer = await dial_and_stand_still(transport)
+            with suppress(ConnectionError):
+                while not ears.gone:
+                    await asyncio.get_running_loop().sock_sendall(peer, pings)
+            await until(lambda: len(ears.gone) == 1)
+            peer.close()
+
+    asyncio.run(story())
+
+
 def test_clients_that_leave_in_either_way_are_gone() -> None:
     async def story() -> None:
         ears = Ears()
