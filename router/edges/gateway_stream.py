@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
 
@@ -24,7 +24,7 @@ ACCEPTED_PER_TURN = 16
 """Connections that are accepted before other work of the loop has its turn."""
 
 
-class StreamClient:
+class StreamClient(ABC):
     """A Client that has an outflow. `encode` is its transport's."""
 
     label: str
@@ -41,7 +41,7 @@ class StreamClient:
     def close(self) -> None: ...
 
 
-class StreamTransport:
+class StreamTransport(ABC):
     """Listens at `address`, and closes clients that stand still."""
 
     def __init__(self, address: Address, ears: Ears, max_clients: int) -> None:

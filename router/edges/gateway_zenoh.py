@@ -7,8 +7,6 @@ Knows no packet or document.
 from __future__ import annotations
 
 import asyncio
-import json
-import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -17,10 +15,10 @@ import zenoh
 
 from router.edges.gateway_binding import RETRY_SECONDS
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client, Ears, Frame
+from router.edges.gateway_zenoh_config import session_config, short, why_in_vain
 from router.edges.gateway_zenoh_inbox import Inbox, Queries
 from router.edges.gateway_zenoh_puts import Lost, Putter, key_of
 from router.edges.log import logger
-from router.edges.port_holder import port_holder
 from router.errors import StartError
 from router.table.model import Address, ZenohSettings
 
@@ -29,10 +27,6 @@ MOST = 16 << 20
 
 CLOSING_SECONDS = 2.0
 """How long a session has to end."""
-
-LARGE_MESSAGE_US = 2_000_000
-"""How long Zenoh may wait for room for the fragments of one large message before it drops it: 7 MB take 0.6 s at
-100 Mbit/s. By default it gives up after 50 ms."""
 
 
 class ZenohTransport:
@@ -57,17 +51,17 @@ class ZenohTransport:
         self._retrying: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        config = _config(self._settings)
+        config = session_config(self._settings)
         self._loop = asyncio.get_running_loop()
         self._inbox = Inbox(self._ears, self._most)
         self._queries = Queries(self._answer)
         try:
             await self._connect(config)
         except zenoh.ZError as error:
-            if why := _why_in_vain(self._settings, str(error)):
+            if why := why_in_vain(self._settings, str(error)):
                 await self.close()
                 raise StartError(why) from error
-            logger.warning("Zenoh cannot be reached yet: trying each second", key=self._key, why=_short(error))
+            logger.warning("Zenoh cannot be reached yet: trying each second", key=self._key, why=short(error))
             self._retrying = self._loop.create_task(self._retry(config))
 
     async def close(self) -> None:
@@ -118,7 +112,7 @@ class ZenohTransport:
             try:
                 await self._connect(config)
             except zenoh.ZError as error:
-                logger.debug("Zenoh cannot be reached yet", key=self._key, why=_short(error))
+                logger.debug("Zenoh cannot be reached yet", key=self._key, why=short(error))
             else:
                 logger.info("Zenoh is reached", key=self._key)
 
@@ -202,42 +196,3 @@ def _reply(queries: Sequence[zenoh.Query], root: str, frames: Sequence[Frame]) -
                 except zenoh.ZError as error:
                     failure = error
     return failure
-
-
-def _config(settings: ZenohSettings) -> zenoh.Config:
-    """Raises StartError."""
-    config: zenoh.Config = zenoh.Config()
-    values: dict[str, object] = {
-        "mode": settings.mode,
-        "scouting/multicast/enabled": not settings.connect and not settings.listen,
-        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": LARGE_MESSAGE_US,
-    }
-    if settings.connect:
-        values["connect/endpoints"] = settings.connect
-    if settings.listen:
-        values["listen/endpoints"] = settings.listen
-    for name, value in values.items():
-        try:
-            config.insert_json5(name, json.dumps(value))
-        except zenoh.ZError as error:
-            raise StartError(f"Zenoh does not take {value!r} for {name}: {_short(error)}") from error
-    return config
-
-
-def _why_in_vain(settings: ZenohSettings, error: str) -> str:
-    """What to do about an error that does not pass by itself; empty for others."""
-    if "not supported" in error:
-        return f"Zenoh cannot use one of these: {', '.join((*settings.connect, *settings.listen))}: {_short(error)}"
-    if "os error 98" not in error:
-        return ""
-    for locator in settings.listen:
-        port = re.search(r":(\d+)$", locator)
-        if port and locator in error:
-            holder = port_holder("tcp", int(port[1]))
-            return f"{locator} cannot be used: {holder} has the port; stop it, or choose another port"
-    return f"Zenoh cannot listen: {_short(error)}"
-
-
-def _short(error: object) -> str:
-    """Without the places in Zenoh's own source."""
-    return re.sub(r" at /\S+:\d+\.?", "", str(error))

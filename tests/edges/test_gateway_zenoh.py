@@ -278,6 +278,15 @@ def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
     asyncio.run(story())
 
 
+def test_a_key_that_is_none_is_refused() -> None:
+    async def story() -> None:
+        bad = Located("rovers//loki?", SourceSpan("routes/rover.yaml"))
+        with pytest.raises(StartError, match="rovers//loki"):
+            await ZenohTransport(ZenohSettings(bad), Ears()).open()
+
+    asyncio.run(story())
+
+
 @pytest.mark.parametrize("where", ["nonsense", "tcp/", "carrier-pigeon/127.0.0.1:7447"])
 def test_a_locator_that_zenoh_does_not_know_is_refused(where: str) -> None:
     async def story() -> None:
