@@ -16,10 +16,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from demo.expected import page_of
 from demo.places import taken_places
 from demo.processes import TABLE, Demo, DemoError
 from demo.verdict import Finding
 from router.errors import RouterError
+from router.table.model import Address, RouteTable
 from router.tools.wire import read_table
 
 ROOT = Path(__file__).parent.parent
@@ -40,9 +42,8 @@ def leave(number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + number)
 
 
-def play(console: Console) -> list[Finding]:
-    """Raises DemoError, or TableError for a broken table."""
-    table = read_table(TABLE)
+def play(console: Console, table: RouteTable) -> list[Finding]:
+    """Raises DemoError."""
     if problems := taken_places(table):
         told = "\n  ".join(problems)
         raise DemoError(f"addresses of {TABLE} are taken; does another demo, router or simulator run?\n  {told}")
@@ -55,8 +56,8 @@ def play(console: Console) -> list[Finding]:
         demo.end()
 
 
-def tell(console: Console, findings: list[Finding]) -> int:
-    """The verdict, and the exit code that belongs to it."""
+def tell(console: Console, findings: list[Finding], page: Address | None) -> int:
+    """The verdict, and the exit code that belongs to it. `page` is where a browser finds the table's dashboard."""
     verdicts = Table.grid(padding=(0, 2))
     for finding in findings:
         mark = Text("ok", style="green") if finding.ok else Text("FAIL", style="red")
@@ -65,6 +66,8 @@ def tell(console: Console, findings: list[Finding]) -> int:
     if all(finding.ok for finding in findings):
         console.print(f"\n{SUCCESS}\n", style="bold")
         console.print(NEXT_STEPS, highlight=False)
+        if page is not None:
+            console.print(f"  {f'http://{page}/':<37}  and in a browser, while those two run", highlight=False)
         return 0
     console.print("\nThe demo failed: see the lines above.", style="bold red")
     return 1
@@ -77,11 +80,12 @@ def main() -> int:
     console = Console()
     console.print(f"Starting router, simulated rover and two ROS 2 nodes on {TABLE} ...", highlight=False)
     try:
-        findings = play(console)
+        table = read_table(TABLE)
+        findings = play(console, table)
     except RouterError as error:
         console.print(f"The demo cannot run: {error}", style="red", highlight=False, markup=False)
         return 1
-    return tell(console, findings)
+    return tell(console, findings, page_of(table))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from router.table.model import EndpointKind, Route, RouteTable
+from router.compiler.topics import resolved
+from router.table.model import Address, EndpointKind, GatewayFormat, Route, RouteTable
 
 SILENT = "basestation"
 """The endpoint whose link is lost for a while."""
@@ -39,6 +40,19 @@ def command_topics(table: RouteTable) -> set[str]:
 
 def _topics(routes: list[Route]) -> dict[str, str]:
     return {topic.topic.value: topic.type.value for route in routes for topic in route.topics}
+
+
+def page_of(table: RouteTable) -> Address | None:
+    """Where the table has a page for browsers."""
+    for gateway in table.gateways.values():
+        if gateway.format is GatewayFormat.JSON and gateway.address is not None:
+            return gateway.address.value
+    return None
+
+
+def shown_topics(table: RouteTable) -> set[str]:
+    """What the page has to show: absolute names of what the router publishes."""
+    return {resolved(topic, table.node) for topic in inbound_topics(table)}
 
 
 def expected_arrivals(table: RouteTable) -> set[tuple[str, str]]:

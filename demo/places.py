@@ -1,11 +1,11 @@
-"""What the demo needs free on this machine: the table's UDP addresses, the metrics port, a ROS domain."""
+"""What the demo needs free on this machine: the table's addresses, and a ROS domain."""
 
 from __future__ import annotations
 
 import random
 import socket
 
-from router.table.model import Address, RouteTable
+from router.table.model import Address, RouteTable, Transport
 from router.tools import UsageError
 from router.tools.places import open_udp
 
@@ -17,14 +17,20 @@ def taken_places(table: RouteTable) -> list[str]:
     """One line for each address of the table that cannot be had."""
     wanted = {f"listener {name}": listener.address.value for name, listener in table.listeners.items()}
     wanted |= {f"endpoint {name}": endpoint.address.value for name, endpoint in table.endpoints.items()}
+    wanted |= {f"gateway {name}": each.receive.value for name, each in table.gateways.items() if each.receive}
     problems = []
     for purpose, address in wanted.items():
         try:
             open_udp(address, purpose).close()
         except UsageError as error:
             problems.append(str(error))
-    if table.metrics is not None and _is_taken(table.metrics.value):
-        problems.append(f"metrics: another process has TCP port {table.metrics.value}")
+    listening = {"metrics": table.metrics} if table.metrics is not None else {}
+    for name, gateway in table.gateways.items():
+        if gateway.transport.value is not Transport.UDP and gateway.address is not None:
+            listening[f"gateway {name}"] = gateway.address
+    for purpose, listens in listening.items():
+        if _is_taken(listens.value):
+            problems.append(f"{purpose}: another process has TCP port {listens.value}")
     return problems
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from rich.console import Console
 
 from demo.children import Child
-from demo.expected import FOUND, LOST, SILENT
+from demo.expected import FOUND, LOST, SILENT, page_of, shown_topics
+from demo.page import Shown, look
 from demo.places import free_ros_domain
 from demo.screen import open_screen
 from demo.verdict import Finding, judge
@@ -76,11 +77,17 @@ class Demo:
             while simulator.latest["seconds"] < DURATION:
                 time.sleep(REFRESH)
                 screen.show(window.add(self._snapshot()), listener.latest, simulator.latest)
+        shown = self._look_at_page()
         self._finish(talker)
         time.sleep(DRAINING)
         self._finish(simulator)
         time.sleep(SETTLING)
-        return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()))
+        return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()), shown)
+
+    def _look_at_page(self) -> Shown | None:
+        """None where the table has no page."""
+        address = page_of(self._table)
+        return look(address, shown_topics(self._table)) if address else None
 
     def _wait_until_up(self, listener: Child) -> None:
         """Until the ROS listener has found the router's topics: before that, the router withholds messages."""

@@ -73,12 +73,14 @@ class _Terminal:
     def show(self, view: View, heard: Said, simulated: Said) -> None:
         def on_ros(row: RouteRow) -> Text:
             """The slowest topic of the route counts: each shall get every message."""
-            route = self._routes[row.route]
-            topics = () if route.is_outbound else route.topics
+            route = self._routes.get(row.route)  # none is that of a gateway
+            topics = () if route is None or route.is_outbound else route.topics
             return _count([topic_count(heard, topic.topic.value) for topic in topics])
 
         def on_udp(row: RouteRow) -> Text:
-            route = self._routes[row.route]
+            route = self._routes.get(row.route)
+            if route is None:
+                return _count([])
             ends = [destination.endpoint.value for destination in route.destinations]
             return _count([arrival_count(simulated, endpoint, route.case.value) for endpoint in ends])
 

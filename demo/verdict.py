@@ -8,7 +8,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from demo.expected import FOUND, LOST, SILENT, expected_arrivals, halted_boards, inbound_topics, outbound_topics
+from demo.expected import (
+    FOUND,
+    LOST,
+    SILENT,
+    expected_arrivals,
+    halted_boards,
+    inbound_topics,
+    outbound_topics,
+    shown_topics,
+)
+from demo.page import Shown
 from router.table.model import RouteTable
 from router.tools.live import View
 from router.tools.live_view import reasons_text
@@ -29,14 +39,20 @@ class Finding:
     text: str
 
 
-def judge(table: RouteTable, heard: Said, simulated: Said, view: View | None) -> list[Finding]:
-    """`heard` and `simulated` are the last words of the ROS listener and the simulator, `view` the last scrape."""
+def judge(
+    table: RouteTable, heard: Said, simulated: Said, view: View | None, shown: Shown | None = None
+) -> list[Finding]:
+    """`heard` and `simulated` are the last words of the ROS listener and the simulator, `view` the last scrape.
+
+    `shown` is what the table's page had to show, None where it has none.
+    """
     return [
         _topics(table, heard),
         _arrivals(table, simulated),
         *_frames(table, simulated),
         _deadman(table, simulated),
-        _losses(view),
+        *([] if shown is None else [_page(table, shown)]),
+        _losses(table, view),
     ]
 
 
@@ -102,7 +118,19 @@ def _change(simulated: Said, board: str, state: str, start: float, end: float) -
     return next((float(change["at"]) for change in changes if start <= change["at"] < end), None)
 
 
-def _losses(view: View | None) -> Finding:
+def _page(table: RouteTable, shown: Shown) -> Finding:
+    """Whether somebody who opens the page late gets everything at once."""
+    wanted = shown_topics(table)
+    if not shown.has_page:
+        return Finding(False, "the dashboard's page or websocket cannot be reached")
+    if missing := sorted(wanted - shown.topics):
+        return Finding(False, f"the dashboard's page got nothing of {', '.join(missing)}")
+    if shown.early:
+        return Finding(False, f"the dashboard's page got data before its schema: {', '.join(sorted(shown.early))}")
+    return Finding(True, f"the dashboard's page got all {len(wanted)} topics, each with its schema first")
+
+
+def _losses(table: RouteTable, view: View | None) -> Finding:
     if view is None:
         return Finding(False, "the router's metrics could not be read")
     lost, wanted = Counter(view.rejected), Counter[str]()
@@ -113,6 +141,6 @@ def _losses(view: View | None) -> Finding:
         lost["kernel_drops"] = view.kernel_drops
     if lost:
         return Finding(False, f"the router lost messages: {reasons_text(lost)}")
-    received = sum(row.received for row in view.routes)
+    received = sum(row.received for row in view.routes if row.route not in table.gateways)
     withheld = f", withheld {reasons_text(wanted)} as the table asks" if wanted else ""
     return Finding(True, f"the router took {received} messages and lost none{withheld}")

@@ -15,11 +15,13 @@ from sensor_msgs.msg import FluidPressure, Imu, MagneticField, NavSatFix, NavSat
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import Engine
-from router.table.model import Route, RouteTable
+from router.table.model import Route, RouteTable, Transport
 from tests.engine.plain import plain_outlets
 
 ROUTES = Path(__file__).parent.parent / "routes"
 Publish = Callable[..., dict[str, bytes]]
+EPHEMERAL = 32_768
+"""From this port on, Linux hands them out by itself."""
 WALL_NS = 1_700_000_000_123_456_789
 
 # As the system's list of payload cases has it: H a hardware board, R ROS on the rover, B the basestation.
@@ -134,6 +136,20 @@ def test_simulation_table_is_the_rover_on_loopback_addresses_of_its_own(rover: P
     assert len({address.host for address in addresses}) == len(addresses)
     assert list(map(flow, table.routes)) == list(map(flow, rover.table.routes))
     assert depths(table) == depths(rover.table)
+
+
+def test_a_browser_finds_the_rover_and_can_only_move_a_simulated_one(rover: Program) -> None:
+    (watched,), (tried,) = ([*table.gateways.values()] for table in (rover.table, program_of("sim.yaml").table))
+    assert (watched.transport.value, watched.inbound) == (Transport.WEBSOCKET, ())
+    assert watched.address is not None
+    assert watched.address.value.host == "0.0.0.0"
+    assert tried.address is not None
+    assert tried.address.value.host == "127.0.0.1"
+    assert tried.address.value.port < EPHEMERAL
+    commanded = {topic.topic.value for route in rover.table.routes if route.is_outbound for topic in route.topics}
+    for inbound in tried.inbound:
+        assert inbound.topic.topic.value in commanded
+        assert inbound.ttl is not None
 
 
 def test_legacy_table_sends_everything_to_both_and_publishes_four_topics(rover: Program) -> None:

@@ -37,7 +37,7 @@ endpoints:
 {endpoints}"""
 """The rover's table with loopback addresses, to be filled in by `Site.table`."""
 
-IMPATIENT_ROVER = ROVER.replace("tests/acceptance/patient.yaml", "routes/rover.yaml")
+IMPATIENT_ROVER = ROVER.replace("patient.yaml", "quiet.yaml")
 """With the rover's own times for what is stale, and for its deadmen."""
 
 

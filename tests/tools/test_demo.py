@@ -9,19 +9,31 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from demo.children import Child
-from demo.expected import FOUND, LOST, command_topics, expected_arrivals, inbound_topics, outbound_topics
+from demo.expected import (
+    FOUND,
+    LOST,
+    command_topics,
+    expected_arrivals,
+    inbound_topics,
+    outbound_topics,
+    page_of,
+    shown_topics,
+)
+from demo.page import Shown, look
 from demo.places import free_ros_domain, taken_places
 from demo.verdict import judge
-from router.table.model import RouteTable
+from router.table.model import Address, Located, RouteTable
 from router.tools.live import RouteRow, TargetRow, View
 from router.tools.places import open_udp
 from router.tools.wire import read_table
+from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent.parent
 LASTING = "import time\nprint('{\"ready\": true}', flush=True)\ntime.sleep(60)\n"
@@ -49,19 +61,26 @@ def all_arrived(table: RouteTable) -> dict[str, Any]:
     return {"received": received, "undecodable": {}, "changes": changes, "frames": frames}
 
 
+def all_shown(table: RouteTable) -> Shown:
+    return Shown(True, frozenset(shown_topics(table)) | {"/rosout"})
+
+
 @pytest.fixture(scope="module")
 def sim_table() -> RouteTable:
     return read_table(ROOT / "routes" / "sim.yaml")
 
 
-def complaints(table: RouteTable, heard: dict[str, Any], arrived: dict[str, Any], view: View) -> list[str]:
-    return [finding.text for finding in judge(table, heard, arrived, view) if not finding.ok]
+def complaints(
+    table: RouteTable, heard: dict[str, Any], arrived: dict[str, Any], view: View, shown: Shown | None = None
+) -> list[str]:
+    return [finding.text for finding in judge(table, heard, arrived, view, shown) if not finding.ok]
 
 
 def test_all_is_well_when_everything_arrived_and_nothing_was_lost(sim_table: RouteTable) -> None:
     view = seen(dropped={"rate_limited": 5, "stale": 1})
-    assert complaints(sim_table, all_heard(sim_table), all_arrived(sim_table), view) == []
-    *_, losses = judge(sim_table, all_heard(sim_table), all_arrived(sim_table), view)
+    everything = sim_table, all_heard(sim_table), all_arrived(sim_table), view, all_shown(sim_table)
+    assert complaints(*everything) == []
+    *_, losses = judge(*everything)
     assert losses.text.endswith("lost none, withheld 5 rate_limited, 1 stale as the table asks")
 
 
@@ -130,6 +149,21 @@ def test_any_loss_fails(sim_table: RouteTable, view: View, complaint: str) -> No
     assert complaints(sim_table, all_heard(sim_table), all_arrived(sim_table), view) == [complaint]
 
 
+def test_what_a_page_did_not_show_fails(sim_table: RouteTable) -> None:
+    everything = all_shown(sim_table)
+    for shown, complaint in (
+        (Shown(), "the dashboard's page or websocket cannot be reached"),
+        (everything._replace(topics=everything.topics - {"/imu/mag"}), "the dashboard's page got nothing of /imu/mag"),
+        (everything._replace(early=frozenset({"/imu/mag"})), "page got data before its schema: /imu/mag"),
+    ):
+        (told,) = complaints(sim_table, all_heard(sim_table), all_arrived(sim_table), seen(), shown)
+        assert told.endswith(complaint)
+
+
+def test_a_page_that_nobody_serves_shows_nothing() -> None:
+    assert look(Address("127.0.0.1", free_port(kind=socket.SOCK_STREAM)), {"/imu/mag"}) == Shown()
+
+
 def test_silence_of_the_witnesses_fails(sim_table: RouteTable) -> None:
     assert len(complaints(sim_table, {}, {}, seen())) == 4
 
@@ -139,6 +173,17 @@ def test_addresses_that_are_taken_are_named(table: RouteTable) -> None:
     with open_udp(table.endpoints["board"].address.value, "other"):
         (problem,) = taken_places(table)
     assert problem.startswith("endpoint board: cannot bind 127.0.6.30:")
+
+
+def test_a_port_of_a_gateway_that_is_taken_is_named(table: RouteTable, sim_table: RouteTable) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        address = Address(*other.getsockname())
+        dashboard = sim_table.gateways["dashboard"]
+        listens = Located(address, dashboard.span)
+        beside = replace(table, gateways={"dashboard": replace(dashboard, address=listens)})
+        assert page_of(beside) == address
+        assert taken_places(beside) == [f"gateway dashboard: another process has TCP port {address}"]
+    assert taken_places(beside) == []
 
 
 def test_a_ros_domain_with_a_participant_is_not_free() -> None:
