@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import resource
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -301,4 +302,7 @@ def _version() -> str:
 def tune_interpreter() -> None:
     """Settings of the whole process, for whoever owns it: call once, after start, before traffic."""
     gc.freeze()  # what start-up made lives as long as the process: the collector need not look at it again
+    may_open, may_ask_for = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if may_open not in (resource.RLIM_INFINITY, may_ask_for):  # 1024 are too few for as many clients of a gateway
+        resource.setrlimit(resource.RLIMIT_NOFILE, (may_ask_for, may_ask_for))
     sys.setswitchinterval(0.0005)  # the receive thread waits no longer than this for a busy thread to let it in

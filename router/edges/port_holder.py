@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 _LISTENING = {"udp": "07", "tcp": "0A"}
@@ -31,10 +32,12 @@ def _inodes(protocol: str, port: int) -> Iterator[str]:
 
 def _open_files(process: Path) -> Iterator[str]:
     try:
-        for descriptor in (process / "fd").iterdir():
-            yield str(descriptor.readlink())
+        descriptors = list((process / "fd").iterdir())
     except OSError:  # somebody else's process, or one that has just ended
         return
+    for descriptor in descriptors:
+        with suppress(OSError):  # closed meanwhile, as the one by which they were listed is
+            yield str(descriptor.readlink())
 
 
 def _name(process: Path) -> str:

@@ -34,6 +34,9 @@ if TYPE_CHECKING:  # which imports rclpy
 
 T = TypeVar("T")
 
+MOST_ASKED = 4096
+"""Bytes of what a client may send that may publish nothing: it can only ask for schemas."""
+
 PAGE = Path(__file__).with_name("page.html")
 
 
@@ -136,11 +139,12 @@ def _outlets(
 
 
 def _transport(settings: Gateway, ears: Ears) -> Transport:
-    address, most = settings.address, settings.max_message
+    address = settings.address
+    most = settings.max_message if settings.inbound else MOST_ASKED
     if settings.zenoh is not None:
         from router.edges.gateway_zenoh import ZenohTransport  # takes 50 ms to import
 
-        return ZenohTransport(settings.zenoh, ears)
+        return ZenohTransport(settings.zenoh, ears, most)
     assert address is not None  # noqa: S101 - the schema wants one for all others
     if settings.transport.value is Way.UDP:
         return UdpTransport(address.value, settings.receive.value if settings.receive else None, ears)
