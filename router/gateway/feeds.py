@@ -47,7 +47,8 @@ class Feed:
         self._tap: TopicTap | None = None
         self._is_reliable = self._keeps = False
         self._depth = 1
-        self._arrived = 0
+        self._arrived = self._taken = self._missed = 0
+        self._is_even = False  # `_taken` counts from when it was level with `_arrived`
         self._waits = False  # something has come that was not taken
         self._turn: asyncio.Handle | None = None
         self._last: Sample | None = None
@@ -58,6 +59,11 @@ class Feed:
         if not self._eaches:
             self._count()
         return self._arrived
+
+    @property
+    def missed(self) -> int:
+        """Messages so far that were to be handed on, and gave way to newer ones in the middleware's queue before."""
+        return self._missed
 
     @property
     def is_open(self) -> bool:
@@ -78,11 +84,11 @@ class Feed:
         return self._last
 
     def follow(self, wanted: Choice, each: Each | None) -> None:
-        """One follower more. Subscribes, anew if that was with another QoS or not deep enough. Raises StartError."""
-        self._followers += 1
-        if each:
-            self._eaches += (each,)
-        depth = DEPTH if self._eaches else self._depth  # which stays: to go back would lose what comes meanwhile
+        """One follower more. Subscribes, anew if that was with another QoS or not deep enough.
+
+        What had come by then is for those who followed before. Raises StartError.
+        """
+        depth = DEPTH if each or self._eaches else self._depth  # which stays: to go back would lose what comes meanwhile
         if (wanted.is_reliable, wanted.keeps, depth) != (self._is_reliable, self._keeps, self._depth):
             self._take(self._depth)
             self.close()
@@ -91,6 +97,10 @@ class Feed:
                 self.topic, self._type.message_class, is_reliable=wanted.is_reliable, keeps=wanted.keeps, depth=depth
             )
             self._is_reliable, self._keeps, self._depth = wanted.is_reliable, wanted.keeps, depth
+        self._followers += 1
+        if each:
+            self._is_even = self._is_even and bool(self._eaches)
+            self._eaches += (each,)
         self._listen(self._tap)
 
     def unfollow(self, each: Each | None) -> None:
@@ -120,17 +130,26 @@ class Feed:
             return
         self._loop.add_reader(tap.fd, self._on_arrival)
         if self._turn is None:
-            self._turn = self._loop.call_soon(self._serve)  # what was counted while nobody wanted it
+            self._turn = self._loop.call_soon(self._on_turn)  # what was counted while nobody wanted it
 
     def _on_arrival(self) -> None:
         self._count()
         if self._turn is None:
             self._serve()
 
-    def _serve(self) -> None:
+    def _on_turn(self) -> None:
         self._turn = None
+        self._count()
+        self._serve()
+
+    def _serve(self) -> None:
+        """What was counted by now is taken here, or was lost."""
         if self._take(TURN) == TURN:
-            self._turn = self._loop.call_soon(self._serve)
+            self._turn = self._loop.call_soon(self._on_turn)
+        elif self._is_even:
+            self._missed = max(self._missed, self._arrived - self._taken)
+        else:
+            self._is_even, self._taken = True, self._arrived - self._missed
 
     def _count(self) -> None:
         if self._tap and (came := self._tap.arrived()):
@@ -142,6 +161,7 @@ class Feed:
         taken = 0
         while taken < most and self._tap and (message := self._tap.take()):
             taken += 1
+            self._taken += 1
             self._last = Sample(self.topic, self._type, *message)
             for each in self._eaches:
                 self._hand_on(each, self._last)

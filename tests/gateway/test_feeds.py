@@ -289,6 +289,50 @@ def test_it_adapts_when_a_publisher_of_less_quality_joins(publisher: Publish) ->
     run(story())
 
 
+def test_whoever_follows_again_for_another_quality_gets_no_message_twice(publisher: Publish) -> None:
+    samples: list[bytes] = []
+
+    def each(_: Feed, sample: Sample) -> None:
+        samples.append(sample.cdr)
+
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", PLAIN, each)
+            peer = publisher(STRING)
+            await matched(peer)
+            peer.publish([HELLO])
+            peer.await_receipt()  # holds up the loop: what came is not taken yet
+            assert samples == []
+            assert hub.join("/greeting", PLAIN._replace(is_reliable=False), each) is feed
+            hub.leave(feed, each)
+            assert samples == [HELLO]
+
+    run(story())
+
+
+def test_what_gave_way_in_the_queue_is_counted_once_and_nothing_else(publisher: Publish) -> None:
+    samples: list[bytes] = []
+
+    async def story() -> None:
+        async with opened() as hub:
+            feed = hub.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+            peer = publisher(STRING)
+            await matched(peer)
+            peer.publish([HELLO])
+            await until(lambda: samples == [HELLO])
+            peer.publish([HELLO] * 250)
+            peer.await_receipt()
+            await until(lambda: feed.arrived == 251)
+            peer.publish([cdr("last")])
+            await until(lambda: samples[-1] == cdr("last"))
+            assert (len(samples), feed.missed) == (102, 150)
+            peer.close()
+            await asyncio.sleep(0.5)  # a publisher that goes is no message
+            assert (feed.arrived, feed.missed) == (252, 150)
+
+    run(story())
+
+
 @pytest.mark.parametrize("is_each", [False, True])
 def test_what_was_kept_comes_to_a_late_feed(publisher: Publish, is_each: bool) -> None:
     publisher(STRING, "--transient-local").publish([HELLO])
