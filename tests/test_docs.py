@@ -1,19 +1,41 @@
-"""The generated reference pages are up to date, and the examples of the route table are good ones."""
+"""The generated reference pages are up to date, and examples do what the text says of them."""
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import pytest
 
 from router.compiler import check_table
+from router.gateway.compression import compress
+from router.gateway.documents import PublishRequest, request
+from router.gateway.json_code import json_writer
+from router.gateway.json_reading import cdr_builder
+from router.gateway.packets import Packet, pack
+from router.gateway.schema_text import schema_text
+from router.gateway.style import Style
+from router.types.ros import ros_interfaces
+from tests.gateway.fake_gateway import FakeGateway
+from tests.ports import free_port
 
 DOCS = Path(__file__).parent.parent / "docs"
 ROVER = DOCS.parent / "routes" / "rover.yaml"
-EXAMPLES = re.findall(r"^```yaml\n(.*?)^```", (DOCS / "table.md").read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
 PAGES = runpy.run_path(str(DOCS / "generate.py"))["PAGES"]
+PATIENCE = 30.0
+
+
+def examples(page: str, language: str) -> list[str]:
+    text = (DOCS / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -21,8 +43,99 @@ def test_page_is_what_the_code_says(name: str) -> None:
     assert (DOCS / name).read_text(encoding="utf-8") == PAGES[name](), "run `python docs/generate.py`"
 
 
-@pytest.mark.parametrize("example", EXAMPLES)
+@pytest.mark.parametrize("example", examples("table.md", "yaml") + examples("gateway.md", "yaml"))
 def test_each_example_of_a_table_is_good_in_place_of_what_the_rover_has(tmp_path: Path, example: str) -> None:
     table = tmp_path / "table.yaml"
     table.write_text(f"extends: {ROVER}\n{example}")
     assert list(map(str, check_table(table).diagnostics)) == []
+
+
+# -- docs/gateway.md -----------------------------------------------------------------------------------------------
+
+VECTOR = ros_interfaces().get("geometry_msgs/msg/Vector3")
+TIME = 1700000000.25
+
+
+def vector_packet(**values: float) -> Packet:
+    assert VECTOR is not None
+    cdr = cdr_builder(VECTOR, Style.PLAIN)(values)
+    return Packet(TIME, False, "/imu/rate", VECTOR.name, json_writer(VECTOR, Style.WRAPPED)(cdr).encode())
+
+
+def test_the_packet_that_is_taken_apart_is_one_of_the_gateway() -> None:
+    [example] = examples("gateway.md", "hex")
+    data = bytes.fromhex("".join(line.partition("   ")[0] for line in example.splitlines()))
+    assert data == pack(vector_packet(x=1.0, y=0.1, z=-2.5))
+    assert f"These {len(data)} bytes" in (DOCS / "gateway.md").read_text(encoding="utf-8")
+
+
+def test_schema_and_documents_are_as_they_are_shown() -> None:
+    assert VECTOR is not None
+    schema, sent, received = examples("gateway.md", "json")
+    assert json.loads(schema) == json.loads(schema_text(VECTOR))
+    data = next(line for line in map(json.loads, sent.splitlines()) if line["op"] == "data")
+    cdr = cdr_builder(VECTOR, Style.PLAIN)(data["data"])
+    assert json.loads(json_writer(VECTOR, Style.PLAIN)(cdr)) == data["data"]
+    published = request(received.splitlines()[0].encode())
+    assert isinstance(published, PublishRequest)
+    assert published.type_name == "geometry_msgs/msg/Twist"
+    twist = ros_interfaces().get(published.type_name)
+    assert twist is not None
+    assert cdr_builder(twist, Style.PLAIN)(published.data)
+
+
+@contextmanager
+def program(folder: Path, name: str, *arguments: object) -> Iterator[IO[str]]:
+    """What an example that begins with its own name prints, while it runs."""
+    [text] = (text for text in examples("gateway.md", "python") if text.startswith(f"# {name}: python {name} "))
+    (folder / name).write_text(text)
+    command = [sys.executable, name, *map(str, arguments)]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        try:
+            yield running.stdout
+        finally:
+            running.kill()
+
+
+def test_the_client_shows_data_whose_schema_it_has(tmp_path: Path) -> None:
+    assert VECTOR is not None
+    port = free_port()
+    plain = vector_packet(x=1.0, y=0.1, z=-2.5)
+    schema = plain._replace(payload=schema_text(VECTOR).encode())
+    compressed = plain._replace(is_compressed=True, payload=compress(plain.payload, 3))
+    early = plain._replace(type_name="geometry_msgs/msg/Point")
+    with (
+        program(tmp_path, "client.py", "127.0.0.1", port) as printed,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway,
+    ):
+        while not holds_udp(port):
+            pass
+        for packet in (early, schema, plain, compressed):
+            gateway.sendto(pack(packet), ("127.0.0.1", port))
+        line = f'{TIME:.3f} /imu/rate {{"x": [1.0], "y": [0.1], "z": [-2.5]}}\n'
+        assert [printed.readline(), printed.readline()] == [line, line]
+
+
+def holds_udp(port: int) -> bool:
+    """Whether somebody has the port of 127.0.0.1."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return True
+    return False
+
+
+def test_the_client_that_sends_sends_what_the_simulated_rover_lets_in(tmp_path: Path) -> None:
+    table = check_table(ROVER.with_name("sim.yaml"), {})
+    [inbound] = table.gateways[0].inbound
+    gateway = FakeGateway()
+    try:
+        with program(tmp_path, "drive.py", f"ws://127.0.0.1:{gateway.port}/"):
+            sent = gateway.received.get(timeout=PATIENCE)
+    finally:
+        gateway.close()
+    assert (sent["op"], sent["topic"]) == ("publish", inbound.topic)
+    assert isinstance(sent["time"], float)
+    assert cdr_builder(inbound.type, Style.PLAIN)(sent["data"])
