@@ -114,7 +114,7 @@ def test_the_client_shows_data_whose_schema_it_has(tmp_path: Path) -> None:
     plain = vector_packet(x=1.0, y=0.1, z=-2.5)
     schema = plain._replace(payload=schema_text(VECTOR).encode())
     compressed = plain._replace(is_compressed=True, payload=compress(plain.payload, 3))
-    early = plain._replace(type_name="geometry_msgs/msg/Point")
+    early = plain._replace(topic="/early", type_name="geometry_msgs/msg/Point")
     packets = [pack(packet) for packet in (early, schema, plain, compressed)]
     line = f'{TIME:.3f} /imu/rate {{"x": [1.0], "y": [0.1], "z": [-2.5]}}\n'
     with program(tmp_path, "client.py", "127.0.0.1", port) as printed, sent_again_and_again(packets, port):
