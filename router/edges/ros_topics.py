@@ -88,7 +88,7 @@ class RosTopics:
             return TopicTap(
                 self._node, topic, message_class, hearing(is_reliable=is_reliable, keeps=keeps, depth=depth)
             )
-        except RCL_ERRORS as error:
+        except (*RCL_ERRORS, OSError) as error:
             raise StartError(f"topic '{topic}' cannot be subscribed to: {error}") from error
 
     def _our_types(self, topic: str) -> set[str]:
@@ -107,7 +107,7 @@ class TopicTap:
     """
 
     def __init__(self, node: Node, topic: str, message_class: Any, qos: QoSProfile) -> None:
-        """Raises one of `ros_node.RCL_ERRORS`."""
+        """Raises one of `ros_node.RCL_ERRORS`, or OSError where no more files may be open."""
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         with ExitStack() as opening:
             self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)

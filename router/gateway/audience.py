@@ -100,13 +100,15 @@ class Audience:
         return [frame for frame in frames if len(frame.data) <= LARGE]
 
     async def _pump(self) -> None:
-        while len(self._bulk):
-            frames = self._bulk.take(1)
-            wire = self._on_wire(frames)
-            for start in range(0, len(wire), PUMPED):
+        try:
+            while len(self._bulk):
+                frames = self._bulk.take(1)
+                wire = self._on_wire(frames)
+                for start in range(0, len(wire), PUMPED):
+                    for each in self.subscribers.values():
+                        each.client.write(wire[start : start + PUMPED])
+                    await asyncio.sleep(PUMP_S)
                 for each in self.subscribers.values():
-                    each.client.write(wire[start : start + PUMPED])
-                await asyncio.sleep(PUMP_S)
-            for each in self.subscribers.values():
-                each.sent += len(frames)
-        self._is_pumping = False
+                    each.sent += len(frames)
+        finally:
+            self._is_pumping = False

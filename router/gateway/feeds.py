@@ -88,7 +88,8 @@ class Feed:
 
         What had come by then is for those who followed before. Raises StartError.
         """
-        depth = DEPTH if each or self._eaches else self._depth  # which stays: to go back would lose what comes meanwhile
+        # It stays deep: to go back would lose what comes meanwhile.
+        depth = DEPTH if each or self._eaches else self._depth
         if (wanted.is_reliable, wanted.keeps, depth) != (self._is_reliable, self._keeps, self._depth):
             self._take(self._depth)
             self.close()

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from router.gateway.feeds import Feed, Sample
 from router.gateway.following import Choice
+from router.table.model import EACH
 
 MOST_UNCONVERTED = 4
 """Large messages of one topic that wait to be converted, where every message is to be sent."""
@@ -14,9 +15,9 @@ MOST_UNCONVERTED = 4
 
 @dataclass(slots=True)
 class Served:
-    """`period` in ns, EACH for every message. `counted` and `told` are what of `feed.arrived` is in the books, and was
-    told to clients as a rate. `sample` is the latest one that was looked at. `is_busy` while a large one is converted,
-    for which `unconverted` wait.
+    """`period` in ns, EACH for every message. `counted` is what of `feed.arrived` is in the books, of `feed.missed`
+    where every message is handed on; `told` is what of `feed.arrived` was told to clients as a rate. `sample` is the
+    latest one that was looked at. `is_busy` while a large one is converted, for which `unconverted` wait.
     """
 
     feed: Feed
@@ -26,10 +27,20 @@ class Served:
     told: int = 0
     sample: Sample | None = None
     is_busy: bool = False
+    has_ended: bool = False
     unconverted: deque[Sample] = field(default_factory=deque)
 
+    @classmethod
+    def fresh(cls, feed: Feed, choice: Choice, period: int) -> Served:
+        """One that is served from now on. A latest value that is there already, because another gateway follows the
+        topic, counts as one that comes: publishers that keep it for late joiners do not send it again.
+        """
+        known = feed.latest() is not None
+        arrived = feed.arrived
+        return cls(feed, choice, period, counted=feed.missed if period == EACH else arrived - known, told=arrived)
+
     def came(self) -> int:
-        """Messages that came since this was asked last."""
-        arrived = self.feed.arrived
-        came, self.counted = arrived - self.counted, arrived
+        """Messages since this was asked last; where every one is handed on, those that were not."""
+        total = self.feed.missed if self.period == EACH else self.feed.arrived
+        came, self.counted = total - self.counted, total
         return came

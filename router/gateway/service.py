@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack
 from typing import Union
 
 from router.compiler.program import GatewayPlan
@@ -20,11 +21,13 @@ from router.gateway.encoding import Encoding, encoding
 from router.gateway.inlet import Checked, Inlet, RefusedError
 from router.gateway.json_reading import InvalidMessageError, example
 from router.gateway.ledger import Ledger
+from router.gateway.outlet import Outlet
 from router.gateway.packets import PacketError, TooLargeError
 from router.gateway.schema_text import schema_text
 from router.gateway.style import Style
+from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks
-from router.gateway.topics import Surroundings, Topics
+from router.gateway.topics import Topics
 from router.table.model import Transport as Way
 
 MOST_READING = 4
@@ -55,9 +58,10 @@ class GatewayService:
         self._encoding = encoding(settings)
         self._tasks = Tasks(around.failed)
         self.audience = Audience(self.name, self._encoding, ledger, self._tasks, around.clock_ns, around.wall_s)
-        self._topics = Topics(
-            plan, around, self._encoding, ledger, self._tasks, lambda: bool(self.audience), self._deliver
+        outlet = Outlet(
+            settings, around, self._encoding, ledger, self._tasks, lambda: bool(self.audience), self._deliver
         )
+        self._topics = Topics(plan, around, outlet, ledger, self._tasks, self._deliver)
         self._transport = transport(self)
         self._answered = -_ANSWER_NS
         self._reading = 0
@@ -76,9 +80,10 @@ class GatewayService:
 
     async def close(self) -> None:
         """Nothing is sent or received any more."""
-        await self._tasks.close()
-        await self._transport.close()
-        self._topics.close()
+        async with AsyncExitStack() as closing:  # in the opposite order: who comes or sends something begins tasks
+            closing.push_async_callback(self._tasks.close)
+            closing.callback(self._topics.close)
+            closing.push_async_callback(self._transport.close)
 
     def _deliver(self, frames: Sequence[Frame]) -> None:
         self.audience.send(frames, self._transport)
@@ -121,7 +126,7 @@ class GatewayService:
         """What takes long, in another thread."""
         try:
             understood = await asyncio.get_running_loop().run_in_executor(
-                self._around.worker, _understood, self._encoding, self._inlet, data
+                self._around.reading, _understood, self._encoding, self._inlet, data
             )
         finally:
             self._reading -= 1
@@ -130,8 +135,7 @@ class GatewayService:
     def _settle(self, client: Client, understood: Understood, arrived_ns: int) -> None:
         match understood:
             case RefusedError():
-                self._inlet.reject(understood.reason, str(understood))
-                self._tell(client, understood)
+                self._refuse(client, understood)
             case SchemaRequest():
                 self._show_schemas(client, understood.type_name)
             case Checked():
@@ -141,6 +145,10 @@ class GatewayService:
                     self._tell(client, refused)
 
     # -- answers -------------------------------------------------------------------------------------------------
+
+    def _refuse(self, client: Client, refused: RefusedError) -> None:
+        self._inlet.reject(refused.reason, str(refused))
+        self._tell(client, refused)
 
     def _tell(self, client: Client, refused: RefusedError) -> None:
         subscriber = self.audience.subscribers.get(client)
@@ -152,7 +160,7 @@ class GatewayService:
         now = self._around.clock_ns()
         subscriber = self.audience.subscribers.get(client)
         if subscriber is None or now - self._answered < _ANSWER_NS:
-            self._inlet.reject("rate_limited", "schemas are sent 10 times per second at most")
+            self._refuse(client, RefusedError("rate_limited", "schemas are sent 10 times per second at most"))
             return
         self._answered = now
         self.audience.send_to(subscriber, self._topics.snapshot(type_name))

@@ -23,6 +23,13 @@ class Tasks:
         """Calls `work` now and then on a grid of `period_s`; what it missed is left out."""
         self.run(self._each(period_s, work))
 
+    async def attempt(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Calls `work` once, and waits for its end, whatever that is."""
+        try:
+            await work()
+        except Exception as error:  # noqa: BLE001 what comes next matters as much
+            self._failed(error)
+
     async def close(self) -> None:
         """Ends them all, wherever they are."""
         running = list(self._running)
@@ -34,10 +41,7 @@ class Tasks:
         clock = asyncio.get_running_loop().time
         due = clock()
         while True:
-            try:
-                await work()
-            except Exception as error:  # noqa: BLE001 the next turn matters as much
-                self._failed(error)
+            await self.attempt(work)
             due += period_s * max(1, int((clock() - due) / period_s))
             await asyncio.sleep(due - clock())
 

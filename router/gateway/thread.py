@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,7 +25,7 @@ from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
 from router.gateway.style import Style
 from router.gateway.subscriber import Subscriber
-from router.gateway.topics import Surroundings
+from router.gateway.surroundings import Surroundings
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as Way
 from router.types.ros import ros_interfaces
@@ -59,13 +60,14 @@ class GatewayThread:
         self._books = program.books
         self._counts = counts
         self._outlets = _outlets(program, ros, feed, report)
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="gateway bulk")
+        self._converting = ThreadPoolExecutor(1, thread_name_prefix="gateway bulk")
+        self._reading = ThreadPoolExecutor(1, thread_name_prefix="gateway reading")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
         self._services: list[GatewayService] = []
         self._hub = Hub(ros.topics, ros_interfaces(), self._loop)
-        self._around = Surroundings(self._hub, self._worker, report, failed, monotonic_ns, wall_ns)
+        self._around = Surroundings(self._hub, self._converting, self._reading, failed, monotonic_ns, wall_ns)
         self._thread.start()
         try:
             for plan in program.gateways:
@@ -103,16 +105,20 @@ class GatewayThread:
 
     def stop(self) -> None:
         """Nothing is received any more when this returns, nor sent."""
-        self._call(self._close())
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._worker.shutdown()
-        self._loop.close()
+        try:
+            self._call(self._close())
+        finally:  # a thread that goes on would keep the process
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+            self._converting.shutdown()
+            self._reading.shutdown()
+            self._loop.close()
 
     async def _close(self) -> None:
-        for service in self._services:
-            await service.close()
-        self._hub.close()
+        async with AsyncExitStack() as closing:  # all of them, whatever one raises
+            closing.callback(self._hub.close)
+            for service in self._services:
+                closing.push_async_callback(service.close)
 
     def _call(self, work: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()

@@ -1,0 +1,220 @@
+"""A gateway between topics and clients that the test itself plays: no ROS, no network."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, cast
+
+from router.compiler import check_table
+from router.compiler.program import GatewayPlan, Program
+from router.edges.clock import monotonic_ns, wall_ns
+from router.edges.gateway_transport import Client, Ears, Frame
+from router.edges.ros_topics import RosTopics, SeenPublisher
+from router.engine import Report
+from router.gateway.feeds import Hub
+from router.gateway.inlet import Inlet, InletOutlets
+from router.gateway.ledger import Ledger
+from router.gateway.service import GatewayService
+from router.gateway.style import Style
+from router.gateway.surroundings import Surroundings
+from router.table.model import Address
+from router.types.ros import ros_interfaces
+
+INTERFACES = ros_interfaces()
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+node: {{name: router}}
+listen: {{here: {{address: 127.0.0.1:25000}}}}
+endpoints: {{board: {{address: 127.0.0.2:8, kind: board}}}}
+routes: {{}}
+gateways: {{{gateways}}}
+"""
+
+
+def program(folder: Path, gateways: str) -> Program:
+    """Of a table with these gateways, a YAML flow mapping without its braces."""
+    path = folder / "table.yaml"
+    text = TABLE.format(protos=Path(__file__).parents[2] / "protos", gateways=gateways)
+    path.write_text(text, encoding="utf-8")
+    made = check_table(path, {}).program
+    assert made is not None
+    return made
+
+
+class Tap:
+    """What stands for a subscription."""
+
+    def __init__(self, depth: int) -> None:
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._waiting: deque[bytes] = deque(maxlen=depth)
+
+    def put(self, cdr: bytes) -> None:
+        self._waiting.append(cdr)
+        os.eventfd_write(self.fd, 1)
+
+    def arrived(self) -> int:
+        try:
+            return os.eventfd_read(self.fd)
+        except BlockingIOError:
+            return 0
+
+    def take(self) -> tuple[bytes, int] | None:
+        return (self._waiting.popleft(), wall_ns()) if self._waiting else None
+
+    def close(self) -> None:
+        os.close(self.fd)
+
+
+class Graph:
+    """Topics by name, each with one publisher of a type; what it does wrong is in `faults`, for a topic or "names"."""
+
+    def __init__(self, types: Mapping[str, str]) -> None:
+        self.types = dict(types)
+        self.faults: dict[str, Exception] = {}
+        self.taps: dict[str, Tap] = {}
+
+    def names(self) -> list[str]:
+        if fault := self.faults.pop("names", None):
+            raise fault
+        return [*self.types]
+
+    def publishers(self, topic: str) -> list[SeenPublisher]:
+        return [SeenPublisher(self.types[topic], is_reliable=True, keeps=False, is_ours=False)]
+
+    def load(self, type_name: str, definitions: object) -> object:
+        return type_name
+
+    def tap(self, topic: str, message_class: object, *, is_reliable: bool, keeps: bool, depth: int) -> Tap:
+        if fault := self.faults.get(topic):
+            raise fault
+        self.taps[topic] = Tap(depth)
+        return self.taps[topic]
+
+
+class PlayedClient:
+    def __init__(self) -> None:
+        self.label = "a test"
+        self.frames: list[Frame] = []
+
+    def write(self, frames: Sequence[Frame]) -> None:
+        self.frames += frames
+
+    def backlog(self) -> int:
+        return 0
+
+    def close(self) -> None:
+        """There is nothing to end."""
+
+    @property
+    def values(self) -> list[Frame]:
+        return [frame for frame in self.frames if frame.topic.startswith("/") and not frame.is_schema]
+
+
+class PlayedTransport:
+    """Its client is there from the start. `last_words` come from it while the gateway closes."""
+
+    is_ready = True
+    address: Address | None = None
+
+    def __init__(self, ears: Ears) -> None:
+        self.client = PlayedClient()
+        self.last_words: list[bytes] = []
+        self._ears = ears
+
+    async def open(self) -> None:
+        self._ears.joined(self.client)
+
+    async def close(self) -> None:
+        await asyncio.sleep(0)
+        for data in self.last_words:
+            self._ears.received(self.client, data, wall_ns())
+        self._ears.left(self.client)
+
+    def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
+        for client in clients:
+            client.write(frames)
+
+
+class Stage:
+    """The gateways of a program, one `Played` each, which share topics: `async with Stage(program, graph)`."""
+
+    def __init__(self, made: Program, graph: Graph) -> None:
+        self.faults: list[Exception] = []
+        self.reports: list[Report] = []
+        self.published: list[tuple[str, bytes]] = []
+        self.counts = made.books.fresh_counts()
+        self._books = made.books
+        self._graph = graph
+        self._plans = made.gateways
+        self._closing = ExitStack()
+
+    async def __aenter__(self) -> Stage:
+        worker = self._closing.enter_context(ThreadPoolExecutor(1))
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: self.faults.append(context["exception"]))
+        hub = Hub(cast("RosTopics", self._graph), INTERFACES, loop)
+        self._closing.callback(hub.close)
+        self.around = Surroundings(hub, worker, worker, self.faults.append, monotonic_ns, wall_ns)
+        self.played = {plan.settings.name: Played(self, plan) for plan in self._plans}
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for played in self.played.values():
+            await played.close()
+        self._closing.close()
+
+    def count(self, metric: str, *labels: str) -> int:
+        return self.counts[self._books.slot(metric, *labels)]
+
+    def ledger(self, plan: GatewayPlan) -> Ledger:
+        return Ledger(plan.settings, self._books, self.counts, self.reports.append)
+
+    def inlet(self, plan: GatewayPlan) -> Inlet:
+        def publisher(topic: str) -> Any:
+            return lambda cdr: self.published.append((topic, cdr))
+
+        outlets = InletOutlets(
+            publish={topic: publisher(topic) for topic in plan.inbound},
+            publish_errors=(),
+            feed_deadman={},
+            report=self.reports.append,
+            clock_ns=monotonic_ns,
+            wall_ns=wall_ns,
+        )
+        return Inlet(plan, Style.PLAIN, self._books, self.counts, outlets)
+
+
+class Played:
+    """One gateway and its client."""
+
+    def __init__(self, stage: Stage, plan: GatewayPlan) -> None:
+        self.service = GatewayService(plan, stage.around, stage.ledger(plan), stage.inlet(plan), self._transport)
+        self._is_open = False
+
+    def _transport(self, ears: Ears) -> PlayedTransport:
+        self.transport = PlayedTransport(ears)
+        return self.transport
+
+    @property
+    def client(self) -> PlayedClient:
+        return self.transport.client
+
+    async def start(self) -> None:
+        await self.service.open()
+        self.service.start()
+        self._is_open = True
+
+    async def close(self) -> None:
+        if self._is_open:
+            self._is_open = False
+            await self.service.close()

@@ -1,0 +1,127 @@
+"""A gateway's topics and clients brought together: what is sent, what is counted, and what faults leave intact."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from tests.gateway.stage import Graph, Stage, program
+
+STRING = "std_msgs/msg/String"
+TCP = "transport: {tcp: 127.0.0.1:8600}, format: json_lines, publish_period: 20ms, discovery_period: 100ms"
+EACH = TCP.replace("20ms", "each")
+PATIENCE_S = 20.0
+
+
+def cdr(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return b"\0\1\0\0" + len(data).to_bytes(4, "little") + data
+
+
+def run(story: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(story, 2 * PATIENCE_S))
+
+
+async def until(condition: Callable[[], object]) -> None:
+    deadline = asyncio.get_running_loop().time() + PATIENCE_S
+    while not condition():
+        assert asyncio.get_running_loop().time() < deadline, "it never happened"
+        await asyncio.sleep(0.005)
+
+
+def test_a_value_that_another_gateway_has_taken_comes_to_a_client_that_was_there_before(tmp_path: Path) -> None:
+    async def story() -> None:
+        graph = Graph({"/map": STRING})
+        both = f"early: {{{TCP}}}, late: {{{TCP.replace('8600', '8601')}}}"
+        async with Stage(program(tmp_path, both), graph) as stage:
+            early, late = stage.played["early"], stage.played["late"]
+            await early.start()
+            await until(lambda: "/map" in graph.taps)
+            graph.taps["/map"].put(cdr("a rover's world"))
+            await until(lambda: early.client.values)
+            await late.start()
+            await until(lambda: late.client.values)
+            assert [frame.is_schema for frame in late.client.frames] == [True, False]
+            assert (
+                stage.count("messages_received", "late", "ros") == stage.count("messages_sent", "late", "clients") == 1
+            )
+
+    run(story())
+
+
+def test_a_fault_of_the_first_look_does_not_end_looking(tmp_path: Path) -> None:
+    async def story() -> None:
+        graph = Graph({"/map": STRING})
+        graph.faults["names"] = RuntimeError("no")
+        async with Stage(program(tmp_path, f"it: {{{TCP}}}"), graph) as stage:
+            await stage.played["it"].start()
+            await until(lambda: "/map" in graph.taps)
+            assert [str(fault) for fault in stage.faults] == ["no"]
+
+    run(story())
+
+
+def test_a_topic_with_a_fault_keeps_no_other_from_being_served(tmp_path: Path) -> None:
+    async def story() -> None:
+        graph = Graph({"/bad": STRING, "/good": STRING})
+        graph.faults["/bad"] = ArithmeticError("no")
+        async with Stage(program(tmp_path, f"it: {{{TCP}}}"), graph) as stage:
+            await stage.played["it"].start()
+            await until(lambda: "/good" in graph.taps)
+            assert stage.faults
+
+    run(story())
+
+
+def test_what_comes_faster_than_each_can_be_handed_on_is_in_the_books(tmp_path: Path) -> None:
+    async def story() -> None:
+        graph = Graph({"/fast": STRING})
+        async with Stage(program(tmp_path, f"it: {{{EACH}}}"), graph) as stage:
+            await stage.played["it"].start()
+            await until(lambda: "/fast" in graph.taps)
+            graph.taps["/fast"].put(cdr("first"))
+            await until(lambda: stage.played["it"].client.values)
+            for _ in range(250):
+                graph.taps["/fast"].put(cdr("more"))
+            await until(lambda: stage.count("messages_dropped", "it", "clients", "overloaded"))
+            assert stage.count("messages_received", "it", "ros") == 251
+            assert stage.count("messages_sent", "it", "clients") == 101
+            assert stage.count("messages_dropped", "it", "clients", "overloaded") == 150
+        assert stage.count("messages_received", "it", "ros") == 251
+
+    run(story())
+
+
+def test_a_client_that_asks_for_schemas_too_often_is_told(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Stage(program(tmp_path, f"it: {{{TCP}}}"), Graph({})) as stage:
+            played = stage.played["it"]
+            await played.start()
+            for _ in range(2):
+                played.service.received(played.client, b'{"op":"schema"}', 0)
+            [answer] = [json.loads(frame.data) for frame in played.client.frames]
+            assert (answer["op"], answer["reason"]) == ("rejected", "rate_limited")
+
+    run(story())
+
+
+def test_whoever_sends_while_the_gateway_closes_leaves_no_task_behind(tmp_path: Path) -> None:
+    async def story() -> None:
+        inbound = "inbound: [{topic: /said, type: std_msgs/msg/String}]"
+        async with Stage(program(tmp_path, f"it: {{{TCP}, {inbound}}}"), Graph({})) as stage:
+            played, before = stage.played["it"], asyncio.all_tasks()
+            await played.start()
+            request = {"op": "publish", "topic": "/said", "data": {"data": "a" * 100_000}}
+            played.transport.last_words = [json.dumps(request).encode()]
+            await played.close()
+            assert asyncio.all_tasks() == before
+            assert (stage.published, stage.faults) == ([], [])
+
+    run(story())
