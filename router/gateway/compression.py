@@ -43,6 +43,15 @@ def compress(data: bytes, level: int) -> bytes:
     return frame
 
 
+def told_size(data: bytes) -> int | None:
+    """Bytes that a frame holds by its header, which `decompress` goes by; None if not told, 0 for what is no frame."""
+    try:
+        size: int | None = zstd.get_frame_info(data).decompressed_size
+    except zstd.ZstdError:
+        return 0
+    return size
+
+
 def decompress(data: bytes, most: int) -> bytes:
     """The content of one zstd frame, at most `most` bytes. The frame's window takes no more memory than that, or 8 MiB.
 
@@ -51,16 +60,17 @@ def decompress(data: bytes, most: int) -> bytes:
     if not data.startswith(_MAGIC):
         raise PacketError("the payload is no zstd frame")
     try:
-        told = zstd.get_frame_info(data).decompressed_size
+        told = told_size(data)
         if told is not None and told > most:
             raise TooLargeError(f"the payload is {told} bytes uncompressed, more than {most}")
+        limit = told or most
         window = max(_LEAST_WINDOW_LOG, (most - 1).bit_length())
         decompressor = zstd.ZstdDecompressor(options={zstd.DecompressionParameter.window_log_max: window})
-        content: bytes = decompressor.decompress(data, most + 1)
+        content: bytes = decompressor.decompress(data, limit + 1)
     except zstd.ZstdError as error:
         raise PacketError(f"the payload cannot be decompressed: {error}") from error
-    if len(content) > most:
-        raise TooLargeError(f"the payload is more than {most} bytes uncompressed")
+    if len(content) > limit:
+        raise TooLargeError(f"the payload is more than {limit} bytes uncompressed")
     if not decompressor.eof:
         raise PacketError("the payload ends before its zstd frame does")
     if decompressor.unused_data:

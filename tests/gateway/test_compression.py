@@ -9,7 +9,7 @@ from backports import zstd
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.gateway.compression import compress, decompress
+from router.gateway.compression import compress, decompress, told_size
 from router.gateway.packets import PacketError
 
 MOST = 1 << 20
@@ -52,13 +52,35 @@ def test_a_bomb_is_refused_and_takes_no_memory(frame: bytes) -> None:
     assert peak < 2 * MOST + 100_000
 
 
+def test_a_frame_that_tells_less_than_it_holds_is_refused_where_that_is_seen() -> None:
+    frame = bytearray(compress(b"\0" * (8 << 20), 3))
+    assert told_size(bytes(frame)) == 8 << 20
+    at = frame.index((8 << 20).to_bytes(4, "little"))
+    frame[at : at + 4] = (1000).to_bytes(4, "little")
+    assert told_size(bytes(frame)) == 1000
+    tracemalloc.start()
+    with pytest.raises(PacketError):
+        decompress(bytes(frame), 16 << 20)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [(compress(b"abc", 3), 3), (streamed(b"abc"), None), (b"", 0), (b"{}", 0), (bytes.fromhex("28b52ffd"), 0)],
+)
+def test_what_a_frame_tells(frame: bytes, told: int | None) -> None:
+    assert told_size(frame) == told
+
+
 @pytest.mark.parametrize(
     ("frame", "complaint"),
     [
         (b"", "no zstd frame"),
         (b"{}", "no zstd frame"),
         (bytes.fromhex("502a4d180100000061"), "no zstd frame"),  # one to be skipped
-        (bytes.fromhex("28b52ffd"), "cannot be decompressed"),
+        (bytes.fromhex("28b52ffd"), "ends before its zstd frame does"),
         (compress(b"abc" * 100, 3)[:-1], "ends before its zstd frame does"),
         (streamed(b"abc", checksum_flag=1)[:-1], "ends before its zstd frame does"),
         (streamed(b"abc", checksum_flag=1)[:-1] + b"\0", "cannot be decompressed"),
