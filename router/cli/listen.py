@@ -56,9 +56,8 @@ def _seconds(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     from router.table.model import GatewayFormat
     from router.tools.listening import Listening
-    from router.tools.listening_places import open_source, remote
+    from router.tools.listening_places import open_source, remote, topic_filter
     from router.tools.listening_reading import Message
-    from router.tools.listening_topics import topic_filter
 
     listening = Listening(topic_filter(args.topic or ()))
     form = GatewayFormat(args.format) if args.format else None

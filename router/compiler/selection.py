@@ -47,9 +47,9 @@ class TopicSelector:
 
     def __init__(self, settings: Gateway, inbound: Collection[str]) -> None:
         include = settings.include or (TopicPattern("/**", is_regex=False, span=settings.span),)
-        self._include = [(pattern, _matcher(pattern)) for pattern in include]
-        self._exclude = [_matcher(pattern) for pattern in settings.exclude]
-        self._rates = [(_matcher(rate.pattern), rate) for rate in settings.rates]
+        self._include = [(pattern, matcher(pattern)) for pattern in include]
+        self._exclude = [matcher(pattern) for pattern in settings.exclude]
+        self._rates = [(matcher(rate.pattern), rate) for rate in settings.rates]
         self._named = {pattern.text for pattern in settings.include if is_name(pattern)}
         self._inbound = frozenset(inbound)
         self._publish_period = settings.publish_period
@@ -91,7 +91,8 @@ def _parts(text: str) -> list[str]:
     return text.split("/")[1:]
 
 
-def _matcher(pattern: TopicPattern) -> Callable[[str], object]:
+def matcher(pattern: TopicPattern) -> Callable[[str], object]:
+    """Says something true of the names that a sound pattern matches."""
     return re.compile(pattern.text if pattern.is_regex else _regex(pattern.text)).fullmatch
 
 

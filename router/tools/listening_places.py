@@ -1,4 +1,5 @@
-"""Where to listen, as typed: `[udp://][HOST:]PORT`, `tcp://HOST:PORT`, `ws://HOST:PORT`, `zenoh://KEY?connect=...`.
+"""What to listen to, as typed: `[udp://][HOST:]PORT`, `tcp://HOST:PORT`, `ws://HOST:PORT`, `zenoh://KEY?connect=...`;
+and which topics, by globs as gateways have them.
 
 Opens nothing but what was named. A transport's library is imported when it is needed.
 """
@@ -6,11 +7,12 @@ Opens nothing but what was named. A transport's library is imported when it is n
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from urllib.parse import parse_qs
 
+from router.compiler.selection import matcher, pattern_problem
 from router.errors import SourceSpan, did_you_mean
-from router.table.model import Address, GatewayFormat, Located, ZenohSettings
+from router.table.model import Address, GatewayFormat, Located, TopicPattern, ZenohSettings
 from router.tools import UsageError, places
 from router.tools.listening import Source
 
@@ -74,3 +76,12 @@ def _zenoh(text: str) -> ZenohSettings:
         connect=tuple(options.get("connect", ())),
         listen=tuple(options.get("listen", ())),
     )
+
+
+def topic_filter(globs: Sequence[str]) -> Callable[[str], bool]:
+    """Whether any of them matches a topic; without globs each topic does. Raises UsageError."""
+    patterns = [TopicPattern(glob, is_regex=False, span=_COMMAND_LINE) for glob in globs]
+    for problem in filter(None, map(pattern_problem, patterns)):
+        raise UsageError(f"--topic: {problem.what}; {problem.hint}")
+    matchers = [matcher(pattern) for pattern in patterns]
+    return lambda topic: not matchers or any(matches(topic) for matches in matchers)

@@ -12,9 +12,9 @@ from router.gateway.documents import data_document, schema_document
 from router.gateway.fragments import datagrams
 from router.gateway.packets import Packet, pack
 from router.tools.listening import Arrival, Listening, Source
+from router.tools.listening_places import topic_filter
 from router.tools.listening_reading import Heard, Message, Problem, Schema, Shape
 from router.tools.listening_show import json_line, pieces
-from router.tools.listening_topics import topic_filter
 
 EVERY = topic_filter([])
 
