@@ -86,7 +86,7 @@ GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "not_allowed": "a topic that `inbound` does not have",
     "wrong_type": "another type than `inbound` says",
     "invalid": "a field is missing, unknown, of another type or out of range",
-    "rate_limited": "schemas were asked for too often",
+    "rate_limited": "schemas were asked for too often, or too much waits to be read",
 }
 """Why a gateway refused what a client sent, with what each means."""
 

@@ -20,9 +20,6 @@ from router.table.model import Gateway, GatewayFormat, Transport
 LARGE = 64 << 10
 """Bytes of a message that is converted in a thread of its own, so that smaller ones need not wait for it."""
 
-QUICK = 4 << 10
-"""Bytes of JSON from a client that are read at once: of 64 KiB, the worst takes 30 ms."""
-
 UDP_PAYLOAD = 65_507
 """The longest datagram that IPv4 carries."""
 
@@ -58,9 +55,9 @@ class Encoding(ABC):
     def request(self, data: bytes) -> Request:
         """Raises PacketError for what has not the format, InvalidMessageError for JSON that is none."""
 
-    def is_quick(self, data: bytes) -> bool:
-        """Whether `request` takes no time worth mentioning."""
-        return len(data) <= QUICK
+    def text_size(self, data: bytes) -> int:
+        """Bytes of JSON that `request` will read."""
+        return len(data)
 
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
         """The same frames as the transport is to send them."""
@@ -87,13 +84,13 @@ class PacketEncoding(Encoding):
         payload = sample.payload(self.style, self.level)
         return HEAD.pack(time, self.level > 0) + prefix(sample.topic, sample.type_name) + payload
 
-    def is_quick(self, data: bytes) -> bool:
+    def text_size(self, data: bytes) -> int:
         try:
             packet = unpack(data)
         except PacketError:
-            return True
+            return 0
         size = told_size(packet.payload) if packet.is_compressed else len(packet.payload)
-        return size is not None and size <= QUICK
+        return self._most if size is None else min(size, self._most)
 
     def request(self, data: bytes) -> Request:
         packet = unpack(data)

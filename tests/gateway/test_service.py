@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from router.gateway.service import QUICK
 from tests.gateway.stage import Graph, Stage, program
 
 STRING = "std_msgs/msg/String"
@@ -108,6 +109,42 @@ def test_a_client_that_asks_for_schemas_too_often_is_told(tmp_path: Path) -> Non
                 played.service.received(played.client, b'{"op":"schema"}', 0)
             [answer] = [json.loads(frame.data) for frame in played.client.frames]
             assert (answer["op"], answer["reason"]) == ("rejected", "rate_limited")
+
+    run(story())
+
+
+def test_messages_that_are_not_small_are_read_in_order_though_many_come_at_once(tmp_path: Path) -> None:
+    async def story() -> None:
+        inbound = "inbound: [{topic: /said, type: std_msgs/msg/String}]"
+        async with Stage(program(tmp_path, f"it: {{{TCP}, {inbound}}}"), Graph({})) as stage:
+            played = stage.played["it"]
+            await played.start()
+            words = [*(str(number) * QUICK for number in range(10)), "a short one does not overtake them"]
+            for word in words:
+                request = {"op": "publish", "topic": "/said", "data": {"data": word}}
+                played.service.received(played.client, json.dumps(request).encode(), 0)
+            await until(lambda: len(stage.published) == len(words))
+            assert stage.published == [("/said", cdr(word)) for word in words]
+
+    run(story())
+
+
+def test_when_too_much_waits_to_be_read_the_rest_is_refused_and_its_client_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("router.gateway.service.MOST_READING", 3 * QUICK)
+
+    async def story() -> None:
+        inbound = "inbound: [{topic: /said, type: std_msgs/msg/String}]"
+        async with Stage(program(tmp_path, f"it: {{{TCP}, {inbound}}}"), Graph({})) as stage:
+            played = stage.played["it"]
+            await played.start()
+            request = {"op": "publish", "topic": "/said", "data": {"data": "a" * QUICK}}
+            for _ in range(5):
+                played.service.received(played.client, json.dumps(request).encode(), 0)
+            await until(lambda: len(stage.published) == 2)
+            assert stage.count("datagrams_rejected", "it", "rate_limited") == 3
+            assert [json.loads(frame.data)["reason"] for frame in played.client.frames] == ["rate_limited"] * 3
 
     run(story())
 
