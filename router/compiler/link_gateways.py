@@ -56,7 +56,7 @@ def _deadman(name: str, deadman: InboundDeadman, topic: str, stop: bytes, books:
 
 def _open_books(books: Books, gateway: Gateway) -> None:
     name = gateway.name
-    for metric in ("datagrams_received", "received_bytes", "gateway_clients", "route_seconds"):
+    for metric in ("datagrams_received", "received_bytes", "gateway_clients"):
         books.slot(metric, name)
     books.slot("route_last_message_timestamp_seconds", name)
     for reason in GATEWAY_REJECT_REASONS:

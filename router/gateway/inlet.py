@@ -72,6 +72,7 @@ class Inlet:
         self._outlets = outlets
         self._freshness = Freshness()
         self._accepted = books.slot("messages_received", name, CLIENTS)
+        self._last = books.slot("route_last_message_timestamp_seconds", name)
         self._rejected = {reason: books.slot("datagrams_rejected", name, reason) for reason in GATEWAY_REJECT_REASONS}
 
     def reject(self, reason: str, detail: str = "") -> None:
@@ -101,6 +102,7 @@ class Inlet:
         """
         topic = checked.topic
         self._counts[self._accepted] += 1
+        self._counts[self._last] = self._outlets.wall_ns()
         now = self._outlets.clock_ns()
         self._want_fresh(checked, arrived_ns, now)
         if topic.may_pass and not topic.may_pass(now):

@@ -10,14 +10,26 @@ from router.table.model import ROS, Gateway
 
 
 class Ledger:
-    """For the thread that owns `counts`. Every ROS message that came is sent, filtered or dropped, once."""
+    """For the thread that owns `counts`. Every ROS message that came is sent, filtered or dropped, once.
 
-    def __init__(self, settings: Gateway, books: Books, counts: list[int], report: Callable[[Report], None]) -> None:
+    `wall_ns` is the wall clock.
+    """
+
+    def __init__(
+        self,
+        settings: Gateway,
+        books: Books,
+        counts: list[int],
+        report: Callable[[Report], None],
+        wall_ns: Callable[[], int],
+    ) -> None:
         name, way = settings.name, settings.transport.value.value
         self._name = name
         self._counts = counts
         self._report = report
+        self._wall_ns = wall_ns
         self._received = books.slot("messages_received", name, ROS)
+        self._last = books.slot("route_last_message_timestamp_seconds", name)
         self._sent = books.slot("messages_sent", name, CLIENTS)
         self._filtered = books.slot("messages_filtered", name, CLIENTS)
         self._dropped = {
@@ -33,7 +45,9 @@ class Ledger:
 
     def received(self, times: int) -> None:
         """Messages came from ROS."""
-        self._counts[self._received] += times
+        if times:
+            self._counts[self._received] += times
+            self._counts[self._last] = self._wall_ns()
 
     def sent(self) -> None:
         """One of them was handed to all clients."""

@@ -79,7 +79,7 @@ class GatewayThread:
     async def _open(self, plan: GatewayPlan) -> None:
         settings = plan.settings
         style = Style.PLAIN if settings.format in (GatewayFormat.JSON, GatewayFormat.JSON_LINES) else Style.WRAPPED
-        ledger = Ledger(settings, self._books, self._counts, self._outlets.report)
+        ledger = Ledger(settings, self._books, self._counts, self._outlets.report, wall_ns)
         inlet = Inlet(plan, style, self._books, self._counts, self._outlets)
         service = GatewayService(plan, self._around, ledger, inlet, lambda ears: _transport(settings, ears))
         try:

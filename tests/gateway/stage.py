@@ -177,7 +177,7 @@ class Stage:
         return self.counts[self._books.slot(metric, *labels)]
 
     def ledger(self, plan: GatewayPlan) -> Ledger:
-        return Ledger(plan.settings, self._books, self.counts, self.reports.append)
+        return Ledger(plan.settings, self._books, self.counts, self.reports.append, wall_ns)
 
     def inlet(self, plan: GatewayPlan) -> Inlet:
         def publisher(topic: str) -> Any:

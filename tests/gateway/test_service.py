@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,8 @@ def test_what_comes_faster_than_each_can_be_handed_on_is_in_the_books(tmp_path: 
             assert stage.count("messages_sent", "it", "clients") == 101
             assert stage.count("messages_dropped", "it", "clients", "overloaded") == 150
         assert stage.count("messages_received", "it", "ros") == 251
+        age = time.time_ns() - stage.count("route_last_message_timestamp_seconds", "it")
+        assert 0 <= age < 2 * PATIENCE_S * 1e9
 
     run(story())
 
