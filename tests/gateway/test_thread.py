@@ -1,0 +1,62 @@
+"""The thread of all gateways: what happens to it when one of them cannot begin or end as it should."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from router.compiler.program import Program
+from router.edges.gateway_tcp import TcpTransport
+from router.errors import StartError
+from router.gateway.thread import GatewayThread
+from tests.gateway.stage import Graph, program
+from tests.ports import free_port
+
+
+def opened(made: Program) -> GatewayThread:
+    ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
+    return GatewayThread(made, ros, made.books.fresh_counts(), lambda *_: lambda _: None, print, print)
+
+
+def threads() -> set[str]:
+    return {thread.name for thread in threading.enumerate()}
+
+
+def tcp(name: str, port: int) -> str:
+    return f"{name}: {{transport: {{tcp: 127.0.0.1:{port}}}}}"
+
+
+def test_a_gateway_that_cannot_open_leaves_nothing_of_the_others(tmp_path: Path) -> None:
+    port = free_port(kind=socket.SOCK_STREAM)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        table = f"{tcp('first', port)}, {tcp('second', taken.getsockname()[1])}"
+        with pytest.raises(StartError, match=r"gateway 'second' cannot be opened: .* has the port"):
+            opened(program(tmp_path, table))
+    assert "gateway" not in threads()
+    socket.create_server(("127.0.0.1", port)).close()
+
+
+def test_a_fault_in_closing_keeps_neither_the_other_gateways_nor_the_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ports = [free_port(kind=socket.SOCK_STREAM) for _ in range(2)]
+    gateways = opened(program(tmp_path, f"{tcp('first', ports[0])}, {tcp('second', ports[1])}"))
+    close, closed = TcpTransport.close, []
+
+    async def closes(transport: TcpTransport) -> None:
+        await close(transport)
+        closed.append(transport)
+        raise RuntimeError("no")
+
+    monkeypatch.setattr(TcpTransport, "close", closes)
+    with pytest.raises(RuntimeError, match="no"):
+        gateways.stop()
+    assert len(closed) == 2
+    assert "gateway" not in threads()
