@@ -5,7 +5,7 @@ Prints what the compiler found out, and what ROS knows of topics; finds out noth
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from time import sleep
 
 from router.cli.explain_words import duration, quality
@@ -13,6 +13,7 @@ from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import resolved
 from router.errors import StartError
+from router.gateway.following import by_frequency
 from router.table.model import EACH, Gateway, GatewayFormat, RouteTable, TopicPattern, Transport
 
 Topics = Mapping[str, str]
@@ -44,10 +45,9 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
     return known | {name: _publishers(types) for name, types in seen.items() if types}
 
 
-def _publishers(types: Sequence[str]) -> str:
-    """Most common type first, as gateways choose."""
-    names = sorted(set(types), key=lambda name: (-types.count(name), name))
-    return ", ".join(f"{name} of {types.count(name)}" for name in names)
+def _publishers(types: Iterable[str]) -> str:
+    """That which gateways choose first."""
+    return ", ".join(f"{name} of {times}" for name, times in by_frequency(types).items())
 
 
 def explained_gateway(checked: CheckedGateway, topics: Topics) -> Iterator[str]:

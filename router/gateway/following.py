@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -31,9 +31,14 @@ def choice(publishers: Sequence[SeenPublisher], *, is_let_in: bool) -> Choice | 
     counted = [publisher for publisher in publishers if not (is_let_in and publisher.is_ours)]
     if not counted:
         return None
-    times = Counter(publisher.type_name for publisher in counted)
-    type_name, *others = sorted(times, key=lambda name: (-times[name], name))
+    type_name, *others = by_frequency(publisher.type_name for publisher in counted)
     heard = [publisher for publisher in counted if publisher.type_name == type_name]
     is_reliable = all(publisher.is_reliable for publisher in heard)
     keeps = is_reliable and all(publisher.keeps for publisher in heard)
     return Choice(type_name, is_reliable, keeps, tuple(others))
+
+
+def by_frequency(type_names: Iterable[str]) -> dict[str, int]:
+    """How often each is there, the most frequent first."""
+    times = Counter(type_names)
+    return {name: times[name] for name in sorted(times, key=lambda name: (-times[name], name))}
