@@ -16,12 +16,10 @@ from router.gateway.json_reading import parse_json
 from router.gateway.packets import HEAD, PacketError, prefix, unpack
 from router.gateway.style import Style
 from router.table.model import Gateway, GatewayFormat, Transport
+from router.table.units import LARGEST_DATAGRAM
 
 LARGE = 64 << 10
 """Bytes of a message that is converted in a thread of its own, so that smaller ones need not wait for it."""
-
-UDP_PAYLOAD = 65_507
-"""The longest datagram that IPv4 carries."""
 
 _IDS = 1 << 32
 
@@ -72,7 +70,7 @@ class PacketEncoding(Encoding):
     def __init__(self, settings: Gateway) -> None:
         super().__init__(settings)
         if settings.transport.value is Transport.UDP:
-            self.most = UDP_PAYLOAD
+            self.most = LARGEST_DATAGRAM
 
     def introduces(self, topic: str, type_name: str) -> Hashable:
         return topic, type_name  # each packet names both, and clients may keep schemas by either

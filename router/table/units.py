@@ -38,8 +38,11 @@ MIN_PERIOD = 1_000_000
 MIN_INTERVAL = 10_000_000
 """ns. Looking at the ROS graph, and sending schemas, costs more than data."""
 
-MIN_DATAGRAM, MAX_DATAGRAM = 576, 65507
-"""What every IPv4 host takes, and the longest that UDP carries."""
+MIN_DATAGRAM = 576
+"""Bytes that every IPv4 host takes."""
+
+LARGEST_DATAGRAM = 65_507
+"""Bytes that one UDP datagram over IPv4 can carry."""
 
 MIN_MESSAGE, MAX_MESSAGE = 1000, 256 << 20
 
@@ -61,7 +64,7 @@ def parse_size(text: str) -> int:
 
 def parse_datagram_size(text: str) -> int:
     """`1400B` as bytes of a UDP datagram."""
-    return _exact(text, _BYTES, "bytes", MAX_DATAGRAM, MIN_DATAGRAM)
+    return _exact(text, _BYTES, "bytes", LARGEST_DATAGRAM, MIN_DATAGRAM)
 
 
 def parse_message_size(text: str) -> int:

@@ -12,6 +12,7 @@ from contextlib import suppress
 from router.edges.udp import SO_MEMINFO, SO_RCVBUFFORCE
 from router.gateway.packets import Packet, pack
 from router.table.model import Address
+from router.table.units import LARGEST_DATAGRAM
 from router.tools import places
 from router.tools.listening import Arrival
 
@@ -58,7 +59,7 @@ class UdpSource:
         if select.select([self._socket], [], [], timeout)[0]:
             with suppress(BlockingIOError):
                 while len(found) < _MOST_AT_ONCE:
-                    found.append(Arrival(*self._socket.recvfrom(places.LARGEST_DATAGRAM)))
+                    found.append(Arrival(*self._socket.recvfrom(LARGEST_DATAGRAM)))
         return found
 
     def close(self) -> None:

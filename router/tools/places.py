@@ -18,9 +18,6 @@ LOOPBACK = "127.0.0.1"
 ANYWHERE = Address(ANY_HOST, 0)
 """To send from whichever address and port the kernel likes."""
 
-LARGEST_DATAGRAM = 65_507
-"""Bytes that one UDP datagram can carry."""
-
 
 def destination(text: str, table: RouteTable | None) -> Address:
     """`HOST:PORT`, or the name of an endpoint or listener of the table."""

@@ -16,11 +16,12 @@ from dataclasses import dataclass, field
 
 from router.compiler.program import DeadmanPlan
 from router.table.model import Address, Endpoint, RouteTable
+from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, boards
 from router.tools.inbox import Inbox
 from router.tools.models import moment
 from router.tools.payload_model import PayloadModel
-from router.tools.places import LARGEST_DATAGRAM, LOOPBACK, open_udp, reachable
+from router.tools.places import LOOPBACK, open_udp, reachable
 from router.tools.streams import STRANGER, Silence, check_silences, streams
 from router.tools.wire import Wire
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from google.protobuf.json_format import MessageToDict
 
 from router.errors import DecodeError
-from router.tools.places import LARGEST_DATAGRAM
+from router.table.units import LARGEST_DATAGRAM
 from router.tools.ros_show import ros_json, ros_words
 from router.tools.show import compact, one_line
 from router.tools.wire import Decoded, Wire
