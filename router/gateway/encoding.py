@@ -10,10 +10,10 @@ from math import inf
 from router.edges.gateway_transport import Frame
 from router.gateway.compression import decompress, told_size
 from router.gateway.documents import PublishRequest, Request, SchemaRequest, data_document, request, schema_document
-from router.gateway.feeds import Sample
 from router.gateway.fragments import capacity, datagrams
 from router.gateway.json_reading import parse_json
 from router.gateway.packets import HEAD, PacketError, prefix, unpack
+from router.gateway.samples import Sample
 from router.gateway.style import Style
 from router.table.model import Gateway, GatewayFormat, Transport
 from router.table.units import LARGEST_DATAGRAM

@@ -1,25 +1,19 @@
-"""What comes in on ROS topics, once for all gateways: one subscription for a topic, however many follow it.
+"""What comes in on one ROS topic, once for all gateways: one subscription, however many follow it.
 
-Knows no client, and no gateway but as a callback. All of it is for the loop's thread, unless it says otherwise.
+Knows no client, and no gateway but as a callback. All of it is for the loop's thread.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from router.compiler.lookup import layout
-from router.errors import StartError, TableError
-from router.gateway.following import Choice, choice
+from router.gateway.following import Choice
 from router.gateway.samples import ReadyType, Sample
-from router.types.ros import RosInterfaces
 
 if TYPE_CHECKING:  # which imports rclpy
     from router.edges.ros_topics import RosTopics, TopicTap
-
-__all__ = ["Each", "Feed", "Hub", "Sample"]
 
 DEPTH = 100
 """Messages that wait on a topic of which every one is wanted; the oldest go first."""
@@ -176,83 +170,3 @@ class Feed:
 
 
 Each = Callable[[Feed, Sample], None]
-
-
-class Hub:
-    """The topics that can be followed, and a feed for each that is. Close it."""
-
-    def __init__(self, ros: RosTopics, interfaces: RosInterfaces, loop: asyncio.AbstractEventLoop) -> None:
-        self._topics = ros
-        self._interfaces = interfaces
-        self._loop = loop
-        self._feeds: dict[str, Feed] = {}
-        self._types: dict[str, ReadyType | str] = {}  # or why not
-        self._loader = ThreadPoolExecutor(1, thread_name_prefix="gateway types")
-
-    async def look(self, let_in: Collection[str], wanted: Callable[[str], bool]) -> dict[str, Choice]:
-        """The topics among those `wanted` that somebody publishes on; our own publishers do not count on `let_in`.
-
-        Types are made ready here, so that `join` does not take long. Others have their turn between topics.
-        """
-        seen: dict[str, Choice] = {}
-        for topic in self._topics.names():
-            await asyncio.sleep(0)
-            if not wanted(topic):
-                continue
-            if picked := choice(self._topics.publishers(topic), is_let_in=topic in let_in):
-                seen[topic] = picked
-                if picked.type_name not in self._types:
-                    ready = await self._loop.run_in_executor(self._loader, self._load, picked.type_name)
-                    self._types[picked.type_name] = ready
-        return seen
-
-    def join(self, topic: str, wanted: Choice, each: Each | None) -> Feed:
-        """Follows `topic`: `each` is called for every message, without it `latest` is there to be asked.
-
-        To follow another choice, join again and leave the old feed, which may be the same, afterwards. A feed of
-        another type ends here, whoever follows it. Raises StartError, and then nobody follows.
-        """
-        ready = self._ready(wanted.type_name)
-        feed = self._feeds.get(topic)
-        if feed and feed.type_name != wanted.type_name:
-            feed.close()  # first: DDS has one type for a topic in a process
-            feed = None
-        if feed is None:
-            feed = self._feeds[topic] = Feed(topic, ready, self._topics, self._loop)
-        try:
-            feed.follow(wanted, each)
-        except StartError:
-            del self._feeds[topic]
-            raise
-        return feed
-
-    def leave(self, feed: Feed, each: Each | None) -> None:
-        """With the `each` that it was joined with."""
-        feed.unfollow(each)
-        if not feed.is_followed:
-            feed.close()
-            if self._feeds.get(feed.topic) is feed:
-                del self._feeds[feed.topic]
-
-    def close(self) -> None:
-        for feed in self._feeds.values():
-            feed.close()
-        self._feeds.clear()
-        self._loader.shutdown()
-
-    def _ready(self, type_name: str) -> ReadyType:
-        if (ready := self._types.get(type_name)) is None:
-            ready = self._types[type_name] = self._load(type_name)
-        if isinstance(ready, str):
-            raise StartError(ready)
-        return ready
-
-    def _load(self, type_name: str) -> ReadyType | str:
-        """Or why not. Runs in a thread of its own, but for types that were not looked for."""
-        try:
-            message = self._interfaces.get(type_name)
-            if message is None:
-                return f"{type_name} is not installed"
-            return ReadyType(message, self._topics.load(type_name, layout(message)))
-        except (StartError, TableError) as error:
-            return str(error)

@@ -10,8 +10,8 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 
 from router.edges.gateway_transport import Frame
 from router.gateway.encoding import LARGE, Encoding
-from router.gateway.feeds import Sample
 from router.gateway.ledger import Ledger
+from router.gateway.samples import Sample
 from router.gateway.served import MOST_UNCONVERTED, Served
 from router.gateway.style import UnreadableError
 from router.gateway.surroundings import Surroundings

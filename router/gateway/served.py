@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from router.gateway.feeds import Feed, Sample
+from router.gateway.feeds import Feed
 from router.gateway.following import Choice
+from router.gateway.samples import Sample
 from router.table.model import EACH
 
 MOST_UNCONVERTED = 4

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-from router.gateway.feeds import Hub
+from router.gateway.hub import Hub
 
 
 @dataclass(frozen=True, slots=True)

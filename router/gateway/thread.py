@@ -19,7 +19,7 @@ from router.edges.gateway_websocket import WebsocketTransport
 from router.engine import Report
 from router.engine.deadman import Feed
 from router.errors import StartError
-from router.gateway.feeds import Hub
+from router.gateway.hub import Hub
 from router.gateway.inlet import Inlet, InletOutlets
 from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService

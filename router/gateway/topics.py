@@ -14,10 +14,11 @@ from router.edges.gateway_transport import Frame
 from router.edges.log import logger
 from router.errors import StartError
 from router.gateway.documents import TopicRow
-from router.gateway.feeds import Feed, Sample
+from router.gateway.feeds import Feed
 from router.gateway.following import Choice
 from router.gateway.ledger import Ledger
 from router.gateway.outlet import Outlet
+from router.gateway.samples import Sample
 from router.gateway.served import Served
 from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks

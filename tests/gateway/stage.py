@@ -18,7 +18,7 @@ from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.gateway_transport import Client, Ears, Frame
 from router.edges.ros_topics import RosTopics, SeenPublisher
 from router.engine import Report
-from router.gateway.feeds import Hub
+from router.gateway.hub import Hub
 from router.gateway.inlet import Inlet, InletOutlets
 from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService

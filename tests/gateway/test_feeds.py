@@ -16,9 +16,10 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from router.compiler.program import TopicPlan
 from router.errors import StartError
 from router.gateway.compression import decompress
-from router.gateway.feeds import TURN, Feed, Hub, Sample
+from router.gateway.feeds import TURN, Feed
 from router.gateway.following import Choice
-from router.gateway.samples import ReadyType
+from router.gateway.hub import Hub
+from router.gateway.samples import ReadyType, Sample
 from router.gateway.style import Style, UnreadableError
 from router.types.ros import ros_interfaces
 from tests.edges.ros_opening import HELLO, STRING, cdr, open_ros, string_topic
