@@ -12,6 +12,8 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 _HOST = re.compile(r"[A-Za-z0-9.:\[\]-]+")
+_LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
+"""Addresses, and names that nobody can register for the whole internet."""
 _INLINE = re.compile(rb"<(script|style)[^>]*>(.*?)</\1>", re.DOTALL)
 
 
@@ -26,7 +28,10 @@ class Page:
         """What is answered to a request; None goes on to a websocket."""
         if any(value.lower() == "websocket" for value in request.headers.get_all("Upgrade")):
             if _is_from_elsewhere(request.headers):
-                return connection.respond(HTTPStatus.FORBIDDEN, "a page of another host may not connect\n")
+                return connection.respond(
+                    HTTPStatus.FORBIDDEN,
+                    "a page of another host may not connect; open the page by this computer's address\n",
+                )
             return None
         if request.path.partition("?")[0] != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "there is one page: /\n")
@@ -49,9 +54,13 @@ class Page:
 
 
 def _is_from_elsewhere(headers: Headers) -> bool:
-    """Whether a browser says that a page of another host wants this: any page that is open there could publish."""
+    """Whether a browser says that a page of another host wants this: any page that is open there could publish.
+
+    A name that anybody can register may have been made to lead here after its page was loaded (DNS rebinding).
+    """
     hosts = [host.lower() for host in headers.get_all("Host")]
-    return any([origin.lower().partition("://")[2]] != hosts for origin in headers.get_all("Origin"))
+    origins = [origin.lower().partition("://")[2] for origin in headers.get_all("Origin")]
+    return any([origin] != hosts or not _LOCAL.fullmatch(origin) for origin in origins)
 
 
 def _policy(page: bytes) -> str:

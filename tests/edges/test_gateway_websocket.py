@@ -303,28 +303,32 @@ def test_the_page_is_given_with_a_policy_that_lets_it_nothing_from_outside() -> 
 
 
 @pytest.mark.parametrize(
-    ("origin", "welcome"),
+    ("host", "origin", "welcome"),
     [
-        ("http://rover:8765", True),
-        ("https://ROVER:8765", True),
-        ("http://rover", False),
-        ("http://evil.example", False),
-        ("http://rover:8765.evil.example", False),
-        ("null", False),
-        ("", False),
+        ("rover:8765", "http://rover:8765", True),
+        ("rover:8765", "https://ROVER:8765", True),
+        ("10.0.0.7:8765", "http://10.0.0.7:8765", True),
+        ("[fe80::1]:8765", "http://[fe80::1]:8765", True),
+        ("loki.local", "http://loki.local", True),
+        ("rover:8765", "http://rover", False),
+        ("rover:8765", "http://evil.example", False),
+        ("rover:8765", "http://rover:8765.evil.example", False),
+        ("evil.example:8765", "http://evil.example:8765", False),  # a name that was made to lead here
+        ("rover:8765", "null", False),
+        ("rover:8765", "", False),
     ],
 )
-def test_a_page_of_another_host_may_not_connect(origin: str, welcome: bool) -> None:
+def test_a_page_of_another_host_may_not_connect(host: str, origin: str, welcome: bool) -> None:
     async def story() -> None:
         ears = Ears()
         transport = documents(ears)
         async with opened(transport):
             if welcome:
-                async with dial(transport, host="rover:8765", additional_headers={"Origin": origin}):  # type: ignore[arg-type]
+                async with dial(transport, host=host, additional_headers={"Origin": origin}):  # type: ignore[arg-type]
                     await until(lambda: ears.clients)
                 return
             with pytest.raises(InvalidStatus, match="403"):
-                await dial(transport, host="rover:8765", additional_headers={"Origin": origin})  # type: ignore[arg-type]
+                await dial(transport, host=host, additional_headers={"Origin": origin})  # type: ignore[arg-type]
             assert not ears.clients
 
     asyncio.run(story())
