@@ -12,14 +12,19 @@ from typing import NamedTuple
 
 from router.edges.gateway_transport import Frame
 
+MOST_FRAMES = 1000
+"""Frames that wait in their order. Each takes some 200 bytes beside its data, for each of maybe a thousand clients."""
+
 
 class _Waiting(NamedTuple):
+    """`since` is when the first one was offered that had this place."""
+
     frame: Frame
-    offered: int
+    since: int
 
 
 class Outbox:
-    """Frames in the order in which they were offered, as long as they have no more than `most_bytes`.
+    """Frames in the order in which they were offered, as long as they have no more than `most_bytes` and are not many.
 
     Beyond that a frame takes the place of those of its topic that wait, so that a topic keeps its turn and costs
     one frame; a topic of which nothing waits still gets one in. A schema is never displaced by data, stays before
@@ -41,9 +46,9 @@ class Outbox:
         key = _key(frame)
         places = self._places[key]
         if frame.is_schema and places:  # it says the same as the one that waits
-            self._put(places[0], key, frame, self._waiting[places[0]].offered)
+            self._put(places[0], frame)
             return 0
-        if frame.is_schema or not places or self.bytes + len(frame.data) <= self._most_bytes:
+        if frame.is_schema or not places or self._has_room(frame):
             self._append(key, frame, now)
             return 0
         displaced = len(places)
@@ -54,7 +59,7 @@ class Outbox:
             self._remove(first)
             self._append(key, frame, now)
         else:
-            self._put(first, key, frame, now)
+            self._put(first, frame)
         return displaced
 
     def take(self, most_bytes: int) -> list[Frame]:
@@ -71,21 +76,25 @@ class Outbox:
         return taken
 
     def lag(self, now: int) -> int:
-        """How long the next frame has been waiting, in ns; 0 when none is."""
+        """How long the next frame, or those whose place it took, have been waiting, in ns; 0 when none is."""
         for waiting in self._waiting.values():
-            return now - waiting.offered
+            return now - waiting.since
         return 0
+
+    def _has_room(self, frame: Frame) -> bool:
+        return self.bytes + len(frame.data) <= self._most_bytes and len(self._waiting) < MOST_FRAMES
 
     def _append(self, key: Hashable, frame: Frame, now: int) -> None:
         self._places[key].append(self._next)
-        self._put(self._next, key, frame, now)
+        self._waiting[self._next] = _Waiting(frame, now)
+        self.bytes += len(frame.data)
         self._next += 1
 
-    def _put(self, place: int, key: Hashable, frame: Frame, now: int) -> None:
-        if before := self._waiting.get(place):
-            self.bytes -= len(before.frame.data)
-        self._waiting[place] = _Waiting(frame, now)
-        self.bytes += len(frame.data)
+    def _put(self, place: int, frame: Frame) -> None:
+        """In place of the one that waits there."""
+        before = self._waiting[place]
+        self._waiting[place] = _Waiting(frame, before.since)
+        self.bytes += len(frame.data) - len(before.frame.data)
 
     def _remove(self, place: int) -> None:
         frame = self._waiting.pop(place).frame

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.edges.gateway_transport import Frame
-from router.gateway.outbox import Outbox
+from router.gateway.outbox import MOST_FRAMES, Outbox
 
 
 def data(topic: str, text: bytes, type_name: str = "T") -> Frame:
@@ -68,14 +68,24 @@ def test_it_gives_no_more_bytes_than_wanted_but_always_something() -> None:
     assert outbox.take(10) == []
 
 
-def test_the_lag_is_how_long_the_next_one_has_waited() -> None:
+def test_beyond_so_many_frames_it_is_the_same() -> None:
+    outbox = Outbox(1 << 20)
+    for number in range(MOST_FRAMES):
+        assert outbox.offer(data("/a", b"1"), number) == 0
+    assert outbox.offer(data("/a", b"2"), 0) == MOST_FRAMES
+    assert [frame.data for frame in outbox.take(100)] == [b"2"]
+
+
+def test_the_lag_is_how_long_the_next_turn_has_been_waited_for() -> None:
     outbox = Outbox(1)
     assert outbox.lag(50) == 0
     outbox.offer(data("/a", b"1"), 10)
     outbox.offer(data("/b", b"2"), 20)
     assert outbox.lag(50) == 40
-    outbox.offer(data("/a", b"3"), 45)  # it took the place of the first
-    assert outbox.lag(50) == 5
+    outbox.offer(data("/a", b"3"), 45)  # takes the place of the first
+    assert outbox.lag(50) == 40
+    outbox.take(1)
+    assert outbox.lag(50) == 30
 
 
 FRAMES = st.builds(
