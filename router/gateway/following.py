@@ -13,13 +13,14 @@ if TYPE_CHECKING:  # which imports rclpy
 class Choice(NamedTuple):
     """How a topic is subscribed to. `keeps` asks for what was kept for those who join late.
 
-    `others` are the types that are not served, most publishers first.
+    `others` are the types that are not served, most publishers first. `is_ours`: nobody else publishes on it.
     """
 
     type_name: str
     is_reliable: bool
     keeps: bool
     others: tuple[str, ...]
+    is_ours: bool = False
 
 
 def choice(publishers: Sequence[SeenPublisher], *, is_let_in: bool) -> Choice | None:
@@ -35,7 +36,8 @@ def choice(publishers: Sequence[SeenPublisher], *, is_let_in: bool) -> Choice | 
     heard = [publisher for publisher in counted if publisher.type_name == type_name]
     is_reliable = all(publisher.is_reliable for publisher in heard)
     keeps = is_reliable and all(publisher.keeps for publisher in heard)
-    return Choice(type_name, is_reliable, keeps, tuple(others))
+    is_ours = all(publisher.is_ours for publisher in counted)
+    return Choice(type_name, is_reliable, keeps, tuple(others), is_ours)
 
 
 def by_frequency(type_names: Iterable[str]) -> dict[str, int]:

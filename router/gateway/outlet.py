@@ -36,7 +36,7 @@ class Outlet:
         self._encoding = encoding
         self._ledger = ledger
         self._tasks = tasks
-        self._is_heard = is_heard
+        self.is_heard = is_heard
         self._deliver = deliver
         self._introduced: set[Hashable] = set()
         self._pending: list[Frame] = []
@@ -51,21 +51,23 @@ class Outlet:
             return
         came = served.came()
         self._ledger.received(came)
-        if not self._is_heard():  # the middleware keeps the newest for whoever comes
+        if not self.is_heard():  # the middleware keeps the newest for whoever comes
             self._ledger.filtered(came)
             return
         sample = served.feed.latest() if came or served.sample is None else served.sample
         is_new = came > 0 and sample is not None and sample is not served.sample
         self._ledger.filtered(came - is_new)
         served.sample = sample
-        if sample is not None and (is_new or self._repeats):
-            self._offer(served, sample, frames, is_new=is_new)
+        if sample is not None and is_new:
+            self._offer(served, sample, frames, is_new=True)
+        elif served.readable is not None and self._repeats:
+            self._offer(served, served.readable, frames, is_new=False)
 
     def take(self, served: Served, sample: Sample) -> None:
         """A message of a topic of which every one is sent."""
         served.sample = sample
         self._ledger.received(1)
-        if not self._is_heard():
+        if not self.is_heard():
             self._ledger.filtered(1)
         elif not served.is_busy:
             self._offer(served, sample, self._queue(), is_new=True)
@@ -134,6 +136,7 @@ class Outlet:
             if is_new:
                 self._ledger.dropped("mapping_error", sample.topic, error)
             return
+        served.readable = sample
         if len(data.data) > self._most:
             if is_new:
                 detail = f"{len(data.data)} bytes, and at most {self._most} can be sent; {self._remedy}"
@@ -167,15 +170,18 @@ class Outlet:
         sample = served.feed.latest()
         if sample is None:
             return
-        frames.append(self.schema(served))
         if not self._is_quick(sample):
+            frames.append(self.schema(served))
             if not served.is_busy:
                 self._offer(served, sample, frames, is_new=False)
             return
         try:
             data = self._frame(sample)
-        except UnreadableError:
-            return  # counted where it is new
+        except UnreadableError:  # which is counted where it is new
+            if served.readable is None:
+                return
+            data = self._frame(served.readable)
+        frames.append(self.schema(served))
         if len(data.data) <= self._most:
             frames.append(data)
 

@@ -99,6 +99,8 @@ class GatewayService:
         subscriber = self.audience.joined(client)
         is_alone = len(self.audience.subscribers) == 1
         self.audience.send_to(subscriber, self._hello() + self._topics.snapshot(is_for_all=is_alone))
+        if is_alone:
+            self._topics.look_again()
 
     def left(self, client: Client) -> None:
         self.audience.left(client)

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from itertools import chain, count, cycle, repeat
 
 from router.compiler.program import GatewayPlan
 from router.compiler.selection import TopicSelector
@@ -22,10 +25,20 @@ from router.gateway.samples import Sample
 from router.gateway.served import Served
 from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks
-from router.table.model import EACH, Transport
+from router.table.model import EACH, GatewayFormat, Transport
 
 RUN = 32
 """Topics that are served before other work of the loop has its turn."""
+
+MOST_TURNS = 20
+"""Into so many turns a period is divided where each packet is a datagram: receivers with the kernel's default buffer
+lose some of a burst of two hundred."""
+
+SHORTEST_PAUSE_S = 0.1
+"""Between looks, however many clients come."""
+
+SHORTEST_TURN = 10_000_000
+"""ns between turns, at least: more often costs more than it spreads."""
 
 FIRST_LOOKS_S = (0.2, 0.5, 1.0, 2.0)
 """Pauses between looks at the graph after the start, as far as they are shorter than `discovery_period`: DDS needs a
@@ -55,15 +68,20 @@ class Topics:
         self._selector = TopicSelector(plan.settings, plan.inbound)
         self._served: dict[str, Served] = {}
         self._not_installed: set[str] = set()
+        self._numbers = count()
+        self._wanted = asyncio.Event()
+        self._spreads = plan.settings.format is GatewayFormat.GATEWAY_V1 and (
+            plan.settings.transport.value is Transport.UDP
+        )
 
     def start(self) -> None:
         settings = self._plan.settings
         self._tasks.run(self._discover(settings.discovery_period / 1e9))
         periods = {settings.publish_period, *(rate.period for rate in settings.rates)} - {EACH}
         for period in sorted(periods):
-            self._tasks.each(period / 1e9, self._tick(period))
+            self._in_turns(period, partial(self._publish, period))
         if settings.transport.value in (Transport.UDP, Transport.ZENOH):
-            self._tasks.each(settings.schema_period / 1e9, self._repeat_schemas)
+            self._in_turns(settings.schema_period, self._repeat_schemas)
 
     def close(self) -> None:
         for topic in list(self._served):
@@ -71,16 +89,25 @@ class Topics:
 
     # -- which topics --------------------------------------------------------------------------------------------
 
+    def look_again(self) -> None:
+        """Somebody has come, and wants topics for which nobody was there."""
+        self._wanted.set()
+
     async def _discover(self, period_s: float) -> None:
-        for pause in FIRST_LOOKS_S:
-            if pause < period_s:
-                await self._tasks.attempt(self._look)
-                await asyncio.sleep(pause)
-        self._tasks.each(period_s, self._look)
+        first = (pause for pause in FIRST_LOOKS_S if pause < period_s)
+        for pause in chain(first, repeat(period_s)):
+            self._wanted.clear()
+            await self._tasks.attempt(self._look)
+            await asyncio.sleep(at_least := min(pause, SHORTEST_PAUSE_S))
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._wanted.wait(), pause - at_least)
 
     async def _look(self) -> None:
         """Serves what has appeared, forgets what has gone, and follows changes of types and QoS."""
         seen = await self._hub.look(self._plan.inbound.keys(), self._selector.selects)
+        if not self._outlet.is_heard():
+            # What only the router publishes it fills only while somebody listens, and without clients nobody does.
+            seen = {topic: choice for topic, choice in seen.items() if not choice.is_ours}
         self._not_installed &= seen.keys()
         for topic in self._served.keys() - seen.keys():
             self._forget(topic)
@@ -119,7 +146,7 @@ class Topics:
             return
         if before:
             self._forget(topic)
-        self._served[topic] = Served.fresh(feed, choice, period)
+        self._served[topic] = Served.fresh(feed, choice, period, next(self._numbers))
         if choice.others:
             logger.warning(
                 "a topic has several types, and is served as that of most publishers",
@@ -136,30 +163,38 @@ class Topics:
 
     # -- when they are served ------------------------------------------------------------------------------------
 
-    def _tick(self, period: int) -> Callable[[], Awaitable[None]]:
-        async def tick() -> None:
-            frames: list[Frame] = []
-            due = [served for served in self._served.values() if served.period == period]
-            for number, served in enumerate(due, 1):
-                try:
-                    self._outlet.poll(served, frames)
-                except Exception as error:  # noqa: BLE001 told loudly; other topics are served all the same
-                    self._failed(error)
-                if number % RUN == 0:
-                    self._deliver(frames)
-                    frames = []
-                    await asyncio.sleep(0)
-            self._deliver(frames)
+    def _in_turns(self, period: int, serve: Callable[[Sequence[Served]], Awaitable[None]]) -> None:
+        """Has each topic served once in a `period` of ns, one after the other or all at once."""
+        number = max(1, min(MOST_TURNS, period // SHORTEST_TURN)) if self._spreads else 1
+        turns = cycle(range(number))
 
-        return tick
+        async def turn() -> None:
+            now = next(turns)
+            await serve([served for served in self._served.values() if served.number % number == now])
+
+        self._tasks.each(period / number / 1e9, turn)
+
+    async def _publish(self, period: int, due: Sequence[Served]) -> None:
+        frames: list[Frame] = []
+        for number, served in enumerate(due, 1):
+            if served.period != period:
+                continue
+            try:
+                self._outlet.poll(served, frames)
+            except Exception as error:  # noqa: BLE001 told loudly; other topics are served all the same
+                self._failed(error)
+            if number % RUN == 0:
+                self._deliver(frames)
+                frames = []
+                await asyncio.sleep(0)
+        self._deliver(frames)
 
     def _on_sample(self, feed: Feed, sample: Sample) -> None:
         if (served := self._served.get(feed.topic)) and served.feed is feed:
             self._outlet.take(served, sample)
 
-    async def _repeat_schemas(self) -> None:
-        known = [served for served in self._served.values() if served.sample is not None]
-        self._deliver([self._outlet.schema(served) for served in known])
+    async def _repeat_schemas(self, due: Sequence[Served]) -> None:
+        self._deliver([self._outlet.schema(served) for served in due if served.readable is not None])
 
     # -- for who asks --------------------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from backports import zstd
 from websockets.sync.client import connect
 
 from router.gateway.fragments import Reassembler
+from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.ros_speaker import Speaker
 from tests.acceptance.site import RouterProcess, Site, key, site, total, udp, wait_until
@@ -489,6 +490,28 @@ def test_the_books_of_a_gateway_balance(tmp_path: Path) -> None:
         counts = now.site.scrape()
         outcomes = ("messages_sent", "messages_filtered", "messages_dropped")
         assert sum(total(counts, metric, route="headset", target="clients") for metric in outcomes) == 90
+
+
+IMU_ONLY = """\
+  dashboard:
+    transport: {websocket: 127.0.0.5:PORT}
+    topics: {include: [/imu_data]}
+    publish_period: 50ms
+    discovery_period: 1h
+"""
+
+
+def test_what_only_the_router_publishes_is_filled_while_a_client_is_there(tmp_path: Path) -> None:
+    imu = next(generated("imu_info")).datagram
+    with scene(tmp_path, IMU_ONLY) as now:
+        send = partial(now.site.send, "sensor_board", imu)
+        time.sleep(3)  # as long as it looks often, because it has just started
+        for _ in range(10):
+            send()
+        filtered = key("messages_filtered", route="imu_info", target="imu_data")
+        wait_until(lambda: now.site.scrape()[filtered] == 10, "what nobody wants")
+        with Dashboard(now) as client, repeating(send):
+            assert client.next("data")["topic"] == "/imu_data"
 
 
 BATCHING = """\

@@ -29,6 +29,7 @@ INT32 = "std_msgs/msg/Int32"
 FIVE = bytes.fromhex("0001000005000000")
 INTERFACES = ros_interfaces()
 PLAIN = Choice(STRING, is_reliable=True, keeps=False, others=())
+OURS = PLAIN._replace(is_ours=True)
 PATIENCE_S = 20.0
 
 Publish = Callable[..., Publisher]
@@ -100,7 +101,7 @@ def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: Publish
             await seen(hub)
             assert await hub.look((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
                 "/greeting": Choice(STRING, is_reliable=True, keeps=True, others=()),
-                "/own": PLAIN,
+                "/own": OURS,
             }
             assert await hub.look((), lambda _: False) == {}
 
@@ -110,7 +111,7 @@ def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: Publish
 def test_what_only_we_publish_on_a_topic_that_is_let_in_is_not_seen() -> None:
     async def story() -> None:
         async with opened(string_topic()) as hub:
-            assert await seen(hub) == PLAIN
+            assert await seen(hub) == OURS
             assert await hub.look(["/greeting"], lambda topic: topic == "/greeting") == {}
 
     run(story())
