@@ -6,6 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
+_PATIENCE_S = 0.1
+
 
 class Tasks:
     """`failed` hears what they raise: a fault of ours, told loudly, which ends no other task."""
@@ -31,11 +33,13 @@ class Tasks:
             self._failed(error)
 
     async def close(self) -> None:
-        """Ends them all, wherever they are."""
-        running = list(self._running)
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
+        """Ends them all, wherever they are. One that has just got what it waited for may miss the first call to end:
+        asyncio.wait_for does until Python 3.12.
+        """
+        while running := list(self._running):
+            for task in running:
+                task.cancel()
+            await asyncio.wait(running, timeout=_PATIENCE_S)
 
     async def _each(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         clock = asyncio.get_running_loop().time
