@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import chain, count, cycle, repeat
+from itertools import chain, count, repeat
 
 from router.compiler.program import GatewayPlan
 from router.compiler.selection import TopicSelector
@@ -166,13 +166,19 @@ class Topics:
     def _in_turns(self, period: int, serve: Callable[[Sequence[Served]], Awaitable[None]]) -> None:
         """Has each topic served once in a `period` of ns, one after the other or all at once."""
         number = max(1, min(MOST_TURNS, period // SHORTEST_TURN)) if self._spreads else 1
-        turns = cycle(range(number))
+        turn_s = period / number / 1e9
+        clock = asyncio.get_running_loop().time
+        begin, done = clock(), -1
 
         async def turn() -> None:
-            now = next(turns)
-            await serve([served for served in self._served.values() if served.number % number == now])
+            """Those whose turn was missed have it now as well."""
+            nonlocal done
+            now = round((clock() - begin) / turn_s)
+            turns = {each % number for each in range(max(done, now - number) + 1, now + 1)}
+            done = now
+            await serve([served for served in self._served.values() if served.number % number in turns])
 
-        self._tasks.each(period / number / 1e9, turn)
+        self._tasks.each(turn_s, turn)
 
     async def _publish(self, period: int, due: Sequence[Served]) -> None:
         frames: list[Frame] = []
