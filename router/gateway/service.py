@@ -37,7 +37,7 @@ QUICK = 4 << 10
 MOST_READING = 16 << 20
 """Bytes of JSON that are read beside the loop or wait for that, of all clients. A single message may be longer."""
 
-_TELL_S = 1.0
+_TELL_S = _SETTLE_S = 1.0
 _ANSWER_NS = 100_000_000
 """How often schemas are sent because a client asks for them: a small question has a large answer."""
 
@@ -80,12 +80,14 @@ class GatewayService:
     def start(self) -> None:
         """Looks for topics and serves them from now on."""
         self._topics.start()
+        self._tasks.each(_SETTLE_S, self.audience.settle)
         if self._has_page:
             self._tasks.each(_TELL_S, self._tell_topics)
 
     async def close(self) -> None:
         """Nothing is sent or received any more."""
         async with AsyncExitStack() as closing:  # in the opposite order: who comes or sends something begins tasks
+            closing.callback(self.audience.close)
             closing.push_async_callback(self._tasks.close)
             closing.callback(self._topics.close)
             closing.push_async_callback(self._transport.close)

@@ -182,9 +182,7 @@ class Topics:
 
     async def _publish(self, period: int, due: Sequence[Served]) -> None:
         frames: list[Frame] = []
-        for number, served in enumerate(due, 1):
-            if served.period != period:
-                continue
+        for number, served in enumerate([each for each in due if each.period == period], 1):
             try:
                 self._outlet.poll(served, frames)
             except Exception as error:  # noqa: BLE001 told loudly; other topics are served all the same
