@@ -45,7 +45,7 @@ METRICS = (
     Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
     Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),
     Metric(
-        "gateway_client_lag_seconds", "number", ("route", "client"), "How long frames have been waiting for a client."
+        "gateway_client_lag_seconds", "number", ("route", "client"), "For how long a client has not had everything."
     ),
     Metric("gateway_client_sent", "counter", ("route", "client"), "Frames handed to a client since it came."),
     Metric("gateway_client_dropped", "counter", ("route", "client"), "Frames that newer ones replaced since it came."),
