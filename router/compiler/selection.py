@@ -7,13 +7,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection
+from functools import lru_cache
 from typing import NamedTuple
 
-from router.table.model import Gateway, TopicPattern
+from router.compiler.automaton import Automaton, UnsupportedError
+from router.table.model import Gateway, TopicPattern, TopicRate
 
 _WILDCARDS = re.compile(r"[*?]")
 _PART = re.compile(r"\*\*|(?:[A-Za-z0-9_?]|\*(?!\*))+")
 _ANY_PARTS = "**"
+_LONGEST_REGEX = 400
+"""Characters. In no more, groups cannot be nested so deeply that it would be trouble to the parser."""
+_REMEMBERED = 4096
+"""Topics whose answers are kept: they are asked for again whenever the gateway looks for topics."""
 
 
 class PatternProblem(NamedTuple):
@@ -24,14 +30,7 @@ class PatternProblem(NamedTuple):
 def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
     """Why a pattern is none."""
     if pattern.is_regex:
-        try:
-            re.compile(pattern.text)
-        except (re.error, OverflowError, RecursionError) as error:
-            return PatternProblem(
-                f"'{pattern.text}' is not a regular expression: {error}",
-                "regular expressions are Python's, and match whole names",
-            )
-        return None
+        return _regex_problem(pattern.text)
     if not pattern.text.startswith("/"):
         hint = f"patterns are for absolute topic names; did you mean '/{pattern.text}' or '/**/{pattern.text}'?"
         return PatternProblem(f"'{pattern.text}' does not begin with '/'", hint)
@@ -39,7 +38,35 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
         what = f"'{wrong[0]}' is no part of a topic's name" if wrong[0] else "a part of it is empty"
         hint = "parts are letters, digits, '_', '*' and '?', or '**' alone; {regex: ...} can say more"
         return PatternProblem(f"'{pattern.text}' matches no topic: {what}", hint)
+    return _unsupported(_regex(pattern.text))
+
+
+def _regex_problem(text: str) -> PatternProblem | None:
+    if len(text) > _LONGEST_REGEX:
+        hint = "several patterns say what one cannot"
+        return PatternProblem(f"a regular expression cannot have more than {_LONGEST_REGEX} characters", hint)
+    try:
+        return _unsupported(text)
+    except (re.error, OverflowError) as error:
+        hint = "regular expressions are Python's, and match whole names"
+        return PatternProblem(f"'{text}' is not a regular expression: {error}", hint)
+
+
+def _unsupported(regex: str) -> PatternProblem | None:
+    """Raises re.error and OverflowError."""
+    try:
+        Automaton(regex)
+    except UnsupportedError as error:
+        hint = "it is to match a whole name without looking back; several patterns say what one cannot"
+        return PatternProblem(f"a pattern cannot have {error}", hint)
     return None
+
+
+class _Answer(NamedTuple):
+    """What a topic is included by, and what its rate is of."""
+
+    chosen: TopicPattern | None
+    rate: TopicRate | None
 
 
 class TopicSelector:
@@ -53,6 +80,7 @@ class TopicSelector:
         self._named = {pattern.text for pattern in settings.include if is_name(pattern)}
         self._inbound = frozenset(inbound)
         self._publish_period = settings.publish_period
+        self._answers = lru_cache(_REMEMBERED)(self._answer)
 
     def selects(self, topic: str) -> bool:
         return self.chosen_by(topic) is not None
@@ -62,19 +90,28 @@ class TopicSelector:
 
         Hidden topics, and those that its clients publish, are sent only under their very name.
         """
+        return self._answers(topic).chosen
+
+    def period(self, topic: str) -> int:
+        """In ns, or EACH."""
+        rate = self._answers(topic).rate
+        return rate.period if rate else self._publish_period
+
+    def rated_by(self, topic: str) -> TopicPattern | None:
+        """The pattern of `rates` that the period is of; None where it is `publish_period`."""
+        rate = self._answers(topic).rate
+        return rate.pattern if rate else None
+
+    def _answer(self, topic: str) -> _Answer:
+        rate = next((rate for matches, rate in self._rates if matches(topic)), None)
+        return _Answer(self._choice(topic), rate)
+
+    def _choice(self, topic: str) -> TopicPattern | None:
         if any(matches(topic) for matches in self._exclude):
             return None
         if (is_hidden(topic) or topic in self._inbound) and topic not in self._named:
             return None
         return next((pattern for pattern, matches in self._include if matches(topic)), None)
-
-    def period(self, topic: str) -> int:
-        """In ns, or EACH."""
-        return next((rate.period for matches, rate in self._rates if matches(topic)), self._publish_period)
-
-    def rated_by(self, topic: str) -> TopicPattern | None:
-        """The pattern of `rates` that the period is of; None where it is `publish_period`."""
-        return next((rate.pattern for matches, rate in self._rates if matches(topic)), None)
 
 
 def is_hidden(topic: str) -> bool:
@@ -93,7 +130,9 @@ def _parts(text: str) -> list[str]:
 
 def matcher(pattern: TopicPattern) -> Callable[[str], object]:
     """Says something true of the names that a sound pattern matches."""
-    return re.compile(pattern.text if pattern.is_regex else _regex(pattern.text)).fullmatch
+    if is_name(pattern):
+        return pattern.text.__eq__
+    return Automaton(pattern.text if pattern.is_regex else _regex(pattern.text)).matches
 
 
 def _regex(glob: str) -> str:
