@@ -27,7 +27,7 @@ DEFAULT_TABLE = Path("routes/rover.yaml")
 VERBS = {
     "run": "run a route table between UDP and ROS 2",
     "validate": "say what is wrong with route tables",
-    "explain": "show what a route does, field by field, and the code that does it",
+    "explain": "show what a route does, field by field, with its code, and what a gateway sends",
     "send": "send envelopes with payloads of your choice",
     "tap": "show what arrives on a UDP port or a ROS topic",
     "listen": "show what a gateway sends",

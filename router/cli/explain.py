@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
-from router.cli.explain_gateway import explained_gateway, known_topics, seen_topics
+from router.cli.explain_gateway import explained_gateway, ignored_gateway, known_topics, seen_topics
 from router.cli.explain_words import duration, quality
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import positive
@@ -53,7 +53,8 @@ def run(args: argparse.Namespace) -> int:
     for route in checked.routes:
         routes.setdefault(route.case.name, []).append(route)
     gateways = {gateway.settings.name: gateway for gateway in checked.gateways}
-    known = [*routes, *gateways]
+    ignored = checked.table.ignored_gateways
+    known = [*routes, *gateways, *ignored]
     for name in args.names:
         if name not in known:
             hint = did_you_mean(name, known)
@@ -65,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
             _print_route(route, checked, args.no_code)
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
+        if name in ignored:
+            print(*ignored_gateway(ignored[name]), sep="\n", end="\n\n")
     return OK
 
 

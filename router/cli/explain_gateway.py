@@ -14,7 +14,7 @@ from router.compiler.selection import TopicSelector
 from router.compiler.topics import resolved
 from router.errors import StartError
 from router.gateway.following import by_frequency
-from router.table.model import EACH, Gateway, GatewayFormat, RouteTable, TopicPattern, Transport
+from router.table.model import EACH, Gateway, GatewayFormat, IgnoredGateway, RouteTable, TopicPattern, Transport
 
 Topics = Mapping[str, str]
 """What is known of topics, by absolute name: types, and how many publish them where somebody looked."""
@@ -60,6 +60,11 @@ def explained_gateway(checked: CheckedGateway, topics: Topics) -> Iterator[str]:
     for entry in checked.inbound:
         yield ""
         yield from _inbound(entry)
+
+
+def ignored_gateway(gateway: IgnoredGateway) -> Iterator[str]:
+    yield f"{gateway.name}: gateway  ({gateway.span})"
+    yield f"  ignored: {gateway.reason}"
 
 
 def _transport(gateway: Gateway) -> str:

@@ -21,6 +21,8 @@ from router.table.model import (
     EndpointKind,
     EnvelopeSettings,
     Framing,
+    Gateway,
+    IgnoredGateway,
     Listener,
     Located,
     NodeSettings,
@@ -51,6 +53,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     endpoints = root.entries.get("endpoints")
     if envelope is None or not _is_group(routes) or not (endpoints is None or _is_group(endpoints)) or routes is None:
         return None
+    gateways = builder.each(root, "gateways", build_gateway, salvage=sound_part)
     return RouteTable(
         path=sources[0].path,
         files=tuple(source.path for source in sources),
@@ -62,7 +65,8 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         endpoints=builder.each(root, "endpoints", _endpoint),
         routes=named(builder.each(root, "routes", build_case, salvage=sound_part).values()),
         routes_span=routes.key.span,
-        gateways=builder.each(root, "gateways", build_gateway, salvage=sound_part),
+        gateways={name: each for name, each in gateways.items() if isinstance(each, Gateway)},
+        ignored_gateways={name: each for name, each in gateways.items() if isinstance(each, IgnoredGateway)},
         broken=frozenset(builder.broken),
     )
 

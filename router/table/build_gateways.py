@@ -15,6 +15,7 @@ from router.table.model import (
     Address,
     Gateway,
     GatewayFormat,
+    IgnoredGateway,
     Inbound,
     InboundDeadman,
     Located,
@@ -59,8 +60,10 @@ DEFAULT_MAX_MESSAGE = 16 << 20
 DEFAULT_MAX_CLIENTS = 1024
 
 
-def build_gateway(entry: Entry) -> Gateway:
+def build_gateway(entry: Entry) -> Gateway | IgnoredGateway:
     settings = mapping(entry.value)
+    if settings.get("ignore"):
+        return IgnoredGateway(entry.key.text, entry.key.span, text(settings, "ignore").value)
     ((name, chosen),) = mapping(settings.get("transport")).entries.items()
     transport = Transport(name)
     topics = settings.get("topics")

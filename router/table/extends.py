@@ -1,7 +1,7 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
-Knows `extends`, that a route is either carried or ignored, that a deadman sends one payload and a gateway has one
-transport. Mappings merge key by key, everything else replaces; every node keeps the span of the file in which it was
+Knows `extends`, that a route or gateway is either there or ignored, that a deadman sends one payload, and a gateway has
+one transport. Mappings merge key by key, everything else replaces; every node keeps the span of the file where it was
 written.
 """
 
@@ -20,9 +20,10 @@ from router.table.source import Source, read_source
 
 KEY = "extends"
 IGNORE = "ignore"
-_ROUTE_DEPTH = len(("routes", "case"))
-_PAYLOAD = ("deadman", "send")
-_GATEWAY_DEPTH = len(("gateways", "name"))
+_DEPTH = len(("routes", "case"))
+"""At which routes and gateways stand."""
+_OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
+"""What of a route or gateway has one key, which says what kind it is."""
 
 
 def load_chain(
@@ -65,14 +66,12 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
-    """Nothing to merge: a route that one of the two ignores and the other carries; two payloads; two transports."""
-    if path[0] == "gateways":
-        return path[_GATEWAY_DEPTH:] == ("transport",) and over.entries.keys() != base.entries.keys()
-    if path[0] != "routes":
+    """Nothing to merge: a route or gateway that one of the two ignores; two payloads; two transports."""
+    if path[0] not in _OF_ONE_KIND:
         return False
-    if path[_ROUTE_DEPTH:] == _PAYLOAD:
+    if path[_DEPTH:] == _OF_ONE_KIND[path[0]]:
         return over.entries.keys() != base.entries.keys()
-    return len(path) == _ROUTE_DEPTH and (IGNORE in over.entries) != (IGNORE in base.entries)
+    return len(path) == _DEPTH and (IGNORE in over.entries) != (IGNORE in base.entries)
 
 
 def _root_mapping(root: Node) -> MappingNode:

@@ -357,6 +357,15 @@ class Gateway:
 
 
 @dataclass(frozen=True, slots=True)
+class IgnoredGateway:
+    """A name that another table has a gateway under, and why there is none here. `span` is the name."""
+
+    name: str
+    span: SourceSpan
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class RouteTable:
     """One table after `extends` and variables. `files` are all files read, the table itself first.
 
@@ -377,4 +386,5 @@ class RouteTable:
     routes: tuple[Route, ...]
     routes_span: SourceSpan
     gateways: Mapping[str, Gateway] = field(default_factory=dict)
+    ignored_gateways: Mapping[str, IgnoredGateway] = field(default_factory=dict)
     broken: frozenset[str] = frozenset()

@@ -30,6 +30,7 @@ _ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
 _NAME_DEPTH = len(("endpoints", "name"))
 _HINTS_FOR_MISSING = {
     "source": "or say 'ignore: why'",
+    "transport": "or say 'ignore: why'",
     "receive": "what its client publishes has to arrive somewhere",
 }
 NAME_FIELDS = ("fields", "send")

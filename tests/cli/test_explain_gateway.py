@@ -99,6 +99,16 @@ def test_without_a_name_routes_and_gateways_are_told(table: Path, capsys: pytest
     assert told.index("imu_info: ") < told.index("vr_headset: gateway") < told.index("dashboard: gateway")
 
 
+def test_of_an_ignored_gateway_the_reason_is_told(
+    table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    over = tmp_path / "over.yaml"
+    over.write_text(f"extends: {table}\ngateways:\n  dashboard: {{ignore: no page on this rover}}\n")
+    told = f"dashboard: gateway  ({over}:3:3)\n  ignored: no page on this rover\n\n"
+    assert explained(capsys, over, "dashboard") == told
+    assert told in explained(capsys, over, "--no-code")
+
+
 def test_an_unknown_gateway_is_wrong_usage(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", "vr_handset", "--table", str(table)]) == BAD_USAGE
     assert "did you mean 'vr_headset'?" in capsys.readouterr().err

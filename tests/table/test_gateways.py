@@ -138,6 +138,10 @@ ZENOH = "transport: {zenoh: {key: a}}"
         (f"{UDP}, topics: {{include: []}}", Code.BAD_VALUE),
         (f"{UDP}, topics: {{include: [{{glob: /a}}]}}", Code.UNKNOWN_KEY),
         (f"{UDP}, inbound: [{{topic: /a, type: std_msgs/msg/Empty}}]", Code.MISSING_KEY),
+        ("publish_period: 1s", Code.MISSING_KEY),
+        ("ignore: no page, publish_period: 1s", Code.UNKNOWN_KEY),
+        ('ignore: ""', Code.BAD_VALUE),
+        ("ignore: 5", Code.WRONG_TYPE),
         (f"{TCP}, inbound: [{{topic: /a}}]", Code.MISSING_KEY),
         (f"{TCP}, inbound: [{{topic: /a, type: std_msgs/msg/Empty, deadman: {{timeout: 1s}}}}]", Code.MISSING_KEY),
         (f"{TCP}, inbound: [{{topic: /a, type: std_msgs/msg/Empty, fields: auto}}]", Code.UNKNOWN_KEY),
@@ -196,3 +200,26 @@ def test_a_table_that_extends_another_merges_the_settings_of_one_transport(tmp_p
     zenoh = table.gateways["it"].zenoh
     assert zenoh
     assert (zenoh.key.value, zenoh.mode) == ("b", "router")
+
+
+def test_an_ignored_gateway_is_none(tmp_path: Path) -> None:
+    table, findings = table_with(tmp_path, f"  it: {{ignore: no page on this rover}}\n  other: {{{TCP}}}\n")
+    assert findings == []
+    assert list(table.gateways) == ["other"]
+    [ignored] = table.ignored_gateways.values()
+    assert (ignored.name, ignored.reason, ignored.span.line) == ("it", "no page on this rover", 6)
+
+
+def test_a_table_that_extends_another_turns_a_gateway_off_and_on_as_a_whole(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(HEAD + f"  it: {{{UDP}, publish_period: 1s}}\n")
+    (tmp_path / "off.yaml").write_text("extends: base.yaml\ngateways: {it: {ignore: nobody looks}}\n")
+    table, findings = load(tmp_path, "extends: off.yaml\n")
+    assert table
+    assert (findings, list(table.gateways), list(table.ignored_gateways)) == ([], [], ["it"])
+    table, findings = load(tmp_path, f"extends: off.yaml\ngateways: {{it: {{{TCP}}}}}\n")
+    assert table
+    assert (findings, list(table.gateways), list(table.ignored_gateways)) == ([], ["it"], [])
+    assert table.gateways["it"].publish_period == 500_000_000
+    table, findings = load(tmp_path, "extends: off.yaml\ngateways: {it: {ignore: for another reason}}\n")
+    assert table
+    assert (findings, table.ignored_gateways["it"].reason) == ([], "for another reason")
