@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from router.gateway.invalid import InvalidMessageError
 from router.gateway.json_parsing import parse_json
+from router.gateway.json_pieces import let_go
 from tests.gateway.client_json import FORMS, written
 
 PADDING = b" " * (1 << 16)
@@ -61,6 +62,9 @@ BAD: dict[str, tuple[bytes, str]] = {
     "100,000 brackets": (b"[" * 100_000, "more than 64 deep (character 64)"),
     "100,000 braces": (b'{"a":' * 100_000, "more than 64 deep"),
     "too many lists": (b"[" + b"[]," * 120_000 + b"1]", "more than 100000 lists"),
+    "too many texts": (b"[" + b'0,"",' * 400_001 + b"1]", "more than 400000 texts and names"),
+    "too many texts with brackets": (b"[" + b'"]",' * 400_001 + b"1]", "more than 400000 texts and names"),
+    "too many names": (b"{" + b",".join(b'"%d":0' % i for i in range(400_001)) + b"}", "more than 400000 texts"),
 }
 BAD_LISTS: dict[str, tuple[bytes, str]] = {
     "a comma at its end": (b"]", "no JSON: "),
@@ -188,6 +192,32 @@ def test_memory_is_in_proportion_to_the_text(text: bytes, factor: int) -> None:
     finally:
         tracemalloc.stop()
     assert most < factor * len(text)
+
+
+@pytest.mark.parametrize("shift", range(12))
+def test_a_long_text_is_read_whole_wherever_pieces_end(shift: int) -> None:
+    for part in ("\\ud83d\\ude00", "\\\\ud83d", "\\\\", '\\"', "\\u0041\\n", "[,]", "\N{GRINNING FACE}"):
+        text = f'{{"a":["{"x" * shift}{part * 20_000}",1],"{part}{"y" * 10_000}":"{part}"}}'
+        assert parse_json(text.encode()) == json.loads(text)
+        for half in ("\\ud83d", "\\ude00", "\\ud83d\\ud83d\\ude00"):
+            assert "half of a surrogate pair" in refusal(f'["{"x" * shift}{part * 20_000}{half}"]'.encode())
+        for wrong in ('\\u12"', "\\", '\\u"', '\\x"', ""):
+            assert "no JSON: " in refusal(f'["{"x" * shift}{part * 20_000}{wrong}]'.encode())
+
+
+@pytest.mark.parametrize(
+    "more", ['"[",', '"\\"]",', '"a,b",', "null,", '"",{},', '{"b":"]"},[2,3],', '"' + "x" * 9000 + '",']
+)
+def test_numbers_between_other_things_are_read(more: str) -> None:
+    text = f'{{"a":[{f"0,1.5,{more}" * 10_000}0],"b":1}}'
+    assert parse_json(text.encode()) == json.loads(text)
+
+
+def test_what_is_let_go_is_empty() -> None:
+    several = [[{"a": [1.5] * 20_000}] * 10_000, "x", 3]
+    value = {"data": several, "more": 1}
+    let_go(value)
+    assert (several, value["more"]) == ([], 1)
 
 
 def test_numbers_keep_their_kind() -> None:
