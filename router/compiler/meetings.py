@@ -11,7 +11,7 @@ from itertools import product
 from router.compiler.program import QosPlan
 from router.compiler.topics import qos_of, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import ANY, Located, Route, RouteTable, Topic
+from router.table.model import ANY, InboundDeadman, Located, Route, RouteTable, Topic
 
 
 def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
@@ -52,10 +52,12 @@ class _Use:
     publishes: bool
     qos: QosPlan
     route: Route | None = None
+    deadman: InboundDeadman | None = None
 
 
 def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
-    """Topics that several name: one type, one QoS for each direction, QoS that matches, and no way back.
+    """Topics that several name: one type, one QoS for each direction, QoS that matches, no way back, and no deadman
+    that meets the messages of others.
 
     Of a gateway these are the topics that its clients publish on.
     """
@@ -68,6 +70,8 @@ def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagn
         for publisher, subscriber in product(uses, uses):
             if publisher.publishes and not subscriber.publishes and publisher.route and subscriber.route:
                 yield from _echoes(name, publisher.route, subscriber.route)
+        for use in uses:
+            yield from _struggles(name, use, uses)
 
 
 def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_Use]]:
@@ -85,7 +89,8 @@ def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
             yield _Use(topic, f"route '{route.name}'", not route.is_outbound, qos_of(topic), route)
     for gateway in table.gateways.values():
         for inbound in gateway.inbound:
-            yield _Use(inbound.topic, f"gateway '{gateway.name}'", True, qos_of(inbound.topic))
+            owner = f"gateway '{gateway.name}'"
+            yield _Use(inbound.topic, owner, True, qos_of(inbound.topic), deadman=inbound.deadman)
 
 
 def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
@@ -97,6 +102,23 @@ def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnost
             message = f"'{sender.value}' would get its own '{publisher.case.value}' back through the topic '{name}'"
             hint = "remove it from the destinations, or give one of the routes another topic"
             yield Diagnostic(sender.span, Code.FORWARDING_LOOP, message, hint)
+
+
+def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
+    """A gateway's deadman knows only its own clients: it publishes against others, and feeds the deadmen of routes."""
+    if use.deadman is None:
+        return
+    for other in others:
+        if other.publishes and other.owner != use.owner:
+            message = f"while clients of {use.owner} are silent, this would publish on '{name}' against {other.owner}"
+            hint = "give each a topic of its own, and let a node choose between them, such as twist_mux"
+        elif other.route is not None and other.route.deadman is not None and not other.publishes:
+            message = f"{other.owner} takes '{name}', and this would keep its deadman from tripping"
+            hint = "leave it to the route"
+        else:
+            continue
+        yield Diagnostic(use.deadman.span, Code.BAD_VALUE, message, hint)
+        return
 
 
 def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import combinations
 
 from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import Address, Endpoint, Gateway, Listener, Located, RouteTable, Transport
+from router.table.model import Address, Endpoint, Gateway, Located, RouteTable, Transport
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
@@ -56,7 +56,7 @@ def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
     keys: dict[str, Gateway] = {}
     for gateway in table.gateways.values():
         if gateway.address is not None and gateway.transport.value is Transport.UDP:
-            yield from _own_address(gateway, gateway.address, table.listeners.values())
+            yield from _own_address(gateway, gateway.address, table)
         if gateway.zenoh is not None:
             first = keys.setdefault(gateway.zenoh.key.value, gateway)
             if first is not gateway:
@@ -64,10 +64,12 @@ def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
                 yield Diagnostic(gateway.zenoh.key.span, Code.ADDRESS_CLASH, message, "give it a key of its own")
 
 
-def _own_address(gateway: Gateway, address: Located[Address], listeners: Iterable[Listener]) -> Iterator[Diagnostic]:
-    own = {f"listener '{listener.name}'": listener.address.value for listener in listeners}
-    if gateway.receive is not None:
-        own["'receive' address"] = gateway.receive.value
+def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable) -> Iterator[Diagnostic]:
+    """Also where another gateway receives: two that name each other would send each other all for ever."""
+    own = {f"listener '{listener.name}'": listener.address.value for listener in table.listeners.values()}
+    for other in table.gateways.values():
+        if other.receive is not None:
+            own["'receive' address" if other is gateway else f"gateway '{other.name}'"] = other.receive.value
     for name, local in own.items():
         if _reaches(address.value, local):
             message = f"'{gateway.name}' would send to the router's own {name} ({address.value})"

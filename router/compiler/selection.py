@@ -18,6 +18,7 @@ _PART = re.compile(r"\*\*|(?:[A-Za-z0-9_?]|\*(?!\*))+")
 _ANY_PARTS = "**"
 _LONGEST_REGEX = 400
 """Characters. In no more, groups cannot be nested so deeply that it would be trouble to the parser."""
+_SIMPLER = "say it in several patterns, and with 'exclude' what is not to be sent"
 _REMEMBERED = 4096
 """Topics whose answers are kept: they are asked for again whenever the gateway looks for topics."""
 
@@ -43,8 +44,7 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
 
 def _regex_problem(text: str) -> PatternProblem | None:
     if len(text) > _LONGEST_REGEX:
-        hint = "several patterns say what one cannot"
-        return PatternProblem(f"a regular expression cannot have more than {_LONGEST_REGEX} characters", hint)
+        return PatternProblem(f"a regular expression cannot have more than {_LONGEST_REGEX} characters", _SIMPLER)
     try:
         return _unsupported(text)
     except (re.error, OverflowError) as error:
@@ -57,8 +57,7 @@ def _unsupported(regex: str) -> PatternProblem | None:
     try:
         Automaton(regex)
     except UnsupportedError as error:
-        hint = "it is to match a whole name without looking back; several patterns say what one cannot"
-        return PatternProblem(f"a pattern cannot have {error}", hint)
+        return PatternProblem(f"a pattern cannot have {error}", _SIMPLER)
     return None
 
 

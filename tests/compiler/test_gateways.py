@@ -30,6 +30,8 @@ PUBLISHES = (
 SUBSCRIBES = """routes: {ph_info: {source: ros, topics: [{topic: %s, type: std_msgs/msg/Float32}],
   fields: {ph_value: data}, destinations: [base]}}"""
 
+BRAKES = SUBSCRIBES.replace("source:", "deadman: {timeout: 1s, send: {ph_info: {}}, to: [base]}, source:")
+
 
 def checked(check_text: CheckText, gateways: str, routes: str = NO_ROUTES, **parts: str) -> Checked:
     """`gateways` on one line in braces. Without the finding that there are few routes."""
@@ -109,6 +111,16 @@ def test_a_gateway_does_not_send_to_the_router(check_text: CheckText, client: st
     assert codes(check_text, gateway) == [Code.FORWARDING_LOOP]
 
 
+def test_gateways_do_not_send_to_each_other(check_text: CheckText) -> None:
+    ping = "ping: {transport: {udp: 127.0.0.1:8501}, receive: 127.0.0.1:8500}"
+    pong = "pong: {transport: {udp: 127.0.0.1:8500}, receive: 127.0.0.1:8501}"
+    assert codes(check_text, f"{ping}, {pong}") == [Code.FORWARDING_LOOP] * 2
+    assert codes(check_text, f"{ping}, pong: {{transport: {{udp: 127.0.0.9:1}}, receive: 0.0.0.0:8501}}") == [
+        Code.FORWARDING_LOOP
+    ]
+    assert codes(check_text, f"{ping}, pong: {{transport: {{udp: 127.0.0.9:1}}, receive: 127.0.0.1:8502}}") == []
+
+
 @pytest.mark.parametrize(
     ("inbound", "found"),
     [
@@ -166,6 +178,34 @@ def test_gateways_that_let_in_one_topic_agree_on_its_type(
     assert codes(check_text, f"{a}, {b}") == found
 
 
+DEADMAN = "deadman: {timeout: 500ms, send: {}}"
+
+
+@pytest.mark.parametrize(
+    ("routes", "first", "second", "found"),
+    [
+        (NO_ROUTES, "", "", 0),
+        (NO_ROUTES, DEADMAN, "", 1),
+        (NO_ROUTES, DEADMAN, DEADMAN, 2),
+        (PUBLISHES % "/b", DEADMAN, None, 0),
+        (PUBLISHES % "/a", DEADMAN, None, 1),
+        (SUBSCRIBES % "/a", DEADMAN, None, 0),
+        (BRAKES % "/a", DEADMAN, None, 1),
+        (BRAKES % "/a", "", None, 0),
+        (BRAKES % "/b", DEADMAN, None, 0),
+    ],
+)
+def test_a_deadman_does_not_meet_the_messages_of_others(
+    check_text: CheckText, routes: str, first: str, second: str | None, found: int
+) -> None:
+    topic = "topic: /a, type: std_msgs/msg/Float32"
+    gateways = f"one: {{{TCP}, inbound: [{{{topic}, {first}}}]}}"
+    if second is not None:
+        gateways += f", other: {{{ZENOH}, inbound: [{{{topic}, {second}}}]}}"
+    assert codes(check_text, gateways, routes) == [Code.BAD_VALUE] * found
+    assert blamed(check_text, gateways, routes) == ["deadman"] * found
+
+
 def test_inbound_topics_are_planned_by_absolute_names_and_published_once(check_text: CheckText) -> None:
     twist = "type: geometry_msgs/msg/Twist"
     a = f"a: {{{UDP}, inbound: [{{topic: cmd_vel, {twist}, ttl: 300ms, max_rate: 20 Hz}}, {{topic: ~/x, {twist}}}]}}"
@@ -210,6 +250,15 @@ def test_what_a_deadman_publishes_is_known_before_the_start(
     assert (deadman.route, deadman.timeout, deadman.repeat) == ("it:/a", 10**9, 50_000_000)
     assert [(topic, data.hex()) for topic, data in deadman.datagrams] == [("/a", cdr.replace(" ", ""))]
     assert program.deadmen == ()
+
+
+def test_an_ignored_gateway_has_no_series_no_address_and_no_name(check_text: CheckText) -> None:
+    found = checked(check_text, f"here: {{ignore: nobody looks}}, it: {{{TCP}}}")
+    assert found.diagnostics == []
+    assert found.program
+    assert [gateway.settings.name for gateway in found.program.gateways] == ["it"]
+    names = {series.labels[0] for series, _ in found.program.books.series() if series.metric == "messages_sent"}
+    assert names == {"it"}
 
 
 def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText) -> None:
