@@ -65,19 +65,13 @@ class RouterProcess:
 
     def __init__(self, folder: Path, *arguments: object, **environment: str) -> None:
         self._log = folder / "router.log"
-        port = str(free_port(ROUTER, kind=socket.SOCK_STREAM))
         folders = (environment.pop("PYTHONPATH", None), str(ROOT), os.environ.get("PYTHONPATH"))
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "router", "run", *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 stderr=log,
-                env={
-                    **os.environ,
-                    "DASHBOARD_PORT": port,
-                    **environment,
-                    "PYTHONPATH": os.pathsep.join(filter(None, folders)),
-                },
+                env={**os.environ, **environment, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
             )
 
     def __enter__(self) -> RouterProcess:
