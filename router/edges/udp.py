@@ -6,26 +6,17 @@ Knows no envelope, route or counter; what a datagram means is the engine's busin
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import socket
-import struct
 from collections.abc import Callable
 from contextlib import suppress
 
 from router.compiler.program import ListenerPlan, SenderPlan
 from router.edges.log import logger
 from router.edges.port_holder import port_holder
+from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops
 from router.errors import SourceSpan, StartError
 from router.table.model import Address
-
-# Linux values that the socket module does not name.
-SO_RCVBUFFORCE = 33
-SO_MEMINFO = 55
-SIOCGSTAMPNS = 0x8907
-_TIMESPEC = struct.Struct("@ll")
-_MEMINFO = struct.Struct("9I")
-_MEMINFO_DROPS = 8
 
 _NETWORK_CHANGED = (errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL)
 """What sending says: there was no network when the router started, there is none now, or this computer has no longer
@@ -39,13 +30,11 @@ class Listener:
         self.name = plan.name
         self.coalesce = plan.coalesce
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._stamp = bytearray(_TIMESPEC.size)
         try:
             # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
             self.socket.bind(plan.address)
-            _ask_for_receive_buffer(self.socket, plan)
-            with suppress(FileNotFoundError):  # nothing was received yet, but now that it was asked the kernel stamps
-                self.arrived_at()
+            _want_receive_buffer(self.socket, plan)
+            self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
             raise StartError(f"{span}: {_why_not_bound(plan, error)}") from error
@@ -54,20 +43,7 @@ class Listener:
 
     def kernel_drops(self) -> int:
         """Datagrams that the kernel threw away before anybody received them, since the socket was opened."""
-        if self.socket.fileno() < 0:
-            return self._drops_at_close
-        words = _MEMINFO.unpack(self.socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
-        return int(words[_MEMINFO_DROPS])
-
-    def arrived_at(self) -> int:
-        """When the kernel got the datagram that was last received, in ns of the wall clock.
-
-        The time that it lay in the receive buffer does not count. Costs a system call, and receiving costs nothing
-        more for it. For the thread that receives; raises FileNotFoundError before the first datagram.
-        """
-        fcntl.ioctl(self.socket, SIOCGSTAMPNS, self._stamp)
-        seconds, nanoseconds = _TIMESPEC.unpack(self._stamp)
-        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+        return self._drops_at_close if self.socket.fileno() < 0 else drops(self.socket)
 
     def end_input(self) -> None:
         """Lets nothing new in. What has arrived can still be received; after it comes the end, peer None.
@@ -88,14 +64,8 @@ class Listener:
         self.socket.close()
 
 
-def _ask_for_receive_buffer(opened: socket.socket, plan: ListenerPlan) -> None:
-    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, plan.receive_buffer)
-    # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
-    if (granted := opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2) >= plan.receive_buffer:
-        return
-    try:
-        opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, plan.receive_buffer)
-    except PermissionError:
+def _want_receive_buffer(opened: socket.socket, plan: ListenerPlan) -> None:
+    if (granted := ask_for_receive_buffer(opened, plan.receive_buffer)) < plan.receive_buffer:
         logger.warning(
             "receive buffer is smaller than the table asks for: bursts may be dropped by the kernel",
             listener=plan.name,

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import select
-import socket
-import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from router.edges.udp import SO_MEMINFO, SO_RCVBUFFORCE
+from router.edges.udp_kernel import ask_for_receive_buffer, drops
 from router.gateway.packets import Packet, pack
 from router.table.model import Address
 from router.table.units import LARGEST_DATAGRAM
@@ -21,18 +19,13 @@ _RECEIVE_BUFFER = 4 << 20
 
 _MOST_AT_ONCE = 1000
 
-_MEMINFO = struct.Struct("9I")
-_DROPS = 8
-
 
 class UdpSource:
     """Bound to `address`. `gateway` is where schemas are asked for, if they are. Raises UsageError."""
 
     def __init__(self, address: Address, gateway: Address | None, say: Callable[[str], None]) -> None:
         self._socket = places.open_udp(address, "listen")
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        with suppress(PermissionError):  # root gets all of it
-            self._socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+        ask_for_receive_buffer(self._socket, _RECEIVE_BUFFER)
         self._gateway = gateway
         self._say = say
         self.place = f"udp {Address(*self._socket.getsockname())}"
@@ -40,8 +33,7 @@ class UdpSource:
     @property
     def lost(self) -> int:
         """Datagrams that the kernel threw away because we were too slow."""
-        words = _MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
-        return int(words[_DROPS])
+        return drops(self._socket)
 
     def ask(self) -> None:
         """An empty packet without a type asks for all schemas. It comes from the port that they are to be sent to."""

@@ -20,7 +20,8 @@ from router.edges import receiver
 from router.edges.clock import wall_ns
 from router.edges.coalescing import FOR_SOCKETS, SAMPLE, Coalescing
 from router.edges.receiver import ReceiveThread
-from router.edges.udp import SO_RCVBUFFORCE, Listener, Sender
+from router.edges.udp import Listener, Sender
+from router.edges.udp_kernel import SO_RCVBUFFORCE
 from router.errors import SourceSpan, StartError
 from router.table.model import Address, Framing
 

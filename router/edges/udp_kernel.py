@@ -1,0 +1,55 @@
+"""What Linux tells of a UDP socket, and the socket module does not: when a datagram arrived, and what was dropped."""
+
+from __future__ import annotations
+
+import fcntl
+import socket
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+
+# Linux values that the socket module does not name.
+SO_RCVBUFFORCE = 33
+SO_MEMINFO = 55
+SIOCGSTAMPNS = 0x8907
+_TIMESPEC = struct.Struct("@ll")
+_MEMINFO = struct.Struct("9I")
+_MEMINFO_DROPS = 8
+
+
+def arrivals(opened: socket.socket) -> Callable[[], int]:
+    """From now on the kernel stamps what arrives. Returns what tells when it got the datagram last received, in ns of
+    the wall clock.
+
+    The time that it lay in the receive buffer does not count. Costs a system call, and receiving costs nothing
+    more for it. For the thread that receives; raises FileNotFoundError before the first datagram.
+    """
+    stamp = bytearray(_TIMESPEC.size)
+
+    def arrived_at() -> int:
+        fcntl.ioctl(opened, SIOCGSTAMPNS, stamp)
+        seconds, nanoseconds = _TIMESPEC.unpack(stamp)
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+    with suppress(FileNotFoundError):  # nothing was received yet, but now that it was asked the kernel stamps
+        arrived_at()
+    return arrived_at
+
+
+def drops(opened: socket.socket) -> int:
+    """Datagrams that the kernel threw away before anybody received them, since the socket was opened."""
+    words = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
+    return int(words[_MEMINFO_DROPS])
+
+
+def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
+    """Asks for `size` bytes, past the system's limit where that is allowed. Returns how many were granted."""
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
+    # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
+    if (granted := opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2) >= size:
+        return granted
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, size)
+    except PermissionError:
+        return granted
+    return size
