@@ -21,6 +21,11 @@ class Splitter(Protocol):
     def take(self) -> bytes | None:
         """The next one that is complete. Raises TooLongError."""
 
+    def __len__(self) -> int:
+        """How many bytes it keeps."""
+
+    def clear(self) -> None: ...
+
 
 class Packets:
     """Each preceded by its length, u32 little-endian."""
@@ -45,6 +50,12 @@ class Packets:
         del self._buffer[:end]
         return packet
 
+    def __len__(self) -> int:
+        return len(self._buffer)
+
+    def clear(self) -> None:
+        self._buffer.clear()
+
 
 class Lines:
     r"""Each ended by `\n`, or `\r\n`."""
@@ -67,3 +78,10 @@ class Lines:
         line = bytes(memoryview(self._buffer)[:end])
         del self._buffer[: end + 1]
         return line.removesuffix(b"\r")
+
+    def __len__(self) -> int:
+        return len(self._buffer)
+
+    def clear(self) -> None:
+        self._buffer.clear()
+        self._searched = 0

@@ -11,14 +11,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
 
+from router.edges.gateway_arrival import LoopClock
 from router.edges.gateway_binding import MOST_UNACCEPTED, Binding, listen_at
+from router.edges.gateway_memory import Trimmer
 from router.edges.gateway_outflow import STALLED_SECONDS, Encoded, Feeder, Outflow
 from router.edges.gateway_transport import Client, Ears, Frame
+from router.edges.gateway_unfinished import MOST_UNFINISHED, UNFINISHED_SECONDS, Unfinished
 from router.edges.log import FloodLog, logger
 from router.table.model import Address
 
 LOOK_SECONDS = 5.0
 """Between looks for clients that stand still."""
+
+OVERHEAD = 1 << 20
+"""Bytes beyond its own length that an unfinished message may take up."""
 
 ACCEPTED_PER_TURN = 16
 """Connections that are accepted before other work of the loop has its turn."""
@@ -42,15 +48,18 @@ class StreamClient(ABC):
 
 
 class StreamTransport(ABC):
-    """Listens at `address`, and closes clients that stand still."""
+    """Listens at `address`, and closes clients that stand still, or begin messages of up to `most` bytes in vain."""
 
-    def __init__(self, address: Address, ears: Ears, max_clients: int) -> None:
+    def __init__(self, address: Address, ears: Ears, max_clients: int, most: int) -> None:
         self.address: Address | None = None
         self._wanted = address
         self.ears = ears
         self.feeder = Feeder()
+        self.clock = LoopClock()
+        self.trimmer = Trimmer()
         self._max_clients = max_clients
         self._clients: set[StreamClient] = set()
+        self._unfinished: Unfinished[StreamClient] = Unfinished(max(MOST_UNFINISHED, most + OVERHEAD))
         self._binding = Binding("tcp", address, self._bind)
         self._watching: asyncio.TimerHandle | None = None
         self._log = FloodLog()
@@ -68,6 +77,8 @@ class StreamTransport(ABC):
         if self._watching is not None:
             self._watching.cancel()
         await self._stop()
+        self.clock.stop()
+        self.trimmer.close()
         self._log.flush(final=True)
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
@@ -97,6 +108,7 @@ class StreamTransport(ABC):
             self._log.note("full", logger.warning, "a client was turned away: there are too many", client=client.label)
             return False
         self._clients.add(client)
+        self.clock.start()
         self.ears.joined(client)
         return True
 
@@ -105,10 +117,30 @@ class StreamTransport(ABC):
         if client in self._clients:
             self._clients.remove(client)
             client.outflow.clear()
+            if not self._clients:
+                self.clock.stop()
             self.ears.left(client)
+
+    def holds(self, client: StreamClient, size: int) -> None:
+        """To be told whenever `client` has sent something; `size` of its bytes are no whole message yet."""
+        largest = self._unfinished.holds(client, size, monotonic())
+        if largest is not None:
+            self.ears.refused("too_large")
+            self._end_unfinished(largest, "a client was closed: too much was sent in messages that are not whole")
+
+    def holds_nothing(self, client: StreamClient) -> None:
+        """It has gone."""
+        self.trimmer.freed(self._unfinished.forget(client))
+
+    def _end_unfinished(self, client: StreamClient, what: str) -> None:
+        self._log.note(what, logger.warning, what, client=client.label)
+        self.trimmer.freed(MOST_UNFINISHED)
+        client.close()
 
     def _watch(self) -> None:
         now = monotonic()
+        for client in self._unfinished.silent(now):
+            self._end_unfinished(client, f"a client was closed: it did not end a message for {UNFINISHED_SECONDS:g} s")
         for client in [each for each in self._clients if each.outflow.is_stalled(now)]:
             self._log.note(
                 "stalled",

@@ -6,7 +6,7 @@ import asyncio
 import socket
 from collections.abc import Sequence
 
-from router.edges.clock import wall_ns
+from router.edges.gateway_arrival import Arrivals
 from router.edges.gateway_outflow import PIECE, Encoded, Outflow, Piece, label, prepare
 from router.edges.gateway_splitting import LENGTH, Lines, Packets, Splitter, TooLongError
 from router.edges.gateway_stream import ACCEPTED_PER_TURN, StreamClient, StreamTransport
@@ -26,7 +26,7 @@ class TcpTransport(StreamTransport):
     """
 
     def __init__(self, address: Address, ears: Ears, prefixed: bool, max_clients: int, most: int) -> None:
-        super().__init__(address, ears, max_clients)
+        super().__init__(address, ears, max_clients, most)
         self._prefixed = prefixed
         self._most = most
         self._server: asyncio.Server | None = None
@@ -93,6 +93,7 @@ class _TcpClient(asyncio.BufferedProtocol, StreamClient):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)  # noqa: S101 - what a server's are
         self._transport = transport
+        self._arrivals = Arrivals(self._owner.clock, transport.get_extra_info("socket"))
         self.label = label(transport)
         prepare(transport)
         self.outflow = Outflow(transport, self._owner.feeder, lambda: True, self._drained)
@@ -100,6 +101,8 @@ class _TcpClient(asyncio.BufferedProtocol, StreamClient):
             transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
+        self._incoming.clear()
+        self._owner.holds_nothing(self)
         self._owner.went(self)
 
     def pause_writing(self) -> None:
@@ -112,6 +115,7 @@ class _TcpClient(asyncio.BufferedProtocol, StreamClient):
         return self._inbox
 
     def buffer_updated(self, nbytes: int) -> None:
+        self._arrived = self._arrivals.stamp(is_all=nbytes < READ_AT_ONCE)
         self._incoming.feed(self._inbox[:nbytes])
         self._take()
 
@@ -122,7 +126,6 @@ class _TcpClient(asyncio.BufferedProtocol, StreamClient):
 
     def _take(self) -> None:
         """Hands on what is complete; who sends much waits until others had their turn."""
-        arrived = wall_ns()
         for _ in range(TAKEN_PER_TURN):
             if self._transport.is_closing():
                 return
@@ -132,9 +135,11 @@ class _TcpClient(asyncio.BufferedProtocol, StreamClient):
                 self._owner.too_long(self, error)
                 return
             if one is None:
+                self._owner.holds(self, len(self._incoming))
                 self._transport.resume_reading()
                 return
-            self._owner.ears.received(self, one, arrived)
+            self._owner.ears.received(self, one, self._arrived)
+            self._owner.trimmer.freed(len(one))
         self._transport.pause_reading()
         self._loop.call_soon(self._take)
 

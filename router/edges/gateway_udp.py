@@ -10,13 +10,16 @@ import socket
 from collections import deque
 from collections.abc import Iterable, Sequence
 
-from router.edges.clock import wall_ns
 from router.edges.gateway_binding import Binding
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client, Ears, Frame
+from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops
 from router.table.model import Address
 
 SEND_BUFFER = 4 << 20
 """Bytes that the kernel is asked to keep for a network that is busy."""
+
+RECEIVE_BUFFER = 1 << 20
+"""Bytes that the kernel is asked to keep of what the client sends while the loop is busy."""
 
 BURST = 64
 BURST_BYTES = 128 * 1024
@@ -45,6 +48,7 @@ class UdpTransport:
         self._binding = Binding("udp", local or Address("0.0.0.0", 0), self._bind)
         self._client: UdpClient | None = None
         self._socket: socket.socket | None = None
+        self._drops_at_close = 0
 
     @property
     def is_ready(self) -> bool:
@@ -60,8 +64,14 @@ class UdpTransport:
         if self._local is not None:
             asyncio.get_running_loop().remove_reader(self._socket)
         self._client.close()
+        self._drops_at_close = self.kernel_drops()
         self._socket.close()
         self._socket = None
+
+    def kernel_drops(self) -> int:
+        """Datagrams of whomever that the kernel threw away before they were received. For any thread."""
+        opened = self._socket
+        return self._drops_at_close if opened is None else drops(opened)
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
         for client in clients:
@@ -74,6 +84,9 @@ class UdpTransport:
             # Never SO_REUSEADDR: with it, a second router would steal the port unnoticed.
             opened.bind(self._local or ("", 0))
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if self._local is not None:
+                ask_for_receive_buffer(opened, RECEIVE_BUFFER)
+                self._arrived_at = arrivals(opened)
         except OSError:
             opened.close()
             raise
@@ -98,7 +111,7 @@ class UdpTransport:
             elif len(data) > self._most:
                 self._ears.refused("too_large")
             else:
-                self._ears.received(client, data, wall_ns())
+                self._ears.received(client, data, self._arrived_at())
 
 
 class UdpClient:

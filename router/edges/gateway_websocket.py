@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
-from websockets.frames import CloseCode, Opcode
+from websockets.frames import DATA_OPCODES, CloseCode, Opcode
 from websockets.frames import Frame as Part
-from websockets.protocol import State
+from websockets.protocol import Event, State
 
-from router.edges.clock import wall_ns
+from router.edges.gateway_arrival import Arrivals
 from router.edges.gateway_http import Page
 from router.edges.gateway_outflow import PIECE, Encoded, Outflow, label, prepare
 from router.edges.gateway_stream import ACCEPTED_PER_TURN, StreamClient, StreamTransport
@@ -35,6 +36,9 @@ TAKEN_PER_TURN = 32
 STRANGERS = 64
 """Connections beyond `max_clients` that may be without a websocket: they fetch the page, or are about to ask."""
 
+PART_BYTES = 300
+"""What each part of a message that is not whole takes up beside its bytes."""
+
 
 class WebsocketTransport(StreamTransport):
     """`text`: the frames of one writing are one text message, joined by newlines; otherwise each is a binary message.
@@ -43,12 +47,13 @@ class WebsocketTransport(StreamTransport):
     """
 
     def __init__(self, address: Address, ears: Ears, text: bool, max_clients: int, most: int, page: bytes) -> None:
-        super().__init__(address, ears, max_clients)
+        super().__init__(address, ears, max_clients, most)
         self._text = text
         self._most = most
         self._page = Page(page)
         self._server: Server | None = None
         self._connections: set[_Connection] = set()
+        self._strangers: dict[_Connection, None] = {}  # in the order in which they came
 
     def encode(self, frames: Sequence[Frame]) -> Encoded:
         messages = [frame.data for frame in frames]
@@ -91,16 +96,24 @@ class WebsocketTransport(StreamTransport):
         return connection
 
     def connected(self, connection: _Connection) -> None:
+        """Where there is no room, that stranger gives way who has had most time to ask."""
         self._connections.add(connection)
+        self._strangers[connection] = None
         if len(self._connections) > self._max_clients + STRANGERS:
-            connection.transport.abort()
+            oldest = next(iter(self._strangers))
+            del self._strangers[oldest]
+            oldest.transport.abort()
 
     def disconnected(self, connection: _Connection) -> None:
         self._connections.discard(connection)
+        self._strangers.pop(connection, None)
+        self.holds_nothing(connection.client)
 
     async def _serve_client(self, connection: ServerConnection) -> None:
         assert isinstance(connection, _Connection)  # noqa: S101 - they come from here
         client = connection.client
+        self._strangers.pop(connection, None)
+        self.holds(client, connection.unfinished())  # no greeting any more
         if not self.came(client):
             await connection.close(CloseCode.TRY_AGAIN_LATER, "there are too many clients")
             return
@@ -120,7 +133,8 @@ class WebsocketTransport(StreamTransport):
         while True:
             for _ in range(TAKEN_PER_TURN):
                 data = await connection.recv(decode=False)
-                self.ears.received(connection.client, data, wall_ns())
+                self.ears.received(connection.client, data, connection.arrived.popleft())
+                self.trimmer.freed(len(data))
             await asyncio.sleep(0)
 
 
@@ -152,6 +166,11 @@ class _Connection(ServerConnection):
         self.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's, but not in its interface
         prepare(self.transport)
         self.client = _WebsocketClient(self)
+        self.arrived: deque[int] = deque()  # a stamp for each message that waits to be taken
+        self._arrivals = Arrivals(self.owner.clock, self.transport.get_extra_info("socket"))
+        self._arrived = 0
+        self._greeted = 0  # bytes
+        self._parts = 0
         self.owner.connected(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -159,9 +178,26 @@ class _Connection(ServerConnection):
         self.owner.disconnected(self)
 
     def data_received(self, data: bytes) -> None:
+        self._arrived = self._arrivals.stamp(is_all=len(data) < READ_AT_ONCE)
+        if self.protocol.state is State.CONNECTING:
+            self._greeted += len(data)
         super().data_received(data)
+        self.owner.holds(self.client, self.unfinished())
         if self.transport.get_write_buffer_size() > HIGH_WATER:  # pings without end, the answers to which are not read
             self.transport.abort()
+
+    def process_event(self, event: Event) -> None:
+        if isinstance(event, Part) and event.opcode in DATA_OPCODES:
+            self._parts = 0 if event.fin else self._parts + 1
+            if event.fin:
+                self.arrived.append(self._arrived)
+        super().process_event(event)
+
+    def unfinished(self) -> int:
+        """Bytes that the library keeps of a greeting, or of a message that is not whole."""
+        if self.protocol.state is State.CONNECTING:
+            return self._greeted
+        return len(self.protocol.reader.buffer) + (self.protocol.current_size or 0) + PART_BYTES * self._parts
 
     def pause_writing(self) -> None:
         super().pause_writing()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import zenoh
@@ -18,6 +17,7 @@ from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client, Ears, 
 from router.edges.gateway_zenoh_config import session_config, short, why_in_vain
 from router.edges.gateway_zenoh_inbox import Inbox, Queries
 from router.edges.gateway_zenoh_puts import Lost, Putter, key_of
+from router.edges.gateway_zenoh_thread import DaemonThread
 from router.edges.log import logger
 from router.errors import StartError
 from router.table.model import Address, ZenohSettings
@@ -45,8 +45,8 @@ class ZenohTransport:
         self._key = settings.key.value
         self._session: zenoh.Session | None = None
         self._client: ZenohClient | None = None
-        self._session_thread = ThreadPoolExecutor(1, thread_name_prefix="zenoh session")
-        self._answering = ThreadPoolExecutor(1, thread_name_prefix="zenoh answers")
+        self._session_thread = DaemonThread("zenoh session")
+        self._answering = DaemonThread("zenoh answers")
         self._is_closed = False
         self._retrying: asyncio.Task[None] | None = None
 
@@ -78,7 +78,7 @@ class ZenohTransport:
             closing = self._loop.run_in_executor(self._session_thread, self._session.close)
             await asyncio.wait([closing], timeout=CLOSING_SECONDS)
         for thread in (self._session_thread, self._answering):
-            thread.shutdown(wait=False, cancel_futures=True)
+            thread.shutdown()
         self._client = self._session = None
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:

@@ -8,16 +8,16 @@ from collections.abc import Callable
 
 import zenoh
 
-from router.edges.clock import wall_ns
+from router.edges.gateway_arrival import LoopClock, stamp
+from router.edges.gateway_memory import Trimmer
 from router.edges.gateway_transport import Client, Ears
-from router.errors import TransportError
 
 RECEIVED_PER_TURN = 32
 """Samples that are handed on before other work of the loop has its turn."""
 
 MOST_RECEIVED = 1000
 MOST_RECEIVED_BYTES = 64 << 20
-"""What waits at most to be handed on; samples beyond that are lost."""
+"""What waits at most to be handed on; samples beyond that are refused."""
 
 MOST_ASKING = 100
 """Queries that wait at most for answers, each of which may be large."""
@@ -34,14 +34,19 @@ class Inbox:
         self._waiting: deque[tuple[bytes, int]] = deque()
         self._heard_bytes = self._handed_bytes = 0
         self._lost = self._told_lost = 0
+        self._clock = LoopClock()
+        self._trimmer = Trimmer()
 
     def start(self, client: Client) -> None:
         """Hands on what comes, from `client`."""
         self._client = client
+        self._clock.start()
         self._hand_on()
 
     def stop(self) -> None:
         self._client = None
+        self._clock.stop()
+        self._trimmer.close()
 
     def hear(self, sample: zenoh.Sample) -> None:
         """For Zenoh's thread."""
@@ -54,7 +59,7 @@ class Inbox:
             self._lost += 1  # told with those that wait
         else:
             self._heard_bytes += size
-            self._waiting.append((sample.payload.to_bytes(), wall_ns()))
+            self._waiting.append((sample.payload.to_bytes(), stamp(self._clock.away_since())))
             if len(self._waiting) == 1:
                 self._loop.call_soon_threadsafe(self._hand_on)
 
@@ -65,11 +70,12 @@ class Inbox:
             data, arrived = self._waiting.popleft()
             self._handed_bytes += len(data)
             self._ears.received(self._client, data, arrived)
+            self._trimmer.freed(len(data))
         if self._waiting:
             self._loop.call_soon(self._hand_on)
-        if lost := self._lost - self._told_lost:
-            self._told_lost += lost
-            self._ears.failed(self._client, TransportError("samples came faster than they could be taken"), lost)
+        for _ in range(self._lost - self._told_lost):
+            self._told_lost += 1
+            self._ears.refused("rate_limited")
 
 
 class Queries:

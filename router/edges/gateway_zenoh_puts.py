@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import NamedTuple
 
 import zenoh
 
 from router.edges.gateway_transport import Frame
+from router.edges.gateway_zenoh_thread import DaemonThread
 from router.errors import TransportError
 
 LARGE = 64 * 1024
@@ -32,8 +33,8 @@ class Putter:
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self._session = session
         self._key = key
-        self._small = ThreadPoolExecutor(1, thread_name_prefix="zenoh puts")
-        self._large = ThreadPoolExecutor(1, thread_name_prefix="zenoh large puts")
+        self._small = DaemonThread("zenoh puts")
+        self._large = DaemonThread("zenoh large puts")
         self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
         self._large_keys: set[str] = set()
         self._large_waiting: dict[str, bytes] = {}
@@ -47,7 +48,7 @@ class Putter:
     def close(self) -> None:
         """Gives up what waits; a put that is under way ends when Zenoh lets it."""
         for executor in (self._small, self._large):
-            executor.shutdown(wait=False, cancel_futures=True)
+            executor.shutdown()
 
     def _put_all(self, frames: Sequence[Frame]) -> list[Lost]:
         lost = []

@@ -132,7 +132,7 @@ def test_what_is_put_under_inbound_is_heard() -> None:
     asyncio.run(story())
 
 
-def test_samples_that_come_faster_than_they_are_taken_are_lost_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gateway_zenoh_inbox, "MOST_RECEIVED", 5)
 
     async def story() -> None:
@@ -143,7 +143,9 @@ def test_samples_that_come_faster_than_they_are_taken_are_lost_and_told(monkeypa
                 await _hears(ears, far)
                 for number in range(2000):
                     far.put(f"{KEY}/inbound/cmd_vel", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
-                await until(lambda: len(ears.said) + sum(lost for _, _, lost in ears.failures) == 2000)
+                await until(lambda: len(ears.said) + len(ears.refusals) == 2000)
+                assert set(ears.refusals) <= {"rate_limited"}
+                assert ears.failures == []
                 numbers = list(map(int, ears.said))
                 assert numbers == sorted(numbers)
 
