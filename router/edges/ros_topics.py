@@ -17,9 +17,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.type_support import check_is_valid_msg_type
 
 from router.edges.ros_arrivals import RawSubscription
+from router.edges.ros_definitions import installed_type
 from router.edges.ros_node import RCL_ERRORS
 from router.edges.ros_types import Definition, matching_class
 from router.errors import StartError
+from router.types.model import MessageType
 
 
 class SeenPublisher(NamedTuple):
@@ -66,6 +68,10 @@ class RosTopics:
     def _is_ours(self, seen: Mapping[str, Any]) -> bool:
         return (seen["node_name"], seen["node_namespace"]) == self._name
 
+    def installed_type(self, type_name: str) -> MessageType:
+        """As its class describes it. Raises StartError. Takes as long as `load`; any thread may call this."""
+        return installed_type(type_name)
+
     def load(self, type_name: str, definitions: Mapping[str, Definition]) -> Any:
         """The class of a message, for `tap`, if it is installed as `definitions` say. Raises StartError.
 
@@ -80,7 +86,7 @@ class RosTopics:
 
     def tap(self, topic: str, message_class: Any, *, is_reliable: bool, keeps: bool, depth: int) -> TopicTap:
         """Subscribes to `topic`. Raises StartError, also where our node has the topic with another type."""
-        type_name = f"{message_class.__module__.partition('.')[0]}/msg/{message_class.__name__}"
+        type_name = "/".join((*message_class.__module__.split(".")[:2], message_class.__name__))
         try:
             others = self._our_types(topic) - {type_name}
             if others:  # DDS has one for a topic in a process; it would say so in other words

@@ -15,6 +15,7 @@ from router.errors import StartError, TableError
 from router.gateway.feeds import Each, Feed
 from router.gateway.following import Choice, choice
 from router.gateway.samples import ReadyType
+from router.types.model import MessageType
 from router.types.ros import RosInterfaces
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -93,9 +94,14 @@ class Hub:
     def _load(self, type_name: str) -> ReadyType | str:
         """Or why not. Runs in a thread of its own, but for types that were not looked for."""
         try:
-            message = self._interfaces.get(type_name)
-            if message is None:
-                return f"{type_name} is not installed"
+            message = self._declared(type_name) or self._topics.installed_type(type_name)
             return ReadyType(message, self._topics.load(type_name, layout(message)))
-        except (StartError, TableError) as error:
+        except StartError as error:
             return str(error)
+
+    def _declared(self, type_name: str) -> MessageType | None:
+        """By a `.msg` file. None where that cannot be read, or nests what has none, also: the class may well say it."""
+        try:
+            return self._interfaces.get(type_name)
+        except TableError:
+            return None

@@ -100,4 +100,5 @@ def _spelled(type_: Type) -> str:
         return ("wstring" if type_.wide else "string") + (f"<{type_.bound}>" if type_.bound is not None else "")
     if not isinstance(type_, MessageType):
         raise TypeError(f"ROS has no type {type_}")
-    return type_.name.replace("/msg/", "/")
+    package, _, rest = type_.name.partition("/")
+    return f"{package}/{rest.rpartition('/')[2]}"  # whether it belongs to a service or action is not told

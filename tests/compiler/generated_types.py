@@ -188,7 +188,7 @@ def values(declared: Type) -> st.SearchStrategy[Any]:
         case Enum():
             return st.sampled_from([*(number for _, number in declared.values), -5, (1 << 31) - 1])
         case List():
-            sizes = {declared.length} if declared.length is not None else {0, 1, 3}
+            sizes = {declared.length} if declared.length is not None else {0, 1, min(3, declared.bound or 3)}
             return st.sampled_from(sorted(sizes)).flatmap(
                 lambda size: st.lists(values(declared.element), min_size=size, max_size=size)
             )

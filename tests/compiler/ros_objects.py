@@ -15,8 +15,8 @@ from rosidl_parser.definition import AbstractNestedType, BasicType, NamespacedTy
 
 
 def message_class(name: str) -> Any:
-    package, _, short = name.partition("/msg/")
-    return getattr(importlib.import_module(f"{package}.msg"), short)
+    package, kind, short = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
 def to_object(cls: Any, value: dict[str, Any]) -> Any:

@@ -18,9 +18,13 @@ SPAN = SourceSpan("routes/rover.yaml", 40, 16, 24)
 
 
 def cdr(text: str) -> bytes:
-    """A std_msgs/msg/String. DDS pads to a multiple of four."""
-    data = bytes(serialize_message(String(data=text)))
-    return data + bytes(-len(data) % 4)
+    """A std_msgs/msg/String."""
+    return padded(serialize_message(String(data=text)))
+
+
+def padded(data: bytes) -> bytes:
+    """As DDS hands on what was published: to a multiple of four."""
+    return bytes(data) + bytes(-len(data) % 4)
 
 
 HELLO = cdr("hello, rover")

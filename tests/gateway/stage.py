@@ -18,6 +18,7 @@ from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.gateway_transport import Client, Ears, Frame
 from router.edges.ros_topics import RosTopics, SeenPublisher
 from router.engine import Report
+from router.errors import StartError
 from router.gateway.hub import Hub
 from router.gateway.inlet import Inlet, InletOutlets
 from router.gateway.ledger import Ledger
@@ -25,6 +26,7 @@ from router.gateway.service import GatewayService
 from router.gateway.style import Style
 from router.gateway.surroundings import Surroundings
 from router.table.model import Address
+from router.types.model import MessageType
 from router.types.ros import ros_interfaces
 
 INTERFACES = ros_interfaces()
@@ -88,6 +90,9 @@ class Graph:
 
     def publishers(self, topic: str) -> list[SeenPublisher]:
         return [SeenPublisher(self.types[topic], is_reliable=True, keeps=False, is_ours=False)]
+
+    def installed_type(self, type_name: str) -> MessageType:
+        raise StartError(f"{type_name} is not installed")
 
     def load(self, type_name: str, definitions: object) -> object:
         return type_name

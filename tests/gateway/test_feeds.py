@@ -7,11 +7,15 @@ import json
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import ExitStack, asynccontextmanager, closing
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from rcl_interfaces.srv import GetParameters  # type: ignore[import-untyped]
+from rclpy.serialization import serialize_message
 
 from router.compiler.program import TopicPlan
 from router.errors import StartError
@@ -21,8 +25,9 @@ from router.gateway.following import Choice
 from router.gateway.hub import Hub
 from router.gateway.samples import ReadyType, Sample
 from router.gateway.style import Style, UnreadableError
-from router.types.ros import ros_interfaces
-from tests.edges.ros_opening import HELLO, STRING, cdr, open_ros, string_topic
+from router.types.ros import RosInterfaces, ros_interfaces
+from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+from tests.edges.ros_opening import HELLO, STRING, cdr, open_ros, padded, string_topic
 from tests.edges.ros_publisher import Publisher
 
 INT32 = "std_msgs/msg/Int32"
@@ -388,6 +393,52 @@ def test_a_publisher_that_was_killed_is_followed_by_its_successor() -> None:
                 await matched(successor)
                 successor.publish([cdr("again")])
                 await until(lambda: latest(feed) == cdr("again"))
+
+    run(story())
+
+
+EVENT = "rcl_interfaces/srv/GetParameters_Event"
+
+
+def test_a_part_of_a_service_is_followed_though_no_msg_file_declares_it(publisher: Publish) -> None:
+    happened = GetParameters.Event(request=[GetParameters.Request(names=["speed"])])
+
+    async def story() -> None:
+        async with opened() as hub:
+            peer = publisher(EVENT)
+            feed = hub.join("/greeting", await seen(hub, lambda choice: choice.type_name == EVENT), None)
+            await heard(peer, padded(serialize_message(happened)), feed)
+            sample = feed.latest()
+            assert sample
+            assert sample.type_name == EVENT
+            value = json.loads(sample.text(Style.PLAIN))
+            assert (value["request"], value["response"]) == ([{"names": ["speed"]}], [])
+            schema = json.loads(feed.schema)
+            assert (schema["name"], schema["namespace"]) == ("GetParameters_Event", "rcl_interfaces::srv")
+            request = schema["fields"][1]["subtype"]
+            assert (request["name"], request["namespace"]) == ("GetParameters_Request", "rcl_interfaces::srv")
+
+    run(story())
+
+
+@pytest.mark.parametrize("text", [None, "no_such_msgs/Thing it", "this is no definition"])
+def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
+    publisher: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None
+) -> None:
+    (tmp_path / "std_msgs" / "msg").mkdir(parents=True)
+    if text:
+        (tmp_path / "std_msgs" / "msg" / "String.msg").write_text(text, encoding="utf-8")
+    monkeypatch.setattr(RosbagsDefinitions, "find", lambda *_: None)
+    interfaces = RosInterfaces(MsgFiles([tmp_path]), RosbagsDefinitions())
+
+    async def story() -> None:
+        loop = asyncio.get_running_loop()
+        with closing(open_ros()) as ros, closing(Hub(ros.topics, interfaces, loop)) as hub:
+            feed = hub.join("/greeting", PLAIN, None)
+            await heard(publisher(STRING), HELLO, feed)
+            sample = feed.latest()
+            assert sample
+            assert sample.text(Style.PLAIN) == '{"data":"hello, rover"}'
 
     run(story())
 
