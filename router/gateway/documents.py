@@ -14,6 +14,7 @@ Times are wall-clock seconds. No document has a newline in it. Knows no topics a
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple, Union
 
@@ -54,6 +55,21 @@ class SchemaRequest(NamedTuple):
 
 
 Request = Union[PublishRequest, SchemaRequest]
+
+
+class Heading(NamedTuple):
+    """What a publish request says besides its data."""
+
+    topic: str
+    type_name: str | None
+
+
+_SEEN = 1 << 10
+"""Bytes at a document's beginning and end in which a topic and a type of 255 bytes have room."""
+_MEMBER = rb'\s*"(op|topic|type|time)"\s*:\s*("[^"\\]*(?:\\.[^"\\]*)*"|[^\s",\[\]{}]{1,64})\s*'
+_ONE = re.compile(_MEMBER)
+_BEFORE = re.compile(rb"\s*\{(?:%b,){1,4}" % _MEMBER)
+_BEHIND = re.compile(rb",%b(?:,%b){0,3}\}\s*\Z" % (_MEMBER, _MEMBER))
 
 
 def data_document(topic: str, type_name: str, time: float, text: str) -> bytes:
@@ -102,6 +118,18 @@ def request(text: bytes) -> Request:
             _check_keys(document, {"op", "type"})
             return SchemaRequest(_type_name(document))
     raise PacketError("'op' is neither publish nor schema")
+
+
+def heading(text: bytes) -> Heading:
+    """That of a long document, without reading its data, which stands before or behind all else. If the document is a
+    request at all, it is one with this heading. Raises PacketError where there is none, InvalidMessageError.
+    """
+    spans = [found.group() for found in (_BEFORE.match(text[:_SEEN]), _BEHIND.search(text[-_SEEN:])) if found]
+    said = {name: value for span in spans for name, value in _ONE.findall(span)}
+    topic, type_name = (parse_json(said.get(name, b"null")) for name in (b"topic", b"type"))
+    if not isinstance(topic, str) or not isinstance(type_name, (str, type(None))):
+        raise PacketError("a long request names its topic, and maybe its type, before its data or behind them")
+    return Heading(topic, type_name)
 
 
 def _publish_request(document: Mapping[str, object]) -> PublishRequest:

@@ -8,11 +8,10 @@ from itertools import count
 from math import inf
 
 from router.edges.gateway_transport import Frame
-from router.gateway.compression import decompress, told_size
-from router.gateway.documents import PublishRequest, Request, SchemaRequest, data_document, request, schema_document
+from router.gateway.documents import data_document, schema_document
 from router.gateway.fragments import capacity, datagrams
-from router.gateway.json_reading import parse_json
-from router.gateway.packets import HEAD, PacketError, prefix, unpack
+from router.gateway.letters import DocumentLetter, Letter, PacketLetter
+from router.gateway.packets import HEAD, prefix
 from router.gateway.samples import Sample
 from router.gateway.style import Style
 from router.table.model import Gateway, GatewayFormat, Transport
@@ -36,7 +35,6 @@ class Encoding(ABC):
 
     def __init__(self, settings: Gateway) -> None:
         self.level = settings.compression
-        self._most = settings.max_message
 
     @abstractmethod
     def introduces(self, topic: str, type_name: str) -> Hashable:
@@ -50,12 +48,8 @@ class Encoding(ABC):
         """Raises UnreadableError."""
 
     @abstractmethod
-    def request(self, data: bytes) -> Request:
-        """Raises PacketError for what has not the format, InvalidMessageError for JSON that is none."""
-
-    def text_size(self, data: bytes) -> int:
-        """Bytes of JSON that `request` will read."""
-        return len(data)
+    def letter(self, data: bytes) -> Letter:
+        """What a client has sent. Raises PacketError for what has not the format, InvalidMessageError."""
 
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
         """The same frames as the transport is to send them."""
@@ -82,20 +76,8 @@ class PacketEncoding(Encoding):
         payload = sample.payload(self.style, self.level)
         return HEAD.pack(time, self.level > 0) + prefix(sample.topic, sample.type_name) + payload
 
-    def text_size(self, data: bytes) -> int:
-        try:
-            packet = unpack(data)
-        except PacketError:
-            return 0
-        size = told_size(packet.payload) if packet.is_compressed else len(packet.payload)
-        return self._most if size is None else min(size, self._most)
-
-    def request(self, data: bytes) -> Request:
-        packet = unpack(data)
-        if not packet.payload:
-            return SchemaRequest(packet.type_name or None)
-        text = decompress(packet.payload, self._most) if packet.is_compressed else packet.payload
-        return PublishRequest(packet.topic, packet.type_name, packet.time, parse_json(text))
+    def letter(self, data: bytes) -> Letter:
+        return PacketLetter(data)
 
 
 class BatchEncoding(PacketEncoding):
@@ -131,8 +113,8 @@ class DocumentEncoding(Encoding):
     def data(self, sample: Sample, time: float) -> bytes:
         return data_document(sample.topic, sample.type_name, time, sample.text(self.style))
 
-    def request(self, data: bytes) -> Request:
-        return request(data)
+    def letter(self, data: bytes) -> Letter:
+        return DocumentLetter(data)
 
 
 def encoding(settings: Gateway) -> Encoding:

@@ -13,8 +13,14 @@ from router.engine.deadman import Feed as FeedDeadman
 from router.engine.freshness import Freshness
 from router.engine.limiter import RateLimit
 from router.gateway.documents import PublishRequest
+from router.gateway.json_longest import longest_text
 from router.gateway.json_reading import InvalidMessageError, cdr_builder
+from router.gateway.letters import Letter
 from router.gateway.style import Style
+from router.table.model import Gateway
+
+_BESIDES = 4 << 10
+"""Bytes that a document may have besides its message."""
 
 
 class RefusedError(Exception):
@@ -43,13 +49,14 @@ class InletOutlets:
 class _Topic:
     """One topic that clients may publish on."""
 
-    def __init__(self, plan: InboundPlan, style: Style, books: Books, gateway: str) -> None:
+    def __init__(self, plan: InboundPlan, style: Style, books: Books, gateway: Gateway) -> None:
         self.plan = plan
+        self.most = int(min(longest_text(plan.type, style) + _BESIDES, gateway.max_message))
         self.build = cdr_builder(plan.type, style)
         self.may_pass = RateLimit(plan.max_rate).may_pass if plan.max_rate is not None else None
-        self.published = books.slot("messages_published", gateway, plan.topic)
+        self.published = books.slot("messages_published", gateway.name, plan.topic)
         self.dropped = {
-            reason: books.slot("messages_dropped", gateway, plan.topic, reason) for reason in INBOUND_DROP_REASONS
+            reason: books.slot("messages_dropped", gateway.name, plan.topic, reason) for reason in INBOUND_DROP_REASONS
         }
 
 
@@ -67,7 +74,7 @@ class Inlet:
     def __init__(self, plan: GatewayPlan, style: Style, books: Books, counts: list[int], outlets: InletOutlets) -> None:
         name = plan.settings.name
         self._gateway = name
-        self._topics = {topic: _Topic(each, style, books, name) for topic, each in plan.inbound.items()}
+        self._topics = {topic: _Topic(each, style, books, plan.settings) for topic, each in plan.inbound.items()}
         self._counts = counts
         self._outlets = outlets
         self._freshness = Freshness()
@@ -80,14 +87,30 @@ class Inlet:
         self._counts[self._rejected[reason]] += 1
         self._outlets.report(Report("reject", self._gateway, "", reason, None, detail))
 
+    def admit(self, letter: Letter) -> int:
+        """Bytes of JSON to be read of a letter, at most. Raises RefusedError, not counted yet, if it need not be."""
+        if letter.topic is None:
+            return letter.size or 0
+        most = self._allowed(letter.topic, letter.type_name).most
+        if letter.size is None:
+            return most
+        if letter.size > most:
+            detail = f"{letter.size} bytes are more than the {most} that any message of {letter.topic} has"
+            raise RefusedError("too_large", detail, letter.topic)
+        return letter.size
+
+    def _allowed(self, name: str, type_name: str | None) -> _Topic:
+        topic = self._topics.get(name)
+        if topic is None:
+            raise RefusedError("not_allowed", f"clients may not publish on '{name[:80]}'", name)
+        wanted = topic.plan.type.name
+        if type_name not in (None, wanted):
+            raise RefusedError("wrong_type", f"{name} has the type {wanted}", name)
+        return topic
+
     def check(self, request: PublishRequest) -> Checked:
         """Raises RefusedError, which is not counted yet. Any thread may call this."""
-        topic = self._topics.get(request.topic)
-        if topic is None:
-            raise RefusedError("not_allowed", f"clients may not publish on '{request.topic[:80]}'", request.topic)
-        wanted = topic.plan.type.name
-        if request.type_name not in (None, wanted):
-            raise RefusedError("wrong_type", f"{request.topic} has the type {wanted}", request.topic)
+        topic = self._allowed(request.topic, request.type_name)
         if topic.plan.ttl is not None and request.time is None:
             raise RefusedError("invalid", f"{request.topic} needs the time at which it was sent", request.topic)
         try:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
-from typing import Union
 
 from router.compiler.program import GatewayPlan
 from router.edges.gateway_transport import Client, Frame, Transport
@@ -18,24 +15,18 @@ from router.gateway.documents import (
     rejected_document,
     topics_document,
 )
-from router.gateway.encoding import Encoding, encoding
+from router.gateway.encoding import encoding
 from router.gateway.inlet import Checked, Inlet, RefusedError
-from router.gateway.json_reading import InvalidMessageError, example
+from router.gateway.json_reading import example
 from router.gateway.ledger import Ledger
 from router.gateway.outlet import Outlet
-from router.gateway.packets import PacketError, TooLargeError
+from router.gateway.reader import Reader, Understood
 from router.gateway.schema_text import schema_text
 from router.gateway.style import Style
 from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks
 from router.gateway.topics import Topics
 from router.table.model import Transport as Way
-
-QUICK = 4 << 10
-"""Bytes of JSON from a client that are read at once: of 64 KiB, the worst takes 30 ms."""
-
-MOST_READING = 16 << 20
-"""Bytes of JSON that are read beside the loop or wait for that, of all clients. A single message may be longer."""
 
 _TELL_S = _SETTLE_S = 1.0
 _ANSWER_NS = 100_000_000
@@ -68,8 +59,7 @@ class GatewayService:
         self._topics = Topics(plan, around, outlet, ledger, self._tasks, self._deliver)
         self._transport = transport(self)
         self._answered = -_ANSWER_NS
-        self._reading = 0  # bytes
-        self._read_from: Counter[Client] = Counter()  # messages
+        self._reader = Reader(self._encoding, inlet, self._tasks, around.reading, self._settle)
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
 
@@ -122,26 +112,7 @@ class GatewayService:
 
     def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
         self._ledger.arrived(len(data))
-        size = self._encoding.text_size(data)
-        if size <= QUICK and not self._read_from[client]:  # else it would overtake what this client sent before
-            self._settle(client, _understood(self._encoding, self._inlet, data), arrived_ns)
-        elif not self._reading or self._reading + size <= MOST_READING:
-            self._reading += size
-            self._read_from[client] += 1
-            self._tasks.run(self._read(client, data, size, arrived_ns))
-        else:
-            self._refuse(client, RefusedError("rate_limited", "other large messages are still being read"))
-
-    async def _read(self, client: Client, data: bytes, size: int, arrived_ns: int) -> None:
-        """What takes long, in another thread."""
-        try:
-            understood = await asyncio.get_running_loop().run_in_executor(
-                self._around.reading, _understood, self._encoding, self._inlet, data
-            )
-        finally:
-            self._reading -= size
-            self._read_from -= Counter([client])  # which keeps no zero
-        self._settle(client, understood, arrived_ns)
+        self._reader.received(client, data, arrived_ns)
 
     def _settle(self, client: Client, understood: Understood, arrived_ns: int) -> None:
         match understood:
@@ -193,21 +164,3 @@ class GatewayService:
     def _document(self, kind: str, data: bytes) -> Frame:
         """One that belongs to no topic; with a slow client, a newer one of its kind takes its place."""
         return Frame(data, kind, "", is_schema=False, born=self._around.clock_ns())
-
-
-Understood = Union[Checked, SchemaRequest, RefusedError]
-
-
-def _understood(encoding: Encoding, inlet: Inlet, data: bytes) -> Understood:
-    """What a client wants. Any thread may ask."""
-    try:
-        request = encoding.request(data)
-        return request if isinstance(request, SchemaRequest) else inlet.check(request)
-    except RefusedError as refused:
-        return refused
-    except TooLargeError as error:
-        return RefusedError("too_large", str(error))
-    except PacketError as error:
-        return RefusedError("malformed", str(error))
-    except InvalidMessageError as error:
-        return RefusedError("invalid", str(error))

@@ -12,6 +12,7 @@ from router.gateway.documents import (
     SchemaRequest,
     TopicRow,
     data_document,
+    heading,
     inbound_document,
     rejected_document,
     request,
@@ -113,6 +114,50 @@ def test_what_is_no_request_is_refused_with_the_reason(text: str, complaint: str
 def test_what_is_no_json_is_refused_as_that(text: bytes) -> None:
     with pytest.raises(InvalidMessageError):
         request(text)
+
+
+DATA = '"data":{"a":[' + "1," * 1000 + '{"topic":"/no","type":"no"}],"b":"\\"topic\\":\\"/no\\"}"}'
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (f'{{"op":"publish","topic":"/t","type":"p/msg/T","time":5.5,{DATA}}}', ("/t", "p/msg/T")),
+        (f' {{ "topic" : "\\/t" , "op":"publish",{DATA} , "time" : 5e9 }}\n', ("/t", None)),
+        (f'{{{DATA},"op":"publish","time":5,"topic":"\\u002ft","type":"p/msg/T"}}', ("/t", "p/msg/T")),
+        (f'{{"op":"publish",{DATA},"topic":"/t","type":null}}', ("/t", None)),
+        (f'{{"type":"p/msg/T",{DATA},"topic":"/t,\\"}}"}}', ('/t,"}', "p/msg/T")),
+    ],
+)
+def test_what_a_long_request_is_about_is_seen_without_its_data(text: str, expected: tuple[str, str]) -> None:
+    assert heading(text.encode()) == expected
+    assert json.loads(text)["topic"] == expected[0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        f"{{{DATA}}}",
+        f'{{"op":"publish",{DATA}}}',
+        f'{{"op":"publish","topic":null,{DATA}}}',
+        f'{{"op":"publish","topic":7,{DATA}}}',
+        f'{{"to\\u0070ic":"/t",{DATA}}}',
+        f'{{{DATA},"x":"a,\\"topic\\":\\"/t\\"}}',
+        f"{{{DATA}}}" + ',"topic":"/t"' * 1000,
+        f"{{{' ' * 5000}}}",
+    ],
+)
+def test_a_long_request_whose_topic_is_not_to_be_seen_is_refused(text: str) -> None:
+    with pytest.raises((PacketError, InvalidMessageError)):
+        heading(text.encode())
+
+
+@given(st.permutations(["op", "topic", "type", "time", "data"]), st.text(max_size=30), st.booleans())
+def test_the_topic_of_any_long_request_is_seen(order: list[str], topic: str, ascii_only: bool) -> None:
+    whole = {"op": "publish", "topic": topic, "type": "p/msg/T", "time": 1.5, "data": {"a": [1] * 3000, "topic": "/no"}}
+    text = json.dumps({name: whole[name] for name in order}, ensure_ascii=ascii_only)
+    assert heading(text.encode("utf-8", "surrogatepass")) == (topic, "p/msg/T")
 
 
 @given(st.binary(max_size=60))

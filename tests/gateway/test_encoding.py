@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.gateway.compression import compress
 from router.gateway.encoding import encoding
-from router.gateway.packets import Packet, pack
+from router.gateway.packets import Packet, PacketError, pack
 from tests.gateway.stage import program
 
 TEXT = b'{"data":["a word"]}'
@@ -30,21 +30,25 @@ def streamed(data: bytes) -> bytes:
     [
         (TEXT, False, len(TEXT)),
         (compress(TEXT * 50, 3), True, 50 * len(TEXT)),
-        (compress(TEXT * 1000, 3), True, 2000),  # is refused, but not before so much is read
-        (streamed(TEXT), True, 2000),
+        (compress(TEXT * 1000, 3), True, 1000 * len(TEXT)),
+        (streamed(TEXT), True, None),
         (TEXT, True, 0),  # which is no zstd frame
     ],
 )
-def test_of_a_packet_what_is_in_it_counts(tmp_path: Path, payload: bytes, is_compressed: bool, size: int) -> None:
+def test_of_a_packet_what_is_in_it_counts(
+    tmp_path: Path, payload: bytes, is_compressed: bool, size: int | None
+) -> None:
     [plan] = program(tmp_path, TCP).gateways
-    assert encoding(plan.settings).text_size(pack(Packet(1.0, is_compressed, "/a", "b", payload))) == size
+    letter = encoding(plan.settings).letter(pack(Packet(1.0, is_compressed, "/a", "b", payload)))
+    assert (letter.topic, letter.type_name, letter.size) == ("/a", "b", size)
 
 
 def test_what_is_no_packet_is_not_read(tmp_path: Path) -> None:
     [plan] = program(tmp_path, TCP).gateways
-    assert encoding(plan.settings).text_size(b"\xff" * 60_000) == 0
+    with pytest.raises(PacketError):
+        encoding(plan.settings).letter(b"\xff" * 60_000)
 
 
 def test_of_a_document_all_counts(tmp_path: Path) -> None:
     [plan] = program(tmp_path, "it: {transport: {websocket: 127.0.0.1:8600}}").gateways
-    assert encoding(plan.settings).text_size(TEXT) == len(TEXT)
+    assert encoding(plan.settings).letter(TEXT).size == len(TEXT)

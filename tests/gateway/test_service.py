@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from router.gateway.service import QUICK
+from router.gateway.letters import QUICK
 from tests.gateway.stage import Graph, Stage, program
 
 STRING = "std_msgs/msg/String"
@@ -135,7 +135,7 @@ def test_messages_that_are_not_small_are_read_in_order_though_many_come_at_once(
 def test_when_too_much_waits_to_be_read_the_rest_is_refused_and_its_client_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("router.gateway.service.MOST_READING", 3 * QUICK)
+    monkeypatch.setattr("router.gateway.reader.MOST_READING", 3 * QUICK)
 
     async def story() -> None:
         inbound = "inbound: [{topic: /said, type: std_msgs/msg/String}]"
