@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from backports import zstd
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.gateway.letters import QUICK
+from router.gateway.packets import Packet, pack
 from tests.gateway.stage import Graph, Stage, program
 
 STRING = "std_msgs/msg/String"
@@ -128,6 +130,71 @@ def test_messages_that_are_not_small_are_read_in_order_though_many_come_at_once(
                 played.service.received(played.client, json.dumps(request).encode(), 0)
             await until(lambda: len(stage.published) == len(words))
             assert stage.published == [("/said", cdr(word)) for word in words]
+
+    run(story())
+
+
+TWO = "inbound: [{topic: /said, type: std_msgs/msg/String}, {topic: /set, type: std_msgs/msg/Int32}]"
+
+
+def publish(topic: str, data: object, **others: object) -> bytes:
+    return json.dumps({"op": "publish", "topic": topic, "data": {"data": data}, **others}).encode()
+
+
+def test_a_large_message_holds_up_its_own_topic_and_no_other(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Stage(program(tmp_path, f"it: {{{TCP}, {TWO}}}"), Graph({})) as stage:
+            played = stage.played["it"]
+            await played.start()
+            for data in (publish("/said", "a" * 2 * QUICK), publish("/said", "b"), publish("/set", 1)):
+                played.service.received(played.client, data, 0)
+            assert [topic for topic, _ in stage.published] == ["/set"]
+            played.service.received(played.client, publish("/said", 3), 0)  # which is nothing to keep in order
+            assert stage.count("datagrams_rejected", "it", "invalid") == 1
+            await until(lambda: len(stage.published) == 3)
+            assert stage.published[1:] == [("/said", cdr("a" * 2 * QUICK)), ("/said", cdr("b"))]
+            played.service.received(played.client, publish("/said", "c"), 0)
+            assert stage.published[-1] == ("/said", cdr("c"))
+
+    run(story())
+
+
+def test_what_need_not_be_read_to_be_refused_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    long = "a" * 2 * QUICK
+    refused = {
+        "not_allowed": publish("/other", long),
+        "wrong_type": publish("/said", long, type="std_msgs/msg/Int32"),
+        "too_large": publish("/set", long),
+        "malformed": b'{"op":"publish","data":"' + long.encode() + b'"}',
+    }
+
+    async def story() -> None:
+        async with Stage(program(tmp_path, f"it: {{{TCP}, {TWO}}}"), Graph({})) as stage:
+            played = stage.played["it"]
+            await played.start()
+            for data in refused.values():
+                played.service.received(played.client, data, 0)
+            assert [json.loads(frame.data)["reason"] for frame in played.client.frames] == [*refused]
+            assert [stage.count("datagrams_rejected", "it", reason) for reason in refused] == [1] * len(refused)
+
+    def read(letter: object, most: int) -> None:
+        raise AssertionError("it was read")
+
+    monkeypatch.setattr("router.gateway.letters.DocumentLetter.read", read)
+    run(story())
+
+
+def test_of_a_frame_that_does_not_tell_its_size_only_what_its_topic_may_have_is_decompressed(tmp_path: Path) -> None:
+    compressor = zstd.ZstdCompressor()
+    payload = compressor.compress(b'{"data":[' + b" " * 100_000 + b"1]}") + compressor.flush()
+
+    async def story() -> None:
+        v1 = TCP.replace("json_lines", "gateway_v1")
+        async with Stage(program(tmp_path, f"it: {{{v1}, {TWO}}}"), Graph({})) as stage:
+            played = stage.played["it"]
+            await played.start()
+            played.service.received(played.client, pack(Packet(1.0, True, "/set", "std_msgs/msg/Int32", payload)), 0)
+            await until(lambda: stage.count("datagrams_rejected", "it", "too_large"))
 
     run(story())
 
