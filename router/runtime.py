@@ -55,6 +55,7 @@ class Router:
         self.program = program
         self.listeners: dict[str, Listener] = {}
         self.metrics_address: Address | None = None
+        self._kernel_drops: dict[str, Callable[[], int]] = {}  # by listener, and by gateway that receives datagrams
         self._counts: list[list[int]] = []  # one for each thread that counts
         self._ros_args = ros_args
         self._open_edges = ExitStack()
@@ -93,7 +94,7 @@ class Router:
     def totals(self) -> dict[str, int]:
         """What happened since the start, over all listeners, routes and targets."""
         totals = {metric: self.total(metric) for metric in _TOTALS}
-        return totals | {"kernel_drops": sum(listener.kernel_drops() for listener in self.listeners.values())}
+        return totals | {"kernel_drops": sum(dropped() for dropped in self._kernel_drops.values())}
 
     def _open(self, opening: ExitStack) -> Callable[[], None]:
         """Opens everything, and returns what starts receiving. `opening` closes in the opposite order.
@@ -139,6 +140,7 @@ class Router:
         gateways = self._open_gateways(ros, feed, reporter)
         if gateways is not None:
             opening.callback(gateways.stop)
+            self._kernel_drops.update(gateways.kernel_drops)
         self._open_metrics(opening, gateways)
 
         def start() -> None:
@@ -164,6 +166,7 @@ class Router:
             listener = Listener(plan, self.program.table.listeners[plan.name].address.span)
             opening.callback(listener.close)
             self.listeners[plan.name] = listener
+            self._kernel_drops[plan.name] = listener.kernel_drops
 
     def _open_senders(self, opening: ExitStack) -> dict[str, Callable[[bytes], int]]:
         send = {}
@@ -251,13 +254,11 @@ class Router:
 
     def _asked(self, gateways: GatewayThread | None) -> dict[str, Asked]:
         """Series that nobody counts in a slot."""
-        drops = {name: listener.kernel_drops for name, listener in self.listeners.items()}
-
         def of_clients(value: Callable[[Subscriber], float]) -> Asked:
             return lambda: gateways.clients(value) if gateways else ()
 
         return {
-            "kernel_drops": lambda: (((name,), dropped()) for name, dropped in drops.items()),
+            "kernel_drops": lambda: (((name,), dropped()) for name, dropped in self._kernel_drops.items()),
             "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),
             "gateway_client_sent": of_clients(lambda client: client.sent),
             "gateway_client_dropped": of_clients(lambda client: client.dropped),

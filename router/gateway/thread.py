@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -26,6 +25,7 @@ from router.gateway.service import GatewayService
 from router.gateway.style import Style
 from router.gateway.subscriber import Subscriber
 from router.gateway.surroundings import Surroundings
+from router.gateway.worker import Worker
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as Way
 from router.types.ros import ros_interfaces
@@ -45,6 +45,7 @@ class GatewayThread:
     """Opens the gateways of a program when it is made, and serves them from `start` on. Raises StartError.
 
     `counts` belong to its thread, in which all that it is given is called. `feed` makes what tells deadmen.
+    `kernel_drops` has what tells that number, for any thread, by gateway that receives datagrams.
     """
 
     def __init__(
@@ -56,12 +57,13 @@ class GatewayThread:
         report: Callable[[Report], None],
         failed: Callable[[Exception], None],
     ) -> None:
+        self.kernel_drops: dict[str, Callable[[], int]] = {}
         self._failed = failed
         self._books = program.books
         self._counts = counts
         self._outlets = _outlets(program, ros, feed, report)
-        self._converting = ThreadPoolExecutor(1, thread_name_prefix="gateway bulk")
-        self._reading = ThreadPoolExecutor(1, thread_name_prefix="gateway reading")
+        self._converting = Worker("gateway bulk")
+        self._reading = Worker("gateway reading")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
@@ -81,7 +83,7 @@ class GatewayThread:
         style = Style.PLAIN if settings.format in (GatewayFormat.JSON, GatewayFormat.JSON_LINES) else Style.WRAPPED
         ledger = Ledger(settings, self._books, self._counts, self._outlets.report, wall_ns)
         inlet = Inlet(plan, style, self._books, self._counts, self._outlets)
-        service = GatewayService(plan, self._around, ledger, inlet, lambda ears: _transport(settings, ears))
+        service = GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))
         try:
             await service.open()
         except StartError as error:
@@ -89,6 +91,12 @@ class GatewayThread:
                 f"{settings.transport.span}: gateway '{settings.name}' cannot be opened: {error}"
             ) from error
         self._services.append(service)
+
+    def _transport(self, settings: Gateway, ears: Ears) -> Transport:
+        transport = _transport(settings, ears)
+        if isinstance(transport, UdpTransport) and settings.receive is not None:
+            self.kernel_drops[settings.name] = transport.kernel_drops
+        return transport
 
     def start(self) -> None:
         self._call(self._start())
@@ -110,8 +118,8 @@ class GatewayThread:
         finally:  # a thread that goes on would keep the process
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
-            self._converting.shutdown()
-            self._reading.shutdown()
+            self._converting.stop()
+            self._reading.stop()
             self._loop.close()
 
     async def _close(self) -> None:

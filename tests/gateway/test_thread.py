@@ -60,3 +60,13 @@ def test_a_fault_in_closing_keeps_neither_the_other_gateways_nor_the_thread(
         gateways.stop()
     assert len(closed) == 2
     assert "gateway" not in threads()
+
+
+def test_what_the_kernel_drops_is_known_of_gateways_that_receive_datagrams(tmp_path: Path) -> None:
+    receiving = f"{{transport: {{udp: 127.0.0.1:9}}, receive: 127.0.0.1:{free_port()}}}"
+    others = f"sender: {{transport: {{udp: 127.0.0.1:9}}}}, {tcp('stream', free_port(kind=socket.SOCK_STREAM))}"
+    made = program(tmp_path, f"both: {receiving}, {others}")
+    gateways = opened(made)
+    assert {name: dropped() for name, dropped in gateways.kernel_drops.items()} == {"both": 0}
+    gateways.stop()
+    assert gateways.kernel_drops["both"]() == 0
