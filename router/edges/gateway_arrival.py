@@ -101,6 +101,7 @@ def _waiting_since(connected: socket.socket) -> int | None:
     """The monotonic time from which on something may be waiting in a connection that nobody took for long."""
     if fcntl.ioctl(connected.fileno(), termios.FIONREAD, bytes(4)) == bytes(4):
         return None
+    now = monotonic_ns()
     information = connected.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _LAST_SENT.size)
     age_ns = _LAST_SENT.unpack(information)[0] * 1_000_000
-    return monotonic_ns() - age_ns if age_ns > AWAY_NS else None
+    return now - age_ns if age_ns > AWAY_NS else None

@@ -28,6 +28,7 @@ class Ears:
     eased: list[Client] = field(default_factory=list)
     said: list[bytes] = field(default_factory=list)
     said_by: list[Client] = field(default_factory=list)
+    arrivals: list[int] = field(default_factory=list)
     refusals: list[str] = field(default_factory=list)
     failures: list[tuple[Client | None, Exception, int]] = field(default_factory=list)
     shown: list[Frame] = field(default_factory=list)
@@ -50,6 +51,7 @@ class Ears:
         assert arrived_ns > 1_600_000_000_000_000_000
         self.said.append(data)
         self.said_by.append(client)
+        self.arrivals.append(arrived_ns)
 
     def refused(self, reason: str) -> None:
         self.refusals.append(reason)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import time
 from collections.abc import Iterator
 
 import pytest
 from structlog.testing import capture_logs
 
 from router.edges import gateway_binding, gateway_udp
+from router.edges.clock import wall_ns
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER
 from router.edges.gateway_udp import UdpTransport
 from router.errors import StartError
@@ -88,6 +90,43 @@ def test_without_a_local_address_it_sends_from_any_port_and_hears_nothing(headse
             headset.sendto(b"hello", sender)
             await asyncio.sleep(0.05)
             assert ears.said == []
+
+    asyncio.run(story())
+
+
+def test_what_was_said_counts_from_when_the_kernel_got_it(headset: socket.socket) -> None:
+    """Which begins to stamp a little after it was asked to."""
+
+    async def story() -> None:
+        ears = Ears()
+        transport = UdpTransport(address_of(headset), local(), ears)
+        async with opened(transport):
+            assert transport.address is not None
+            for number in range(1, 100):
+                headset.sendto(b"go", transport.address)
+                sent = wall_ns()
+                time.sleep(0.01)
+                await until(lambda number=number: len(ears.said) == number)  # type: ignore[misc]
+                if ears.arrivals[-1] <= sent:
+                    return
+        raise AssertionError("the kernel stamps nothing")
+
+    asyncio.run(story())
+
+
+def test_what_the_kernel_drops_is_known_and_a_burst_is_kept(headset: socket.socket) -> None:
+    async def story() -> None:
+        ears = Ears()
+        transport = UdpTransport(address_of(headset), local(), ears)
+        assert transport.kernel_drops() == 0
+        async with opened(transport):
+            assert transport.address is not None
+            for _ in range(5000):  # the loop is away
+                headset.sendto(b"x" * 1400, transport.address)
+            dropped = transport.kernel_drops()
+            assert dropped > 0
+            await until(lambda: len(ears.said) == 5000 - dropped)
+        assert transport.kernel_drops() == dropped
 
     asyncio.run(story())
 
