@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 from router.gateway.invalid import InvalidMessageError
 from router.gateway.json_pieces import MOST_DEEP, PiecewiseText
@@ -13,6 +14,10 @@ from router.gateway.json_strict import STRICT, check_surrogates
 
 _SHORT = 1 << 16
 """Characters that the json module gets at once. It holds the interpreter lock for as long as it reads them."""
+
+_STRING = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"', re.DOTALL)
+_BRACKETS = bytes.maketrans(b"{}", b"[]")
+_OTHERS = bytes({*range(256)} - {*b"[]{}"})
 
 
 def parse_json(text: bytes) -> object:
@@ -24,13 +29,23 @@ def parse_json(text: bytes) -> object:
         decoded = text.decode()
     except UnicodeDecodeError as error:
         raise InvalidMessageError(f"no UTF-8 at byte {error.start}") from None
-    # So few brackets cannot be too deep, whatever they mean.
-    is_plain = len(decoded) <= _SHORT and decoded.count("[") + decoded.count("{") <= MOST_DEEP
     try:
-        if not is_plain:
+        if len(decoded) > _SHORT or not _is_flat(decoded):
             return PiecewiseText(decoded).parsed()
         value: object = STRICT.decode(decoded)
     except json.JSONDecodeError as error:
         raise InvalidMessageError(f"no JSON: {error.msg} (character {error.pos})") from None
     check_surrogates(decoded, value)
     return value
+
+
+def _is_flat(text: str) -> bool:
+    """Whether no list or object in it can be too deep, if it is JSON."""
+    if text.count("[") + text.count("{") <= MOST_DEEP:
+        return True
+    brackets = _STRING.sub("", text).encode().translate(_BRACKETS, _OTHERS)
+    for _ in range(MOST_DEEP):
+        brackets = brackets.replace(b"[]", b"")
+        if not brackets:
+            return True
+    return False

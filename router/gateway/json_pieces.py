@@ -27,6 +27,8 @@ _STRETCH = re.compile(r'[^"\[\]{}]*(?:"[^"\\]*(?:\\.[^"\\]*)*"[^"\[\]{}]*)*(?=[,
 """Elements or members, none of which is a list or an object, up to a comma or an end."""
 _INSIDE = re.compile(r'[^"\\]*(?:\\(?:[^u]|u.{4})[^"\\]*)*', re.DOTALL)
 """Of a text."""
+_NAME = re.compile(r'"([^"\\\x00-\x1f]*)"[ \t\n\r]*:[ \t\n\r]*(?=[^ \t\n\r])')
+_LITTLE_LIST = re.compile(r'\[[^"\[\]{}]{0,40}\]')
 _HIGH_SURROGATE = re.compile(r"\\u[dD][89abAB]..\Z")
 
 
@@ -78,17 +80,22 @@ class PiecewiseText:
         if letter == '"':
             return self._string(at)
         if letter not in {"[", "{"}:
-            return self._scalar(at)
+            # Of a number that is longer, the rest is taken for what follows, and refused as that.
+            return self._short(at, self._text[at : at + _PIECE])
         self._holders += 1
         if depth == MOST_DEEP or self._holders > _MOST_HOLDERS:
             reason = f"more than {MOST_DEEP} deep" if depth == MOST_DEEP else f"more than {_MOST_HOLDERS} lists"
             raise InvalidMessageError(f"{reason} (character {at})")
-        return self._list(at + 1, depth + 1) if letter == "[" else self._object(at + 1, depth + 1)
+        if letter == "{":
+            return self._object(at + 1, depth + 1)
+        if found := _LITTLE_LIST.match(self._text, at):  # as most of wrapped messages are
+            return self._short(at, found.group())
+        return self._list(at + 1, depth + 1)
 
-    def _scalar(self, at: int) -> tuple[object, int]:
-        """A number or a word. Of a longer one than a piece the rest is taken for what follows, and refused as that."""
+    def _short(self, at: int, piece: str) -> tuple[object, int]:
+        """What `piece` begins with, which is the text from `at` on, and where that ends."""
         try:
-            value, length = STRICT.raw_decode(self._text[at : at + _PIECE])
+            value, length = STRICT.raw_decode(piece)
         except json.JSONDecodeError as error:
             self._refuse(error.msg, at + error.pos)
         return value, at + length
@@ -135,14 +142,23 @@ class PiecewiseText:
             at = self._after_comma(at)
 
     def _member(self, at: int, depth: int) -> tuple[tuple[str, object], int]:
+        if found := _NAME.match(self._text, at, at + _PIECE):
+            self._count_texts(1)
+            name, at = found[1], found.end()
+        else:
+            name, at = self._unusual_name(at)
+        value, at = self._value(at, depth)
+        return (name, value), at
+
+    def _unusual_name(self, at: int) -> tuple[str, int]:
+        """And where its value begins."""
         if self._text[at : at + 1] != '"':
             self._refuse("Expecting property name enclosed in double quotes", at)
         name, at = self._string(at)
         at = self._after_space(at)
         if self._text[at : at + 1] != ":":
             self._refuse("Expecting ':' delimiter", at)
-        value, at = self._value(self._after_space(at + 1), depth)
-        return (name, value), at
+        return name, self._after_space(at + 1)
 
     def _list(self, at: int, depth: int) -> tuple[object, int]:
         elements = list[object]()

@@ -59,6 +59,9 @@ BAD: dict[str, tuple[bytes, str]] = {
     "a name twice, escaped once": (b'{"a":1,"\\u0061":2}', "'a' is there twice"),
     "65 lists": (b"[" * 65 + b"]" * 65, "more than 64 deep (character 64)"),
     "65 objects": (b'{"a":' * 65 + b"1" + b"}" * 65, "more than 64 deep"),
+    "65 of both": (b'[{"a":' * 32 + b"[1]" + b"}]" * 32, "more than 64 deep"),
+    "66 of both": (b'[{"a":' * 33 + b"1" + b"}]" * 33, "more than 64 deep"),
+    "65 behind a string": (b'["' + b"]" * 99 + b'",' + b"[" * 64 + b"]" * 65, "more than 64 deep"),
     "100,000 brackets": (b"[" * 100_000, "more than 64 deep (character 64)"),
     "100,000 braces": (b'{"a":' * 100_000, "more than 64 deep"),
     "too many lists": (b"[" + b"[]," * 120_000 + b"1]", "more than 100000 lists"),
@@ -110,6 +113,8 @@ def test_bad_list_of_many_numbers_is_refused(name: str) -> None:
 def test_what_is_just_allowed_is_read(padding: bytes) -> None:
     for text in (
         b"[" * 64 + b"]" * 64,
+        b'[{"a":' * 32 + b"1" + b"}]" * 32,
+        b"[" + b"[[1],{}]," * 100 + b'"[[[\\"{{{"]',
         b'{"a":' * 64 + b"1" + b"}" * 64,
         b'"' + b"[" * 1000 + b'"',
         b'"\\ud83d\\ude00 \\\\ud800"',
