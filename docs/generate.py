@@ -37,7 +37,8 @@ _GATEWAYS = """\
 A [gateway](table.md#gateways) has its name as `listener` and as `route`. What it sends has `clients` as its target, and
 its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
 For what is not published of that, the reasons are those of routes. A deadman of a topic that is let in has gateway and
-topic for its route: `vr_headset:/cmd_vel`. [Gateways](gateway.md#metrics) has how these books balance."""
+topic for its route: `vr_headset:/cmd_vel`. Requests for schemas that are answered are datagrams received, and neither
+rejected nor accepted. [Gateways](gateway.md#metrics) has how these books balance."""
 _LOG = """\
 The log writes the first drop of a kind (route, target, reason) at once, then at most a line in 10 s. That line shows
 the last one, and how many there were: `more`, in the `in_seconds` before the line. So a flood may have ended when its
