@@ -126,7 +126,6 @@ class StreamTransport(ABC):
         largest = self._unfinished.holds(client, size, monotonic())
         if largest is not None:
             self.ears.refused("too_large")
-            self.trimmer.freed(MOST_UNFINISHED)
             self._end_unfinished(largest, "a client was closed: too much was sent in messages that are not whole")
 
     def holds_nothing(self, client: StreamClient) -> None:
@@ -135,6 +134,7 @@ class StreamTransport(ABC):
 
     def _end_unfinished(self, client: StreamClient, what: str) -> None:
         self._log.note(what, logger.warning, what, client=client.label)
+        self.trimmer.freed(MOST_UNFINISHED)  # there may be many, with little each
         client.close()
 
     def _watch(self) -> None:
