@@ -5,21 +5,20 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
-from websockets.frames import DATA_OPCODES, CloseCode, Opcode
+from websockets.frames import CloseCode, Opcode
 from websockets.frames import Frame as Part
-from websockets.protocol import Event, State
+from websockets.protocol import State
 
-from router.edges.gateway_arrival import Arrivals
 from router.edges.gateway_http import Page
-from router.edges.gateway_outflow import PIECE, Encoded, Outflow, label, prepare
-from router.edges.gateway_stream import ACCEPTED_PER_TURN, StreamClient, StreamTransport
-from router.edges.gateway_transport import HIGH_WATER, Ears, Frame
+from router.edges.gateway_outflow import PIECE, Encoded
+from router.edges.gateway_stream import ACCEPTED_PER_TURN, StreamTransport
+from router.edges.gateway_transport import Ears, Frame
+from router.edges.gateway_websocket_connection import WebsocketConnection
 from router.edges.log import logger
 from router.table.model import Address
 
@@ -29,15 +28,11 @@ PING_SECONDS = 20.0
 CLOSING_SECONDS = 1.0
 """How long clients have to say goodbye."""
 
-READ_AT_ONCE = 4 * 1024
 TAKEN_PER_TURN = 32
-"""Bytes that are read, and messages that are handed on, of a client before other work of the loop has its turn."""
+"""Messages of a client that are handed on before other work of the loop has its turn."""
 
 STRANGERS = 64
 """Connections beyond `max_clients` that may be without a websocket: they fetch the page, or are about to ask."""
-
-PART_BYTES = 300
-"""What each part of a message that is not whole takes up beside its bytes."""
 
 
 class WebsocketTransport(StreamTransport):
@@ -52,8 +47,8 @@ class WebsocketTransport(StreamTransport):
         self._most = most
         self._page = Page(page)
         self._server: Server | None = None
-        self._connections: set[_Connection] = set()
-        self._strangers: dict[_Connection, None] = {}  # in the order in which they came
+        self._connections: set[WebsocketConnection] = set()
+        self._strangers: dict[WebsocketConnection, None] = {}  # in the order in which they came
 
     def encode(self, frames: Sequence[Frame]) -> Encoded:
         messages = [frame.data for frame in frames]
@@ -89,13 +84,13 @@ class WebsocketTransport(StreamTransport):
                 connection.transport.abort()
         await self._server.wait_closed()
 
-    def _connection(self, *args: Any, **settings: Any) -> _Connection:
+    def _connection(self, *args: Any, **settings: Any) -> WebsocketConnection:
         """Called by the library for each connection, with what a ServerConnection is made of."""
-        connection = _Connection(*args, **settings)
+        connection = WebsocketConnection(*args, **settings)
         connection.owner = self
         return connection
 
-    def connected(self, connection: _Connection) -> None:
+    def connected(self, connection: WebsocketConnection) -> None:
         """Where there is no room, that stranger gives way who has had most time to ask."""
         self._connections.add(connection)
         self._strangers[connection] = None
@@ -104,13 +99,13 @@ class WebsocketTransport(StreamTransport):
             del self._strangers[oldest]
             oldest.transport.abort()
 
-    def disconnected(self, connection: _Connection) -> None:
+    def disconnected(self, connection: WebsocketConnection) -> None:
         self._connections.discard(connection)
         self._strangers.pop(connection, None)
         self.holds_nothing(connection.client)
 
     async def _serve_client(self, connection: ServerConnection) -> None:
-        assert isinstance(connection, _Connection)  # noqa: S101 - they come from here
+        assert isinstance(connection, WebsocketConnection)  # noqa: S101 - they come from here
         client = connection.client
         self._strangers.pop(connection, None)
         self.holds(client, connection.unfinished())  # no greeting any more
@@ -128,7 +123,7 @@ class WebsocketTransport(StreamTransport):
         finally:
             self.went(client)
 
-    async def _hear(self, connection: _Connection) -> None:
+    async def _hear(self, connection: WebsocketConnection) -> None:
         """Raises ConnectionClosed in the end."""
         while True:
             for _ in range(TAKEN_PER_TURN):
@@ -136,76 +131,6 @@ class WebsocketTransport(StreamTransport):
                 self.ears.received(connection.client, data, connection.arrived.popleft())
                 self.trimmer.freed(len(data))
             await asyncio.sleep(0)
-
-
-class _WebsocketClient(StreamClient):
-    def __init__(self, connection: _Connection) -> None:
-        owner = connection.owner
-        self.encode = owner.encode
-        self.label = label(connection.transport)
-        self.outflow = Outflow(connection.transport, owner.feeder, self._is_open, lambda: owner.ears.drained(self))
-        self._connection = connection
-
-    def close(self) -> None:
-        self._connection.transport.abort()
-
-    def _is_open(self) -> bool:
-        """After the closing handshake has begun, nothing may be sent."""
-        return self._connection.protocol.state is State.OPEN
-
-
-class _Connection(ServerConnection):
-    """The library's, which also tells its client when the kernel takes no more, and when it does again."""
-
-    owner: WebsocketTransport
-    client: _WebsocketClient
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        # What asyncio reads at once, the library handles at once: 256 KiB of tiny messages would take it 0.3 s.
-        self.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's, but not in its interface
-        prepare(self.transport)
-        self.client = _WebsocketClient(self)
-        self.arrived: deque[int] = deque()  # a stamp for each message that waits to be taken
-        self._arrivals = Arrivals(self.owner.clock, self.transport.get_extra_info("socket"))
-        self._arrived = 0
-        self._greeted = 0  # bytes
-        self._parts = 0
-        self.owner.connected(self)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        super().connection_lost(exc)
-        self.owner.disconnected(self)
-
-    def data_received(self, data: bytes) -> None:
-        self._arrived = self._arrivals.stamp(is_all=len(data) < READ_AT_ONCE)
-        if self.protocol.state is State.CONNECTING:
-            self._greeted += len(data)
-        super().data_received(data)
-        self.owner.holds(self.client, self.unfinished())
-        if self.transport.get_write_buffer_size() > HIGH_WATER:  # pings without end, the answers to which are not read
-            self.transport.abort()
-
-    def process_event(self, event: Event) -> None:
-        if isinstance(event, Part) and event.opcode in DATA_OPCODES:
-            self._parts = 0 if event.fin else self._parts + 1
-            if event.fin:
-                self.arrived.append(self._arrived)
-        super().process_event(event)
-
-    def unfinished(self) -> int:
-        """Bytes that the library keeps of a greeting, or of a message that is not whole."""
-        if self.protocol.state is State.CONNECTING:
-            return self._greeted
-        return len(self.protocol.reader.buffer) + (self.protocol.current_size or 0) + PART_BYTES * self._parts
-
-    def pause_writing(self) -> None:
-        super().pause_writing()
-        self.client.outflow.paused()
-
-    def resume_writing(self) -> None:
-        super().resume_writing()
-        self.client.outflow.resumed()
 
 
 def _parts(opcode: Opcode, message: bytes) -> list[bytes]:
