@@ -62,6 +62,9 @@ class Binding:
                 if error.errno not in (None, errno.EADDRNOTAVAIL, told):
                     told = error.errno
                     logger.error("this address cannot be used: trying on", why=self._why_not(error))
+            except Exception as error:  # noqa: BLE001 - a fault of the router, told loudly, is no reason to give up
+                what = {"message": f"a fault in the router itself kept {self._address} closed", "exception": error}
+                asyncio.get_running_loop().call_exception_handler(what)
             else:
                 self.is_ready = True
                 logger.info("the address is here now, and used", address=str(self._address))

@@ -62,6 +62,7 @@ class StreamTransport(ABC):
         self._unfinished: Unfinished[StreamClient] = Unfinished(max(MOST_UNFINISHED, most + OVERHEAD))
         self._binding = Binding("tcp", address, self._bind)
         self._watching: asyncio.TimerHandle | None = None
+        self.is_closing = False
         self._log = FloodLog()
 
     @property
@@ -73,6 +74,7 @@ class StreamTransport(ABC):
         self._watch()
 
     async def close(self) -> None:
+        self.is_closing = True  # who was accepted in this turn of the loop is told of later
         await self._binding.close()
         if self._watching is not None:
             self._watching.cancel()
@@ -98,12 +100,18 @@ class StreamTransport(ABC):
 
     async def _bind(self) -> None:
         listening = listen_at(self._wanted)
-        await self._serve(listening)
+        try:
+            await self._serve(listening)
+        except BaseException:
+            listening.close()
+            raise
         listening.listen(MOST_UNACCEPTED)
         self.address = Address(*listening.getsockname())
 
     def came(self, client: StreamClient) -> bool:
         """Whether there is room for one more; if there is not, that is logged."""
+        if self.is_closing:
+            return False
         if len(self._clients) >= self._max_clients:
             self._log.note("full", logger.warning, "a client was turned away: there are too many", client=client.label)
             return False

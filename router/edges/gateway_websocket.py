@@ -94,7 +94,9 @@ class WebsocketTransport(StreamTransport):
         """Where there is no room, that stranger gives way who has had most time to ask."""
         self._connections.add(connection)
         self._strangers[connection] = None
-        if len(self._connections) > self._max_clients + STRANGERS:
+        if self.is_closing:
+            connection.transport.abort()
+        elif len(self._connections) > self._max_clients + STRANGERS:
             oldest = next(iter(self._strangers))
             del self._strangers[oldest]
             oldest.transport.abort()
@@ -109,11 +111,11 @@ class WebsocketTransport(StreamTransport):
         client = connection.client
         self._strangers.pop(connection, None)
         self.holds(client, connection.unfinished())  # no greeting any more
-        if not self.came(client):
-            await connection.close(CloseCode.TRY_AGAIN_LATER, "there are too many clients")
-            return
         try:
-            await self._hear(connection)
+            if self.came(client):
+                await self._hear(connection)
+            else:
+                await connection.close(CloseCode.TRY_AGAIN_LATER, "there are too many clients")
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
                 self.ears.refused("too_large")

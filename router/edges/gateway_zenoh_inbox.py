@@ -66,13 +66,15 @@ class Inbox:
     def _hand_on(self) -> None:
         if self._client is None:
             return
-        for _ in range(min(len(self._waiting), RECEIVED_PER_TURN)):
-            data, arrived = self._waiting.popleft()
-            self._handed_bytes += len(data)
-            self._ears.received(self._client, data, arrived)
-            self._trimmer.freed(len(data))
-        if self._waiting:
-            self._loop.call_soon(self._hand_on)
+        try:
+            for _ in range(min(len(self._waiting), RECEIVED_PER_TURN)):
+                data, arrived = self._waiting.popleft()
+                self._handed_bytes += len(data)
+                self._ears.received(self._client, data, arrived)
+                self._trimmer.freed(len(data))
+        finally:
+            if self._waiting:  # else `hear` calls
+                self._loop.call_soon(self._hand_on)
         for _ in range(self._lost - self._told_lost):
             self._told_lost += 1
             self._ears.refused("rate_limited")

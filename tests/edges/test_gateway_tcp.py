@@ -9,7 +9,7 @@ import socket
 import struct
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import pytest
 from hypothesis import given
@@ -371,5 +371,20 @@ def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
             writer.close()
             other.close()
         assert [type(fault) for fault in faults] == [json.JSONDecodeError]
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
+    async def story() -> None:
+        transport = packets(Ears())
+        with ExitStack() as connected:
+            async with opened(transport):
+                assert transport.address
+                for _ in range(20):
+                    connected.enter_context(socket.create_connection(transport.address))
+                for _ in range(turns):
+                    await asyncio.sleep(0)
 
     asyncio.run(story())

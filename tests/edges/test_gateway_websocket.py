@@ -6,7 +6,7 @@ import asyncio
 import base64
 import re
 import socket
-from contextlib import AsyncExitStack, suppress
+from contextlib import AsyncExitStack, ExitStack, suppress
 from hashlib import sha256
 
 import pytest
@@ -435,5 +435,20 @@ def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
             await until(lambda: len(ears.clients) == 100)
             transport.write_all(ears.clients, [data(b"hello")])
             assert await asyncio.gather(*(end.recv() for end in ends)) == ["hello"] * 100
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
+    async def story() -> None:
+        transport = documents(Ears())
+        with ExitStack() as connected:
+            async with opened(transport):
+                assert transport.address
+                for _ in range(20):
+                    connected.enter_context(socket.create_connection(transport.address))
+                for _ in range(turns):
+                    await asyncio.sleep(0)
 
     asyncio.run(story())
