@@ -379,12 +379,13 @@ def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
 def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
     async def story() -> None:
         transport = packets(Ears())
-        with ExitStack() as connected:
-            async with opened(transport):
+        async with opened(transport):
+            with ExitStack() as connected:
                 assert transport.address
                 for _ in range(20):
                     connected.enter_context(socket.create_connection(transport.address))
                 for _ in range(turns):
                     await asyncio.sleep(0)
+                await transport.close()
 
     asyncio.run(story())

@@ -443,12 +443,13 @@ def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
 def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
     async def story() -> None:
         transport = documents(Ears())
-        with ExitStack() as connected:
-            async with opened(transport):
+        async with opened(transport):
+            with ExitStack() as connected:
                 assert transport.address
                 for _ in range(20):
                     connected.enter_context(socket.create_connection(transport.address))
                 for _ in range(turns):
                     await asyncio.sleep(0)
+                await transport.close()
 
     asyncio.run(story())
