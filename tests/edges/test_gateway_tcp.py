@@ -22,7 +22,7 @@ from router.edges.gateway_tcp import TAKEN_PER_TURN, TcpTransport
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client
 from router.errors import StartError
 from router.table.model import Address
-from tests.edges.gateway_ears import Ears, data, opened, resident_kib, until
+from tests.edges.gateway_ears import PATIENCE_SECONDS, Ears, data, opened, resident_kib, until
 
 ANY = Address("127.0.0.1", 0)
 MOST = 1000
@@ -379,13 +379,13 @@ def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
 def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
     async def story() -> None:
         transport = packets(Ears())
-        async with opened(transport):
-            with ExitStack() as connected:
-                assert transport.address
-                for _ in range(20):
-                    connected.enter_context(socket.create_connection(transport.address))
-                for _ in range(turns):
-                    await asyncio.sleep(0)
-                await transport.close()
+        await transport.open()
+        assert transport.address
+        with ExitStack() as connected:
+            for _ in range(20):
+                connected.enter_context(socket.create_connection(transport.address))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)
 
     asyncio.run(story())

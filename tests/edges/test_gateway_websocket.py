@@ -19,7 +19,7 @@ from router.edges.gateway_transport import HIGH_WATER, Client
 from router.edges.gateway_websocket import WebsocketTransport
 from router.errors import StartError
 from router.table.model import Address
-from tests.edges.gateway_ears import Ears, data, opened, resident_kib, until
+from tests.edges.gateway_ears import PATIENCE_SECONDS, Ears, data, opened, resident_kib, until
 
 ANY = Address("127.0.0.1", 0)
 MOST = 1000
@@ -443,13 +443,13 @@ def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
 def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
     async def story() -> None:
         transport = documents(Ears())
-        async with opened(transport):
-            with ExitStack() as connected:
-                assert transport.address
-                for _ in range(20):
-                    connected.enter_context(socket.create_connection(transport.address))
-                for _ in range(turns):
-                    await asyncio.sleep(0)
-                await transport.close()
+        await transport.open()
+        assert transport.address
+        with ExitStack() as connected:
+            for _ in range(20):
+                connected.enter_context(socket.create_connection(transport.address))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)
 
     asyncio.run(story())
