@@ -244,7 +244,6 @@ def test_memory_of_large_messages_is_given_back() -> None:
             for number, peer in enumerate(peers):
                 await loop.sock_sendall(peer, struct.pack("<I", large) + b"x" * (large - number % 2))
             await until(lambda: len(ears.said) == 4)
-            assert resident_kib() - before > 6 * large // 1024
             ears.said.clear()
             for peer in peers:
                 peer.close()
