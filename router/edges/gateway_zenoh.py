@@ -12,12 +12,12 @@ from contextlib import suppress
 
 import zenoh
 
+from router.edges.daemon_thread import DaemonThread
 from router.edges.gateway_binding import RETRY_SECONDS
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client, Ears, Frame
 from router.edges.gateway_zenoh_config import session_config, short, why_in_vain
 from router.edges.gateway_zenoh_inbox import Inbox, Queries
 from router.edges.gateway_zenoh_puts import Lost, Putter, key_of
-from router.edges.gateway_zenoh_thread import DaemonThread
 from router.edges.log import logger
 from router.errors import StartError
 from router.table.model import Address, ZenohSettings

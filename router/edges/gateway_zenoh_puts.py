@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import zenoh
 
+from router.edges.daemon_thread import DaemonThread
 from router.edges.gateway_transport import Frame
-from router.edges.gateway_zenoh_thread import DaemonThread
 from router.errors import TransportError
 
 LARGE = 64 * 1024

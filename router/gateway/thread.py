@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.compiler.program import GatewayPlan, Program
 from router.edges.clock import monotonic_ns, wall_ns
+from router.edges.daemon_thread import DaemonThread
 from router.edges.gateway_tcp import TcpTransport
 from router.edges.gateway_transport import Ears, Transport
 from router.edges.gateway_udp import UdpTransport
@@ -25,7 +26,6 @@ from router.gateway.service import GatewayService
 from router.gateway.style import Style
 from router.gateway.subscriber import Subscriber
 from router.gateway.surroundings import Surroundings
-from router.gateway.worker import Worker
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as Way
 from router.types.ros import ros_interfaces
@@ -62,8 +62,8 @@ class GatewayThread:
         self._books = program.books
         self._counts = counts
         self._outlets = _outlets(program, ros, feed, report)
-        self._converting = Worker("gateway bulk")
-        self._reading = Worker("gateway reading")
+        self._converting = DaemonThread("gateway bulk")
+        self._reading = DaemonThread("gateway reading")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
@@ -118,8 +118,8 @@ class GatewayThread:
         finally:  # a thread that goes on would keep the process
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
-            self._converting.stop()
-            self._reading.stop()
+            self._converting.shutdown()
+            self._reading.shutdown()
             self._loop.close()
 
     async def _close(self) -> None:

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from router.edges.gateway_zenoh_thread import DaemonThread
+from router.edges.daemon_thread import DaemonThread
 
 PATIENCE_SECONDS = 20.0
 
@@ -58,7 +58,7 @@ def test_a_thread_without_calls_never_begins() -> None:
 
 def test_a_process_ends_though_a_call_does_not() -> None:
     program = (
-        "import threading; from router.edges.gateway_zenoh_thread import DaemonThread; begun = threading.Event();"
+        "import threading; from router.edges.daemon_thread import DaemonThread; begun = threading.Event();"
         "thread = DaemonThread('calls'); thread.submit(begun.set); thread.submit(threading.Event().wait);"
         "begun.wait(); thread.shutdown()"
     )

@@ -1,4 +1,4 @@
-"""A thread for calls that may wait for a network for ever: the process can end all the same. Knows no Zenoh."""
+"""A thread for calls that may take long, or wait for a network for ever: the process can end all the same."""
 
 from __future__ import annotations
 
