@@ -254,6 +254,7 @@ class Router:
 
     def _asked(self, gateways: GatewayThread | None) -> dict[str, Asked]:
         """Series that nobody counts in a slot."""
+
         def of_clients(value: Callable[[Subscriber], float]) -> Asked:
             return lambda: gateways.clients(value) if gateways else ()
 

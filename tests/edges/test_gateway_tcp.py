@@ -9,7 +9,7 @@ import socket
 import struct
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
@@ -22,7 +22,7 @@ from router.edges.gateway_tcp import TAKEN_PER_TURN, TcpTransport
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client
 from router.errors import StartError
 from router.table.model import Address
-from tests.edges.gateway_ears import PATIENCE_SECONDS, Ears, data, opened, resident_kib, until
+from tests.edges.gateway_ears import Ears, close_while_clients_come, data, opened, resident_kib, until
 
 ANY = Address("127.0.0.1", 0)
 MOST = 1000
@@ -377,15 +377,4 @@ def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
 
 @pytest.mark.parametrize("turns", range(4))
 def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
-    async def story() -> None:
-        transport = packets(Ears())
-        await transport.open()
-        assert transport.address
-        with ExitStack() as connected:
-            for _ in range(20):
-                connected.enter_context(socket.create_connection(transport.address))
-            for _ in range(turns):
-                await asyncio.sleep(0)
-            await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)
-
-    asyncio.run(story())
+    asyncio.run(close_while_clients_come(packets(Ears()), turns))

@@ -6,7 +6,7 @@ import asyncio
 import base64
 import re
 import socket
-from contextlib import AsyncExitStack, ExitStack, suppress
+from contextlib import AsyncExitStack, suppress
 from hashlib import sha256
 
 import pytest
@@ -19,7 +19,7 @@ from router.edges.gateway_transport import HIGH_WATER, Client
 from router.edges.gateway_websocket import WebsocketTransport
 from router.errors import StartError
 from router.table.model import Address
-from tests.edges.gateway_ears import PATIENCE_SECONDS, Ears, data, opened, resident_kib, until
+from tests.edges.gateway_ears import Ears, close_while_clients_come, data, opened, resident_kib, until
 
 ANY = Address("127.0.0.1", 0)
 MOST = 1000
@@ -441,15 +441,4 @@ def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
 
 @pytest.mark.parametrize("turns", range(4))
 def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
-    async def story() -> None:
-        transport = documents(Ears())
-        await transport.open()
-        assert transport.address
-        with ExitStack() as connected:
-            for _ in range(20):
-                connected.enter_context(socket.create_connection(transport.address))
-            for _ in range(turns):
-                await asyncio.sleep(0)
-            await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)
-
-    asyncio.run(story())
+    asyncio.run(close_while_clients_come(documents(Ears()), turns))
