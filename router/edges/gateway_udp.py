@@ -14,6 +14,7 @@ from router.edges.gateway_binding import Binding
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client, Ears, Frame
 from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops
 from router.table.model import Address
+from router.table.units import LARGEST_DATAGRAM
 
 SEND_BUFFER = 4 << 20
 """Bytes that the kernel is asked to keep for a network that is busy."""
@@ -29,9 +30,6 @@ PAUSE_SECONDS = 0.001
 RECEIVED_PER_TURN = 32
 """Datagrams that are taken before other work of the loop has its turn."""
 
-LONGEST = 65507
-"""Bytes of payload that a datagram over IPv4 can have."""
-
 
 class UdpTransport:
     """Its one client is there from the start. Without `local`, any port is sent from and nothing is received.
@@ -39,7 +37,7 @@ class UdpTransport:
     `most` bounds what is received, in bytes.
     """
 
-    def __init__(self, remote: Address, local: Address | None, ears: Ears, most: int = LONGEST) -> None:
+    def __init__(self, remote: Address, local: Address | None, ears: Ears, most: int = LARGEST_DATAGRAM) -> None:
         self.address: Address | None = None
         self._remote = remote
         self._local = local
