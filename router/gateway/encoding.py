@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from itertools import count
 from math import inf
 
@@ -117,11 +117,9 @@ class DocumentEncoding(Encoding):
         return DocumentLetter(data)
 
 
-def encoding(settings: Gateway) -> Encoding:
-    match settings.format:
-        case GatewayFormat.GATEWAY_V1:
-            return PacketEncoding(settings)
-        case GatewayFormat.GATEWAY_V2:
-            return BatchEncoding(settings)
-        case GatewayFormat.JSON | GatewayFormat.JSON_LINES:
-            return DocumentEncoding(settings)
+ENCODINGS: Mapping[GatewayFormat, type[Encoding]] = {
+    GatewayFormat.GATEWAY_V1: PacketEncoding,
+    GatewayFormat.GATEWAY_V2: BatchEncoding,
+    GatewayFormat.JSON: DocumentEncoding,
+    GatewayFormat.JSON_LINES: DocumentEncoding,
+}

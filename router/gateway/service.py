@@ -15,7 +15,7 @@ from router.gateway.documents import (
     rejected_document,
     topics_document,
 )
-from router.gateway.encoding import encoding
+from router.gateway.encoding import ENCODINGS
 from router.gateway.inlet import Checked, Inlet, RefusedError
 from router.gateway.json_reading import example
 from router.gateway.ledger import Ledger
@@ -50,7 +50,7 @@ class GatewayService:
         self._around = around
         self._ledger = ledger
         self._inlet = inlet
-        self._encoding = encoding(settings)
+        self._encoding = ENCODINGS[settings.format](settings)
         self._tasks = Tasks(around.failed)
         self.audience = Audience(self.name, self._encoding, ledger, self._tasks, around.clock_ns, around.wall_s)
         outlet = Outlet(

@@ -19,11 +19,11 @@ from router.edges.gateway_websocket import WebsocketTransport
 from router.engine import Report
 from router.engine.deadman import Feed
 from router.errors import StartError
+from router.gateway.encoding import ENCODINGS
 from router.gateway.hub import Hub
 from router.gateway.inlet import Inlet, InletOutlets
 from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
-from router.gateway.style import Style
 from router.gateway.subscriber import Subscriber
 from router.gateway.surroundings import Surroundings
 from router.table.model import Gateway, GatewayFormat
@@ -80,7 +80,7 @@ class GatewayThread:
 
     async def _open(self, plan: GatewayPlan) -> None:
         settings = plan.settings
-        style = Style.PLAIN if settings.format in (GatewayFormat.JSON, GatewayFormat.JSON_LINES) else Style.WRAPPED
+        style = ENCODINGS[settings.format].style
         ledger = Ledger(settings, self._books, self._counts, self._outlets.report, wall_ns)
         inlet = Inlet(plan, style, self._books, self._counts, self._outlets)
         service = GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))

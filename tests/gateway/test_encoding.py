@@ -10,7 +10,7 @@ from backports import zstd
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.gateway.compression import compress
-from router.gateway.encoding import encoding
+from router.gateway.encoding import ENCODINGS
 from router.gateway.packets import Packet, PacketError, pack
 from tests.gateway.stage import program
 
@@ -39,16 +39,16 @@ def test_of_a_packet_what_is_in_it_counts(
     tmp_path: Path, payload: bytes, is_compressed: bool, size: int | None
 ) -> None:
     [plan] = program(tmp_path, TCP).gateways
-    letter = encoding(plan.settings).letter(pack(Packet(1.0, is_compressed, "/a", "b", payload)))
+    letter = ENCODINGS[plan.settings.format](plan.settings).letter(pack(Packet(1.0, is_compressed, "/a", "b", payload)))
     assert (letter.topic, letter.type_name, letter.size) == ("/a", "b", size)
 
 
 def test_what_is_no_packet_is_not_read(tmp_path: Path) -> None:
     [plan] = program(tmp_path, TCP).gateways
     with pytest.raises(PacketError):
-        encoding(plan.settings).letter(b"\xff" * 60_000)
+        ENCODINGS[plan.settings.format](plan.settings).letter(b"\xff" * 60_000)
 
 
 def test_of_a_document_all_counts(tmp_path: Path) -> None:
     [plan] = program(tmp_path, "it: {transport: {websocket: 127.0.0.1:8600}}").gateways
-    assert encoding(plan.settings).letter(TEXT).size == len(TEXT)
+    assert ENCODINGS[plan.settings.format](plan.settings).letter(TEXT).size == len(TEXT)
