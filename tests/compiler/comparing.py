@@ -30,3 +30,16 @@ def same(left: Any, right: Any) -> bool:
     if isinstance(left, list):
         return len(left) == len(right) and all(map(same, left, right))
     return bool(left == right) or (isinstance(left, float) and math.isnan(left) and math.isnan(right))
+
+
+def without_nul(value: Any) -> Any:
+    """rclpy cuts strings there."""
+    match value:
+        case dict():
+            return {name: without_nul(member) for name, member in value.items()}
+        case list():
+            return [without_nul(element) for element in value]
+        case str():
+            return value.replace("\0", "")
+        case _:
+            return value

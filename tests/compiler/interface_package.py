@@ -16,6 +16,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from router.types.model import MessageType
+from router.types.ros import RosInterfaces
+from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+
 NAME = "nasty"
 MESSAGES: Mapping[str, str] = {
     "Empty": "",
@@ -152,3 +156,9 @@ def _environment(*installs: Path) -> dict[str, str]:
         name: os.pathsep.join([*map(str, paths), os.environ.get(name, "")]).rstrip(os.pathsep)
         for name, paths in added.items()
     }
+
+
+def declared_type(package: InterfacePackage, name: str) -> MessageType:
+    found = RosInterfaces(MsgFiles([package.share]), RosbagsDefinitions()).get(f"{NAME}/msg/{name}")
+    assert found is not None
+    return found

@@ -17,6 +17,7 @@ pytest.importorskip("rclpy")
 
 from rclpy.serialization import deserialize_message, serialize_message
 
+from tests.compiler.comparing import without_nul
 from tests.compiler.ros_objects import message_class, to_object
 
 PACKAGES = ("builtin_interfaces", "comms", "geometry_msgs", "sensor_msgs", "std_msgs")
@@ -30,19 +31,6 @@ def is_installed(name: str) -> bool:
 
 
 INSTALLED = sorted(filter(is_installed, ros_interfaces().names()))
-
-
-def without_nul(value: object) -> object:
-    """rclpy cuts strings there."""
-    match value:
-        case dict():
-            return {name: without_nul(member) for name, member in value.items()}
-        case list():
-            return [without_nul(element) for element in value]
-        case str():
-            return value.replace("\0", "")
-        case _:
-            return value
 
 
 @pytest.mark.parametrize("name", INSTALLED)

@@ -13,12 +13,10 @@ from router.compiler.reference import fill
 from router.compiler.reference_cdr import cdr
 from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Field, Int, MessageType, String
-from router.types.ros import RosInterfaces
-from router.types.ros_sources import MsgFiles, RosbagsDefinitions
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope_of, serializer
 from tests.compiler.generated_types import mirror, values
-from tests.compiler.interface_package import MESSAGES, NAME, InterfacePackage, built, is_buildable
+from tests.compiler.interface_package import MESSAGES, InterfacePackage, built, declared_type, is_buildable
 from tests.compiler.reading import WHOLE, field_values, reader
 
 pytest.importorskip("rclpy")
@@ -30,12 +28,6 @@ def package() -> Iterator[InterfacePackage]:
     made = InterfacePackage(built())
     yield made
     made.close()
-
-
-def declared_type(package: InterfacePackage, name: str) -> MessageType:
-    found = RosInterfaces(MsgFiles([package.share]), RosbagsDefinitions()).get(f"{NAME}/msg/{name}")
-    assert found is not None
-    return found
 
 
 @pytest.mark.parametrize("name", MESSAGES)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -24,6 +23,7 @@ from tests.compiler.reading import field_values
 pytest.importorskip("rclpy")
 
 from router.edges.ros_definitions import installed_type
+from tests.compiler.comparing import without_nul
 from tests.compiler.ros_objects import serialized
 
 PACKAGES = ("comms", "geometry_msgs", "sensor_msgs", "std_msgs")
@@ -46,19 +46,6 @@ def service_parts() -> Iterator[str]:
             if hasattr(found, "Request")
             for part in ("Request", "Response", "Event")
         )
-
-
-def without_nul(value: Any) -> Any:
-    """rclpy cuts strings there."""
-    match value:
-        case dict():
-            return {name: without_nul(member) for name, member in value.items()}
-        case list():
-            return [without_nul(element) for element in value]
-        case str():
-            return value.replace("\0", "")
-        case _:
-            return value
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,8 @@ from hypothesis import strategies as st
 
 from router.gateway.json_reading import cdr_builder, example, parse_json
 from router.gateway.style import Style
-from router.types.model import MessageType
-from router.types.ros import RosInterfaces
-from router.types.ros_sources import MsgFiles, RosbagsDefinitions
 from tests.compiler.comparing import assert_same_message, same
-from tests.compiler.interface_package import MESSAGES, NAME, InterfacePackage, built, is_buildable
+from tests.compiler.interface_package import MESSAGES, InterfacePackage, built, declared_type, is_buildable
 from tests.gateway.client_json import FORMS, tree, values, written
 
 pytest.importorskip("rclpy")
@@ -27,12 +24,6 @@ def package() -> Iterator[InterfacePackage]:
     made = InterfacePackage(built())
     yield made
     made.close()
-
-
-def declared_type(package: InterfacePackage, name: str) -> MessageType:
-    found = RosInterfaces(MsgFiles([package.share]), RosbagsDefinitions()).get(f"{NAME}/msg/{name}")
-    assert found is not None
-    return found
 
 
 @pytest.mark.parametrize("name", MESSAGES)
