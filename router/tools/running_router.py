@@ -1,0 +1,103 @@
+"""A running router as another process meets it: its HTTP address, what it can be asked to do, and its tap.
+
+Knows the address and the form of the answers; what is in a datagram is for whoever asks.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from typing import Any, NamedTuple
+from urllib.parse import urlencode, urlsplit
+
+from router.edges.mirror import Seen
+from router.edges.tap_stream import Lost, StreamReader
+from router.errors import TransportError
+from router.table.model import RouteTable
+from router.tools import UsageError
+from router.tools.places import reachable
+
+PATIENCE = 5.0
+"""Seconds; a router answers at once, and says once a second in a tap that it is there."""
+
+PIECE = 1 << 18
+
+
+class Answer(NamedTuple):
+    """`said` is the JSON object of the answer; `ok` that what was asked for was done."""
+
+    ok: bool
+    said: dict[str, Any]
+
+
+def url_of(table: RouteTable) -> str:
+    """Where the router that runs a table answers. Raises UsageError where it serves no HTTP."""
+    if table.metrics is None:
+        raise UsageError(f"{table.path} has no 'metrics.address', without which a running router cannot be asked")
+    return f"http://{reachable(table.metrics.value)}"
+
+
+def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
+    """Has a running router do something. Raises TransportError where nobody answers, or no router."""
+    with closing(_connection(url, patience)) as connection:
+        response = _asked(connection, url, "POST", path)
+        text = _read(response, url)
+        try:
+            said = json.loads(text)
+        except ValueError:
+            raise TransportError(f"{url}{path}: {response.status} {_first_line(text)}") from None
+        return Answer(response.status == http.client.OK, said)
+
+
+@contextmanager
+def tap(url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()) -> Iterator[Iterator[Seen | Lost]]:
+    """What a running router receives from now on: of these payload cases, from these endpoints; none means all.
+
+    Raises UsageError for what the router refuses, TransportError where none answers, and later when it has ended.
+    """
+    words = urlencode([*(("case", case) for case in cases), *(("from", source) for source in sources)])
+    with closing(_connection(url, PATIENCE)) as connection:
+        response = _asked(connection, url, "GET", f"/tap?{words}" if words else "/tap")
+        if response.status != http.client.OK:
+            raise UsageError(_first_line(_read(response, url)))
+        yield _stream(response, url)
+
+
+def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[Seen | Lost]:
+    reader = StreamReader()
+    while True:
+        try:
+            piece = response.read1(PIECE)
+        except (OSError, http.client.HTTPException) as error:
+            raise TransportError(f"the router at {url} has fallen silent: {error}") from error
+        if not piece:
+            raise TransportError(f"the router at {url} has ended")
+        yield from reader.take(piece)
+
+
+def _connection(url: str, patience: float) -> http.client.HTTPConnection:
+    parts = urlsplit(url if "://" in url else f"http://{url}")
+    if parts.scheme != "http" or not parts.hostname:
+        raise UsageError(f"'{url}' is not like http://127.0.0.1:9108")
+    return http.client.HTTPConnection(parts.hostname, parts.port or 80, timeout=patience)
+
+
+def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: str) -> http.client.HTTPResponse:
+    try:
+        connection.request(method, path, headers={"Content-Length": "0"} if method == "POST" else {})
+        return connection.getresponse()
+    except (OSError, http.client.HTTPException) as error:
+        raise TransportError(f"no router answers at {url}: {error}; is it running?") from error
+
+
+def _read(response: http.client.HTTPResponse, url: str) -> bytes:
+    try:
+        return response.read()
+    except (OSError, http.client.HTTPException) as error:
+        raise TransportError(f"the router at {url} broke off: {error}") from error
+
+
+def _first_line(text: bytes) -> str:
+    return next(iter(text.decode(errors="replace").splitlines()), "")
