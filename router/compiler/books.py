@@ -50,6 +50,13 @@ METRICS = (
     Metric("gateway_client_sent", "counter", ("route", "client"), "Frames handed to a client since it came."),
     Metric("gateway_client_dropped", "counter", ("route", "client"), "Frames that newer ones replaced since it came."),
     Metric("client_messages_dropped", "counter", ("route", "reason"), "Messages that single clients did not get."),
+    Metric("mirror_dropped", "counter", (), "Datagrams that recordings and taps missed, though they were routed."),
+    Metric("recorded_datagrams", "counter", (), "Datagrams written to a recording."),
+    Metric("recorded_bytes", "counter", (), "Bytes in those datagrams."),
+    Metric("record_dropped", "counter", ("reason",), "Datagrams that a recording lacks, by reason."),
+    Metric("config_reloads", "counter", ("result",), "Changed tables that the running router was to take."),
+    Metric("config_last_reload_successful", "number", (), "1 unless the last reload changed nothing for its errors."),
+    Metric("config_last_reload_timestamp_seconds", "time", (), "When the running table was taken."),
     Metric("qos_incompatible", "number", ("route", "topic", "policy"), "Peers that got or gave nothing for their QoS."),
 )
 
@@ -114,6 +121,19 @@ CLIENT_DROP_REASONS: Mapping[str, str] = {
 }
 """Why one client of a gateway did not get a message, with what each means."""
 
+RECORD_DROP_REASONS: Mapping[str, str] = {
+    "overflow": "the disk was slower than the network for longer than the buffer lasts",
+    "write_error": "the file could not be written, as when the disk is full",
+}
+"""Why a recording lacks a datagram, with what each means."""
+
+RELOAD_RESULTS: Mapping[str, str] = {
+    "ok": "the new table runs",
+    "invalid": "the table has errors, or changes what only a restart can",
+    "failed": "something that it names cannot be opened",
+}
+"""What became of a reload, with what each means. Unless it is ok, the old table goes on."""
+
 CLIENTS = "clients"
 """The `target` and `source` label of a gateway's clients."""
 
@@ -143,27 +163,78 @@ HISTOGRAM_SLOTS = len(HISTOGRAM_BOUNDS_NS) + 2
 
 @dataclass(slots=True)
 class Books:
-    """Slots by series. Asking twice for one series gives the same slot, so series exist once."""
+    """Slots by series. Asking twice for one series gives the same slot, so series exist once.
+
+    Books may continue those of an earlier program (`continued`): what both have is counted in the same slots. What
+    only the earlier one had is gone: it is no longer current, but keeps its slots until `settle` frees them.
+    """
 
     _slots: dict[Series, int] = field(default_factory=dict)
+    _current: set[Series] = field(default_factory=set)
+    _free: dict[int, list[int]] = field(default_factory=dict)  # the first slots of free runs, by length
+    _size: int = 0
+
+    def continued(self) -> Books:
+        """Books for the program that comes next, in which nothing is current yet. These here stay as they are."""
+        return Books(self._slots.copy(), set(), {length: starts.copy() for length, starts in self._free.items()}, self._size)
 
     def slot(self, metric: str, *labels: str) -> int:
         declared = _BY_NAME[metric]
         if len(labels) != len(declared.labels):
             raise ValueError(f"{metric} has the labels {declared.labels}, not {labels}")
         first = Series(metric, labels)
+        self._current.add(first)
         if first not in self._slots:
-            for part in range(HISTOGRAM_SLOTS if declared.kind == "histogram" else 1):
-                self._slots[Series(metric, labels, part)] = len(self._slots)
+            length = _slots_of(declared)
+            start = self._run(length)
+            for part in range(length):
+                self._slots[Series(metric, labels, part)] = start + part
         return self._slots[first]
 
+    def _run(self, length: int) -> int:
+        """So many slots in a row that no series has."""
+        if free := self._free.get(length):
+            return free.pop()
+        self._size += length
+        return self._size - length
+
     def series(self) -> Iterable[tuple[Series, int]]:
-        """Every series with its slot, in the order in which they were asked for."""
+        """Every series with its slot: those of this program, and those of earlier ones that counted something."""
         return self._slots.items()
 
     def fresh_counts(self) -> list[int]:
         """A list of zeros, one for each slot, for one thread to own."""
-        return [0] * len(self._slots)
+        return [0] * self._size
+
+    def grow(self, counts: list[int]) -> None:
+        """Gives the list of a thread that counts in earlier books room for these, in place."""
+        counts.extend([0] * (self._size - len(counts)))
+
+    def settle(self, threads: Iterable[list[int]]) -> None:
+        """To be called when nobody counts in what is gone any more, with the lists of all threads.
+
+        Counters of what is gone keep what they counted, for nothing that happened may vanish. Those that counted
+        nothing, and what is no counter, vanish, and their slots are free.
+        """
+        lists = list(threads)
+        for first in [series for series in self._slots if series.part == 0 and series not in self._current]:
+            declared, start = _BY_NAME[first.metric], self._slots[first]
+            length = _slots_of(declared)
+            run = slice(start, start + length)
+            if declared.kind in _COUNTED and any(any(counts[run]) for counts in lists):
+                continue
+            for counts in lists:
+                counts[run] = [0] * length
+            for part in range(length):
+                del self._slots[Series(first.metric, first.labels, part)]
+            self._free.setdefault(length, []).append(start)
+
+
+_COUNTED = ("counter", "histogram")
+
+
+def _slots_of(metric: Metric) -> int:
+    return HISTOGRAM_SLOTS if metric.kind == "histogram" else 1
 
 
 _BY_NAME = {metric.name: metric for metric in METRICS}

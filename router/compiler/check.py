@@ -18,10 +18,12 @@ from router.compiler.meetings import clash_findings, topic_findings
 from router.compiler.network import network_findings
 from router.compiler.program import Program
 from router.compiler.routes import RouteChecker, sorted_findings
+from router.compiler.topics import diagnostics_topic
 from router.errors import Diagnostic, Severity, TableError
 from router.table import load_table
-from router.table.model import RouteTable
+from router.table.model import RouteTable, Topic
 from router.types.lock import check_lock, locked_size
+from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope
 
 
@@ -36,6 +38,7 @@ class Checked:
     envelope: Envelope | None = None
     routes: Sequence[CheckedRoute] = ()
     gateways: Sequence[CheckedGateway] = ()
+    own_topics: Sequence[tuple[Topic, MessageType]] = ()
 
     @property
     def has_errors(self) -> bool:
@@ -48,7 +51,7 @@ class Checked:
 
         if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
             return None
-        return link(self.table, self.schema, self.envelope, self.routes, self.gateways)
+        return link(self.table, self.schema, self.envelope, self.routes, self.gateways, self.own_topics)
 
 
 def check_table(
@@ -71,6 +74,8 @@ def check_table(
     lookup = Lookup(table, schema, envelope, definitions, locked_size(schema) or envelope.max_size)
     routes = RouteChecker(lookup).check_all()
     gateways = check_gateways(lookup)
+    own = diagnostics_topic(table.node)
+    own_type = lookup.ros_type(own) if own else None
     findings = [
         *findings,
         *check_lock(schema, envelope),
@@ -79,4 +84,5 @@ def check_table(
         *clash_findings(table),
         *topic_findings(table, [checked.route for checked in routes]),
     ]
-    return Checked(path, sorted_findings(findings), table, schema, envelope, routes, gateways)
+    own_topics = [(own, own_type)] if own and own_type else []
+    return Checked(path, sorted_findings(findings), table, schema, envelope, routes, gateways, own_topics)

@@ -8,7 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from router.compiler.books import QOS_POLICIES, REJECT_REASONS, UNKNOWN_CASE, Books
+from router.compiler.books import (
+    QOS_POLICIES,
+    RECORD_DROP_REASONS,
+    REJECT_REASONS,
+    RELOAD_RESULTS,
+    UNKNOWN_CASE,
+    Books,
+)
 from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedRoute
 from router.compiler.handlers import HandlerSource
 from router.compiler.link_gateways import link_gateway
@@ -36,9 +43,12 @@ def link(
     envelope: Envelope,
     routes: Sequence[CheckedRoute],
     gateways: Sequence[CheckedGateway] = (),
+    own_topics: Sequence[tuple[Topic, MessageType]] = (),
 ) -> Program:
+    """`own_topics` are published by the router itself, whatever its routes do."""
     books = Books()
     _open_books(books, table, envelope)
+    _open_own_books(books, table)
     served = [checked for checked in routes if not checked.route.ignore]
     inbound: dict[int, tuple[Handler, ...]] = {}
     outbound: dict[str, tuple[Handler, ...]] = {}
@@ -67,7 +77,7 @@ def link(
             for one in table.endpoints.values()
             if one.name in destinations
         ),
-        publishers=_topics(_published(table, served, gateways)),
+        publishers=_topics([*_published(table, served, gateways), *own_topics]),
         subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.feeds),
         inbound=inbound,
         outbound=outbound,
@@ -111,6 +121,19 @@ def _open_books(books: Books, table: RouteTable, envelope: Envelope) -> None:
         books.slot("unhandled", case)
     for endpoint in table.endpoints:
         books.slot("endpoint_last_seen_timestamp_seconds", endpoint)
+
+
+def _open_own_books(books: Books, table: RouteTable) -> None:
+    """Of what the router does beside routing."""
+    for name in ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"):
+        books.slot(name)
+    for result in RELOAD_RESULTS:
+        books.slot("config_reloads", result)
+    if table.record is not None:
+        for name in ("recorded_datagrams", "recorded_bytes"):
+            books.slot(name)
+        for reason in RECORD_DROP_REASONS:
+            books.slot("record_dropped", reason)
 
 
 def compile_handlers(checked: CheckedRoute, table: RouteTable, books: Books) -> Iterator[Handler]:

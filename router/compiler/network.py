@@ -43,6 +43,8 @@ def _held(table: RouteTable) -> Iterator[_Held]:
         yield _Held(f"listener '{listener.name}'", listener.address, is_udp=True)
     if table.metrics is not None:
         yield _Held("the metrics", table.metrics)
+    if table.foxglove is not None:
+        yield _Held("'foxglove'", table.foxglove)
     for gateway in table.gateways.values():
         owner = f"gateway '{gateway.name}'"
         if gateway.receive is not None:

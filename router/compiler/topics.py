@@ -8,10 +8,11 @@ from dataclasses import replace
 
 from router.compiler.program import QosPlan
 from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import NodeSettings, Topic
+from router.table.model import Located, NodeSettings, Topic
 
 DEFAULT_DEPTH = 10
 LONGEST_NAME = 247
+DIAGNOSTICS, DIAGNOSTICS_TYPE = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
 _NAME = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 
 PROFILES: Mapping[str, QosPlan] = {
@@ -25,6 +26,14 @@ PROFILES: Mapping[str, QosPlan] = {
     "best_available": QosPlan("best_available", "best_available", "keep_last", DEFAULT_DEPTH),
 }
 """rmw's profiles by rclpy's names."""
+
+
+def diagnostics_topic(node: NodeSettings) -> Topic | None:
+    """What ROS's monitors read, where the table asks for it."""
+    if node.diagnostics is None:
+        return None
+    span = node.diagnostics
+    return Topic(Located(DIAGNOSTICS, span), Located(DIAGNOSTICS_TYPE, span), span)
 
 
 def topic_name_finding(topic: Topic) -> Diagnostic | None:

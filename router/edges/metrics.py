@@ -1,17 +1,14 @@
-"""Prometheus: reads the books' integers when it is asked, and serves them over HTTP.
+"""Prometheus: reads the books' integers when it is asked.
 
 Counting happens elsewhere, in plain lists; nothing here is called per datagram.
 """
 
 from __future__ import annotations
 
-import errno
-import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate
 from time import sleep
 
-from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
 from prometheus_client.metrics_core import InfoMetricFamily
 from prometheus_client.metrics_core import Metric as Family
 from prometheus_client.registry import Collector
@@ -19,9 +16,6 @@ from prometheus_client.samples import Sample
 
 from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, METRICS, Books, Metric
 from router.compiler.books import metric as metric_named
-from router.edges.port_holder import port_holder
-from router.errors import SourceSpan, StartError
-from router.table.model import Address
 
 PREFIX = "router_"
 
@@ -105,28 +99,3 @@ def _histogram(name: str, labels: dict[str, str], threads: Iterable[list[int]]) 
         yield Sample(f"{name}_bucket", {**labels, "le": bound}, count)
     yield Sample(f"{name}_count", labels, cumulative[-1])
     yield Sample(f"{name}_sum", labels, sum_ns / 1e9)
-
-
-class MetricsServer:
-    """Serves the collector's metrics and those of the process at `address` until closed."""
-
-    def __init__(self, address: Address, span: SourceSpan, collector: Collector) -> None:
-        registry = CollectorRegistry()
-        registry.register(collector)
-        ProcessCollector(registry=registry)
-        try:
-            self._server, self._thread = start_http_server(address.port, address.host, registry)
-        except OSError as error:
-            in_use = error.errno == errno.EADDRINUSE
-            why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
-            raise StartError(
-                f"{span}: metrics cannot be served at {address}: {why}; choose another metrics.address"
-            ) from error
-        self.address = Address(address.host, self._server.server_port)
-
-    def close(self) -> None:
-        # The server looks every half second whether it is to stop, and whenever its socket stirs.
-        self._server.socket.shutdown(socket.SHUT_RDWR)
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()

@@ -1,16 +1,21 @@
 """The receive thread: takes datagrams from all listeners and gives each to whoever it is for, until told to stop.
 
 Where datagrams come thick, it lets some of them gather before it looks again; where they do not, it waits for each.
+Between two datagrams it does what others ask for: so what it calls can be replaced while it runs.
 """
 
 from __future__ import annotations
 
 import select
 import socket
+import struct
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, wait
+from contextlib import suppress
 from time import monotonic_ns
 
 from router.edges.coalescing import SAMPLE, Coalescing
@@ -20,6 +25,11 @@ Receive = Callable[[bytes, "tuple[str, int]"], None]
 
 _WAIT = socket.MSG_TRUNC.value
 _LOOK = _WAIT | socket.MSG_DONTWAIT.value
+
+_PATIENCE = 0.25
+"""Seconds for which it waits for a datagram before it looks whether there is something else to do."""
+
+_TIMEVAL = struct.Struct("@ll")
 
 _TURN = 4
 """The most that one of several listeners may hand in while the others wait."""
@@ -46,10 +56,53 @@ class ReceiveThread:
         self._intakes = [_Intake(listener, receive[listener.name], limit + 1, enough) for listener in listeners]
         self._failed = failed
         self._ended = False
+        self._turns = 0
+        self._tasks: deque[Callable[[], None]] = deque()
         self._thread = threading.Thread(target=self._run, name="receive")
+
+    @property
+    def turns(self) -> int:
+        """Grows at least every 250 ms, unless datagrams keep the thread busy or it is stuck."""
+        return self._turns
 
     def start(self) -> None:
         self._thread.start()
+
+    def give_to(self, receive: Mapping[str, Receive]) -> None:
+        """From the next datagram on, each listener's go to `receive[listener]`. Returns when that is so."""
+
+        def give() -> None:
+            for intake in self._intakes:
+                intake.receive = receive[intake.name]
+
+        self.between(give)
+
+    def between(self, task: Callable[[], None]) -> None:
+        """Has the thread call `task` between two datagrams, and returns when that is done; raises what it raises.
+
+        While the thread does not run, it is called here.
+        """
+        done: Future[None] = Future()
+
+        def tell() -> None:
+            try:
+                task()
+            except Exception as error:  # noqa: BLE001 raised where it was asked for
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+
+        self._tasks.append(tell)
+        while not done.done():
+            if not self._thread.is_alive():
+                self._do_tasks()
+            wait([done], _PATIENCE)
+        done.result()
+
+    def _do_tasks(self) -> None:
+        with suppress(IndexError):  # another thread may do them as well when this one has ended
+            while self._tasks:
+                self._tasks.popleft()()
 
     def stop(self) -> None:
         """Lets nothing new in, handles what the kernel already holds, and returns when that is done."""
@@ -62,28 +115,39 @@ class ReceiveThread:
         receive_all = self._from_one if len(self._intakes) == 1 else self._from_many
         while True:
             try:
-                return receive_all()
+                if receive_all():
+                    return self._do_tasks()
+                self._do_tasks()
             except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, is no reason to stop receiving
                 self._failed(error)
 
-    def _from_one(self) -> None:
-        """One system call per datagram: a blocking receive is also the wait."""
+    def _from_one(self) -> bool:
+        """One system call per datagram: a blocking receive is also the wait. True at the end, False for tasks."""
         [intake] = self._intakes
-        receive, receive_from, size = intake.receive, intake.receive_from, intake.size
-        while True:
+        receive, receive_from, size, tasks = intake.receive, intake.receive_from, intake.size, self._tasks
+        intake.wait_at_most(_PATIENCE)
+        while not tasks:
+            self._turns += 1
             since = monotonic_ns()
             for _ in range(SAMPLE):
-                data, peer = receive_from(size, _WAIT)
+                try:
+                    data, peer = receive_from(size, _WAIT)
+                except BlockingIOError:
+                    break
                 if peer is None:
-                    return
+                    return True
                 receive(data, peer)
+                if tasks:
+                    return False
             rest = intake.coalescing.first(monotonic_ns() - since)
-            while rest:
+            while rest and not tasks:
+                self._turns += 1
                 time.sleep(rest)
                 rest = intake.coalescing.next(intake.take(sys.maxsize))
+        return False
 
-    def _from_many(self) -> None:
-        """Few datagrams per listener and turn, so that a flooded listener cannot starve the others.
+    def _from_many(self) -> bool:
+        """Few datagrams per listener and turn, so that a flooded one cannot starve the others. Returns as `_from_one`.
 
         Those that coalesce are not waited for, but looked at when they have rested.
         """
@@ -93,6 +157,9 @@ class ReceiveThread:
                 waiting.register(descriptor, select.EPOLLIN)
             looks: dict[int, float] = {}  # of those that coalesce: when, by time.monotonic
             while open_ones:
+                if self._tasks:
+                    return False
+                self._turns += 1
                 ended = self._ended  # before looking: what arrives after that is still taken
                 for descriptor in _ready(waiting, looks):
                     taken, rest = open_ones[descriptor].take_one()
@@ -111,12 +178,13 @@ class ReceiveThread:
                     else:
                         waiting.modify(descriptor, select.EPOLLIN)
                         del looks[descriptor]
+        return True
 
 
 def _ready(waiting: select.epoll, looks: Mapping[int, float]) -> list[int]:
     """What has something. Waits for that until the next look is due; epoll alone would wait whole milliseconds."""
     if not looks:
-        return [descriptor for descriptor, _ in waiting.poll()]
+        return [descriptor for descriptor, _ in waiting.poll(_PATIENCE)]
     if (timeout := min(looks.values()) - time.monotonic()) > 0:
         select.select([waiting], [], [], timeout)
     return [descriptor for descriptor, _ in waiting.poll(0) if descriptor not in looks]
@@ -131,13 +199,20 @@ class _Intake:
     """One listener's datagrams, and how long it rests between looks."""
 
     def __init__(self, listener: Listener, receive: Receive, size: int, enough: Callable[[], int]) -> None:
+        self.name = listener.name
         self.descriptor = listener.socket.fileno()
+        self._socket = listener.socket
         self.receive_from = listener.socket.recvfrom
         self.receive = receive
         self.size = size
         self.coalescing = Coalescing(listener.coalesce, enough)
         self._taken = 0  # since the last look at the clock, or the last rest
         self._since = 0
+
+    def wait_at_most(self, seconds: float) -> None:
+        """A blocking receive ends with BlockingIOError after that; Python's own timeout would cost a call of poll."""
+        timeout = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
 
     def take(self, most: int) -> int:
         """Takes what has arrived, and returns how much that was: less than `most` when there is no more."""

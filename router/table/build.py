@@ -16,6 +16,7 @@ from router.table.build_addresses import local_address, remote_address
 from router.table.build_gateways import build_gateway
 from router.table.build_routes import build_case, named
 from router.table.model import (
+    DEFAULT_STALE_AFTER,
     Address,
     Endpoint,
     EndpointKind,
@@ -26,19 +27,30 @@ from router.table.model import (
     Listener,
     Located,
     NodeSettings,
+    RecordSettings,
     RouteTable,
 )
 from router.table.nodes import Entry, MappingNode, is_sound, marked_broken
-from router.table.reading import UnsoundError, boolean, integer, mapping, optional_text, text, text_or
+from router.table.reading import UnsoundError, boolean, duration, integer, mapping, optional_text, text, text_or
 from router.table.salvage import sound_part
 from router.table.source import Source
-from router.table.units import parse_coalesce, parse_data_rate, parse_size
+from router.table.units import (
+    parse_coalesce,
+    parse_data_rate,
+    parse_disk_size,
+    parse_duration,
+    parse_patience,
+    parse_size,
+)
 
 T = TypeVar("T")
 
 DEFAULT_NODE = NodeSettings("rover_router", "/")
 DEFAULT_RECEIVE_BUFFER = 4 << 20
 DEFAULT_COALESCE = 1_000_000
+DEFAULT_MAX_SIZE = 256 << 20
+DEFAULT_MAX_AGE = 600_000_000_000
+DEFAULT_KEEP = 4 << 30
 
 
 def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Diagnostic]) -> RouteTable | None:
@@ -60,7 +72,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         sha256=hashlib.sha256(b"".join(source.data for source in sources)).hexdigest(),
         envelope=envelope,
         node=builder.one(root, "node", _node) or DEFAULT_NODE,
-        metrics=builder.one(root, "metrics", _metrics),
+        metrics=builder.one(root, "metrics", _address),
         listeners=builder.each(root, "listen", _listener),
         endpoints=builder.each(root, "endpoints", _endpoint),
         routes=named(builder.each(root, "routes", build_case, salvage=sound_part).values()),
@@ -68,6 +80,9 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         gateways={name: each for name, each in gateways.items() if isinstance(each, Gateway)},
         ignored_gateways={name: each for name, each in gateways.items() if isinstance(each, IgnoredGateway)},
         broken=frozenset(builder.broken),
+        record=builder.one(root, "record", _record),
+        foxglove=builder.one(root, "foxglove", _address),
+        reload_on_change=builder.one(root, "reload", _reload) or False,
     )
 
 
@@ -144,26 +159,48 @@ def _envelope(entry: Entry) -> EnvelopeSettings:
 def _node(entry: Entry) -> NodeSettings:
     settings = mapping(entry.value)
     return NodeSettings(
-        text_or(settings, "name", DEFAULT_NODE.name), text_or(settings, "namespace", DEFAULT_NODE.namespace)
+        text_or(settings, "name", DEFAULT_NODE.name),
+        text_or(settings, "namespace", DEFAULT_NODE.namespace),
+        settings.entries["diagnostics"].key.span if boolean(settings, "diagnostics") else None,
     )
 
 
-def _metrics(entry: Entry) -> Located[Address]:
+def _address(entry: Entry) -> Located[Address]:
     return local_address(text(mapping(entry.value), "address"))
+
+
+def _record(entry: Entry) -> RecordSettings:
+    settings = mapping(entry.value)
+    directory, last = text(settings, "directory"), duration(settings, "last")
+    return RecordSettings(
+        span=entry.key.span,
+        directory=Path(directory.span.file).absolute().parent / directory.value,
+        continuous=settings.get("continuous") is None or boolean(settings, "continuous"),
+        last=last.value if last else None,
+        max_size=_parsed(settings, "max_size", parse_disk_size, DEFAULT_MAX_SIZE),
+        max_age=_parsed(settings, "max_age", parse_duration, DEFAULT_MAX_AGE),
+        keep=_parsed(settings, "keep", parse_disk_size, DEFAULT_KEEP),
+    )
+
+
+def _reload(entry: Entry) -> bool:
+    return boolean(mapping(entry.value), "on_change")
+
+
+def _parsed(settings: MappingNode, key: str, parse: Callable[[str], T], default: T) -> T:
+    written = optional_text(settings, key)
+    return UnsoundError.guard(parse, written) if written else default
 
 
 def _listener(entry: Entry) -> Listener:
     settings = mapping(entry.value)
-    size, coalesce = optional_text(settings, "receive_buffer"), optional_text(settings, "coalesce")
     return Listener(
         name=entry.key.text,
         span=entry.key.span,
         address=local_address(text(settings, "address")),
         framing=Framing(text_or(settings, "framing", Framing.ZERO_TRIMMED.value)),
-        receive_buffer=UnsoundError.guard(parse_size, text(settings, "receive_buffer"))
-        if size
-        else DEFAULT_RECEIVE_BUFFER,
-        coalesce=UnsoundError.guard(parse_coalesce, text(settings, "coalesce")) if coalesce else DEFAULT_COALESCE,
+        receive_buffer=_parsed(settings, "receive_buffer", parse_size, DEFAULT_RECEIVE_BUFFER),
+        coalesce=_parsed(settings, "coalesce", parse_coalesce, DEFAULT_COALESCE),
     )
 
 
@@ -178,4 +215,5 @@ def _endpoint(entry: Entry) -> Endpoint:
         source_port=integer(settings, "source_port"),
         trim_trailing_zeros=boolean(settings, "trim_trailing_zeros"),
         budget=Located(UnsoundError.guard(parse_data_rate, budget), budget.span) if budget else None,
+        stale_after=_parsed(settings, "stale_after", parse_patience, DEFAULT_STALE_AFTER) or None,
     )

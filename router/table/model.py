@@ -73,8 +73,11 @@ class EnvelopeSettings:
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
+    """`diagnostics` is where the table asks for /diagnostics, None where it does not."""
+
     name: str
     namespace: str
+    diagnostics: SourceSpan | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +92,16 @@ class Listener:
     coalesce: int
 
 
+DEFAULT_STALE_AFTER = 5_000_000_000
+"""ns."""
+
+
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """`span` is the endpoint's name in the table. `budget` is in bytes per second, None for no limit."""
+    """`span` is the endpoint's name in the table. `budget` is in bytes per second, None for no limit.
+
+    Silent for longer than `stale_after` (ns) it is stale; None means that it never is.
+    """
 
     name: str
     span: SourceSpan
@@ -100,6 +110,23 @@ class Endpoint:
     source_port: Located[int] | None
     trim_trailing_zeros: bool
     budget: Located[int] | None = None
+    stale_after: int | None = DEFAULT_STALE_AFTER
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSettings:
+    """Which datagrams are kept, and where. `span` is the key `record`; `directory` is an absolute path.
+
+    `last` and `max_age` in ns, sizes in bytes.
+    """
+
+    span: SourceSpan
+    directory: Path
+    continuous: bool
+    last: int | None
+    max_size: int
+    max_age: int
+    keep: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -388,3 +415,6 @@ class RouteTable:
     gateways: Mapping[str, Gateway] = field(default_factory=dict)
     ignored_gateways: Mapping[str, IgnoredGateway] = field(default_factory=dict)
     broken: frozenset[str] = frozenset()
+    record: RecordSettings | None = None
+    foxglove: Located[Address] | None = None
+    reload_on_change: bool = False

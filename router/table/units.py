@@ -14,6 +14,7 @@ _NANOSECONDS = {
     "ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "min": 60 * 10**9, "h": 3600 * 10**9,
 }  # fmt: skip
 _BYTES = {"B": 1, "kB": 1000, "KiB": 1 << 10, "MB": 10**6, "MiB": 1 << 20}
+_DISK_BYTES = {**_BYTES, "GB": 10**9, "GiB": 1 << 30}
 _BYTES_PER_SECOND = {f"{unit}/s": size for unit, size in _BYTES.items()}
 _HERTZ = re.compile(r"([0-9]{1,15}(?:\.[0-9]{1,15})?) ?Hz")
 
@@ -41,6 +42,9 @@ MIN_INTERVAL = 10_000_000
 MIN_DATAGRAM = 576
 """Bytes that every IPv4 host takes."""
 
+MIN_DISK_SIZE, MAX_DISK_SIZE = 1 << 20, 1 << 50
+"""Bytes of recordings: a file that is smaller would be begun anew with every few datagrams."""
+
 LARGEST_DATAGRAM = 65_507
 """Bytes that one UDP datagram over IPv4 can carry."""
 
@@ -60,6 +64,16 @@ def parse_coalesce(text: str) -> int:
 def parse_size(text: str) -> int:
     """`4MiB` or `64kB` as bytes."""
     return _exact(text, _BYTES, "bytes", MAX_SIZE)
+
+
+def parse_disk_size(text: str) -> int:
+    """`4GiB` as bytes of files."""
+    return _exact(text, _DISK_BYTES, "bytes", MAX_DISK_SIZE, MIN_DISK_SIZE)
+
+
+def parse_patience(text: str) -> int:
+    """`5s` as nanoseconds, or `never` as 0."""
+    return 0 if text == "never" else parse_duration(text)
 
 
 def parse_datagram_size(text: str) -> int:

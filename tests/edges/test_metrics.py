@@ -8,12 +8,15 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from typing import cast
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from router.compiler.books import HISTOGRAM_BOUNDS_NS, METRICS, Books
-from router.edges.metrics import BooksCollector, MetricsServer
+from router.edges.http import HttpServer
+from router.edges.metrics import BooksCollector
+from router.edges.running import Running
 from router.errors import SourceSpan, StartError
 from router.table.model import Address
 
@@ -22,6 +25,7 @@ LOOPBACK = Address("127.0.0.1", 0)
 LABELS = {
     "listener": "rover",
     "reason": "stale",
+    "result": "ok",
     "payload_case": "imu_info",
     "route": "imu_info",
     "source": "sensor_board",
@@ -66,7 +70,7 @@ def scraped() -> Iterator[Scraped]:
     threads = [books.fresh_counts(), books.fresh_counts()]
     result = Scraped(slots, threads, 0, LOOPBACK)
     collector = BooksCollector(books, threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD)
-    with closing(MetricsServer(LOOPBACK, SPAN, collector)) as server:
+    with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), None)) as server:
         result.address = server.address
         yield result
 
@@ -133,4 +137,4 @@ def test_an_address_in_use_is_refused_with_who_has_it() -> None:
     with socket.create_server(LOOPBACK) as other:
         taken = Address(*other.getsockname())
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: metrics cannot be served at {taken}: .*\(pid \d+\)"):
-            MetricsServer(taken, SPAN, BooksCollector(Books(), [[]], {}, BUILD))
+            HttpServer(taken, SPAN, cast("Running", BooksCollector(Books(), [[]], {}, BUILD)), None)

@@ -5,22 +5,26 @@ from __future__ import annotations
 import gc
 import resource
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from prometheus_client.metrics_core import Metric as Family
+
 from router.compiler.program import Program
-from router.compiler.topics import resolved
+from router.compiler.topics import DIAGNOSTICS, resolved
 from router.edges.background import background_threads
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
 from router.edges.log import logger
-from router.edges.metrics import Asked, BooksCollector, MetricsServer
-from router.edges.receiver import ReceiveThread
+from router.edges.metrics import Asked, BooksCollector
+from router.edges.mirror import Mirror
+from router.edges.receiver import Receive, ReceiveThread
 from router.edges.reports import Reporter
+from router.edges.running import ReloadResult
 from router.edges.timekeeper import Timekeeper
 from router.edges.udp import Listener, Sender
 from router.engine import MAX_DATAGRAM, Engine, OutboundEngine
@@ -28,6 +32,7 @@ from router.engine.binding import Guarded, Outlets
 from router.engine.deadman import Deadman, Feed, feeder
 from router.engine.pacing import Pacer
 from router.errors import StartError
+from router.runtime.companions import Companions
 from router.table.model import Address
 
 if TYPE_CHECKING:
@@ -54,10 +59,16 @@ class Router:
     def __init__(self, program: Program, ros_args: Sequence[str] = ()) -> None:
         self.program = program
         self.listeners: dict[str, Listener] = {}
-        self.metrics_address: Address | None = None
+        self.is_ready = False
         self._kernel_drops: dict[str, Callable[[], int]] = {}  # by listener, and by gateway that receives datagrams
         self._counts: list[list[int]] = []  # one for each thread that counts
         self._ros_args = ros_args
+        self._reporter = Reporter()
+        self._receivers: dict[str, Receive] = {}
+        self._receiving: ReceiveThread | None = None
+        self.mirror = Mirror(MAX_DATAGRAM, self._rewire, self._reporter.failed)
+        self._companions = Companions(self)
+        self._collector: BooksCollector | None = None
         self._open_edges = ExitStack()
 
     def __enter__(self) -> Router:
@@ -66,6 +77,7 @@ class Router:
                 start = self._open(opening)
             start()
             self._open_edges = opening.pop_all()
+        self.is_ready = True
         program = self.program
         logger.info(
             "router started",
@@ -82,6 +94,7 @@ class Router:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self.is_ready = False
         logger.info("router stopping")
         self._open_edges.close()
         logger.info("router stopped", **self.totals())
@@ -96,13 +109,51 @@ class Router:
         totals = {metric: self.total(metric) for metric in _TOTALS}
         return totals | {"kernel_drops": sum(dropped() for dropped in self._kernel_drops.values())}
 
+    @property
+    def metrics_address(self) -> Address | None:
+        """Where HTTP is answered, with the port that the kernel chose for port 0."""
+        return self._companions.http_address
+
+    def progress(self) -> int:
+        assert self._receiving is not None  # noqa: S101 - it is asked when it has started
+        return self._receiving.turns + self.total("datagrams_received")
+
+    def collect(self) -> Iterator[Family]:
+        assert self._collector is not None  # noqa: S101 - it is asked when it has started
+        return self._collector.collect()
+
+    def samples(self) -> Iterator[tuple[str, dict[str, str], float]]:
+        return ((sample.name, sample.labels, sample.value) for family in self.collect() for sample in family.samples)
+
+    def reload(self) -> ReloadResult:
+        raise NotImplementedError
+
+    def save_recording(self, reason: str) -> None:
+        """Saves the last datagrams, where the table keeps them; what comes of it is logged."""
+        self._companions.save_recording(reason)
+
+    def _rewire(self) -> None:
+        """Somebody began or ceased to watch what is received."""
+        if self._receiving is not None:
+            self._receiving.give_to(self._teed())
+
+    def _teed(self) -> dict[str, Receive]:
+        return {name: self.mirror.tee(name, receive) for name, receive in self._receivers.items()}
+
+    def _deadman_changed(self, route: str, active: bool) -> None:
+        self._reporter.deadman_changed(route, active)
+        if active:
+            self._companions.deadman_tripped(route)
+
     def _open(self, opening: ExitStack) -> Callable[[], None]:
         """Opens everything, and returns what starts receiving. `opening` closes in the opposite order.
 
         Receiving ends first, then open frames, then what waits to be sent; a deadman has the last word.
         """
-        program = self.program
-        reporter = Reporter()
+        program, reporter = self.program, self._reporter
+        own = self._fresh_counts()
+        own[program.books.slot("config_last_reload_successful")] = 1
+        own[program.books.slot("config_last_reload_timestamp_seconds")] = wall_ns()
         opening.callback(reporter.close)
         self._open_listeners(opening)
         send = self._open_senders(opening)
@@ -121,17 +172,17 @@ class Router:
             wall_ns=wall_ns,
             pacing=Guarded(self._fresh_counts(), pacing.guard),
             collecting=Guarded(self._fresh_counts(), collecting.guard),
-            feed=(feed := feeder(self._deadmen(send, ros, reporter), deadman.guard)),
+            feed=(feed := feeder(self._deadmen(send, ros), deadman.guard)),
             publish_errors=ros.publish_errors if ros else (),
             pacers=self._pacers(pacing, send),
         )
         inbound = Engine(program, outlets, {name: listener.arrived_at for name, listener in self.listeners.items()})
         outbound = OutboundEngine(program, replace(outlets, counts=self._fresh_counts()))
-        receive = {name: inbound.receiver(name) for name in self.listeners}
+        self._receivers = {name: inbound.receiver(name) for name in self.listeners}
         subscribed = ros.subscribed if ros else ()
-        receiving = ReceiveThread(
+        receiving = self._receiving = ReceiveThread(
             list(self.listeners.values()),
-            receive,
+            self._receivers,
             MAX_DATAGRAM,
             lambda: FOR_SUBSCRIBERS if subscribed else FOR_SOCKETS,
             reporter.failed,
@@ -141,7 +192,9 @@ class Router:
         if gateways is not None:
             opening.callback(gateways.stop)
             self._kernel_drops.update(gateways.kernel_drops)
-        self._open_metrics(opening, gateways)
+        self._collector = self._new_collector(gateways)
+        self._companions.open(opening, ros.publish.get(DIAGNOSTICS) if ros else None)
+        opening.callback(self.mirror.close)
 
         def start() -> None:
             for keeper in keepers:
@@ -190,6 +243,8 @@ class Router:
         for gateway in table.gateways.values():
             for inbound in gateway.inbound:
                 spans[resolved(inbound.topic.topic.value, table.node)] = inbound.topic.topic.span
+        if table.node.diagnostics is not None:
+            spans[DIAGNOSTICS] = table.node.diagnostics
         ros = RosEdge(
             table.node,
             program.publishers,
@@ -218,9 +273,7 @@ class Router:
 
         return incompatible
 
-    def _deadmen(
-        self, send: Mapping[str, Callable[[bytes], int]], ros: RosEdge | None, reporter: Reporter
-    ) -> dict[str, Deadman]:
+    def _deadmen(self, send: Mapping[str, Callable[[bytes], int]], ros: RosEdge | None) -> dict[str, Deadman]:
         """By route; those of what gateways let in send to topics."""
         program, counts = self.program, self._fresh_counts()
         inbound = [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
@@ -229,7 +282,7 @@ class Router:
             **({topic: _sender(ros, topic) for plan in inbound for topic, _ in plan.datagrams} if ros else {}),
         }
         return {
-            plan.route: Deadman(plan, program.books, counts, outlets, reporter.report, reporter.deadman_changed)
+            plan.route: Deadman(plan, program.books, counts, outlets, self._reporter.report, self._deadman_changed)
             for plan in (*program.deadmen, *inbound)
         }
 
@@ -259,26 +312,22 @@ class Router:
             return lambda: gateways.clients(value) if gateways else ()
 
         return {
+            "mirror_dropped": lambda: [((), self.mirror.lost)],
+            **self._companions.asked(),
             "kernel_drops": lambda: (((name,), dropped()) for name, dropped in self._kernel_drops.items()),
             "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),
             "gateway_client_sent": of_clients(lambda client: client.sent),
             "gateway_client_dropped": of_clients(lambda client: client.dropped),
         }
 
-    def _open_metrics(self, opening: ExitStack, gateways: GatewayThread | None) -> None:
-        program, settings = self.program, self.program.table.metrics
-        if settings is None:
-            return
+    def _new_collector(self, gateways: GatewayThread | None) -> BooksCollector:
+        program = self.program
         build = {
             "version": _version(),
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
         }
-        server = MetricsServer(
-            settings.value, settings.span, BooksCollector(program.books, self._counts, self._asked(gateways), build)
-        )
-        opening.callback(server.close)
-        self.metrics_address = server.address
+        return BooksCollector(program.books, self._counts, self._asked(gateways), build)
 
 
 def _sender(ros: RosEdge, topic: str) -> Callable[[bytes], int]:

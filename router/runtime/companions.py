@@ -1,0 +1,75 @@
+"""What surrounds a running router and does no routing: recordings, HTTP, diagnostics, Foxglove.
+
+Opens what a table asks for. Knows what belongs together, and does no work itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from router.edges.log import logger
+from router.edges.metrics import Asked
+from router.edges.running import Running
+from router.table.model import Address
+
+if TYPE_CHECKING:
+    from router.edges.recorder import Recorder
+
+
+class Companions:
+    """`open` opens them, before anything is received; each closes with what it was opened in. Raises StartError."""
+
+    def __init__(self, running: Running) -> None:
+        self.http_address: Address | None = None
+        self._running = running
+        self._recorder: Recorder | None = None
+
+    def open(self, opening: ExitStack, publish_diagnostics: Callable[[bytes], None] | None) -> None:
+        """`publish_diagnostics` takes CDR bytes; None where the table asks for no diagnostics."""
+        running, table = self._running, self._running.program.table
+        if table.record is not None:
+            from router.edges.recorder import Recorder
+
+            self._recorder = Recorder(running, table.record)
+            opening.callback(self._recorder.close)
+        if table.foxglove is not None:
+            from router.edges.foxglove import FoxgloveServer
+
+            opening.callback(FoxgloveServer(table.foxglove, running).close)
+        if publish_diagnostics is not None:
+            from router.edges.diagnostics import Diagnostics
+
+            opening.callback(Diagnostics(running, publish_diagnostics).close)
+        if table.metrics is not None:
+            from router.edges.http import HttpServer
+
+            save = self._recorder.save if self._recorder and table.record and table.record.last else None
+            server = HttpServer(table.metrics.value, table.metrics.span, running, save)
+            opening.callback(server.close)
+            self.http_address = server.address
+
+    def asked(self) -> Mapping[str, Asked]:
+        """Series that they count themselves."""
+
+        def recorded(metric: str) -> Asked:
+            return lambda: self._recorder.asked()[metric]() if self._recorder else ()
+
+        return {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}
+
+    def deadman_tripped(self, route: str) -> None:
+        """Called where a deadman acts: what takes time is done elsewhere."""
+        if self._recorder is not None:
+            self._recorder.deadman_tripped(route)
+
+    def save_recording(self, reason: str) -> None:
+        if self._recorder is None:
+            logger.warning("nothing to save: the table has no 'record: {last: ...}'")
+            return
+        from router.edges.recorder import RecordError
+
+        try:
+            self._recorder.save(reason)
+        except RecordError as error:
+            logger.error("the last datagrams could not be saved", problem=str(error))
