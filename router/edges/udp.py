@@ -12,9 +12,10 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from router.compiler.program import ListenerPlan, SenderPlan
+from router.edges.inherited import inherited
 from router.edges.log import logger
 from router.edges.port_holder import port_holder
-from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops
+from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops, receive_buffer
 from router.errors import SourceSpan, StartError
 from router.table.model import Address
 
@@ -24,16 +25,24 @@ the address that the socket sends from."""
 
 
 class Listener:
-    """A bound socket. Opening raises StartError, which says where in the table and what to do."""
+    """A bound socket. Opening raises StartError, which says where in the table and what to do.
+
+    Where this process was handed one with the listener's address, it is that one. Then what is not taken from it waits
+    for the next process, and what the kernel dropped was perhaps dropped before this one began.
+    """
 
     def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
         self.name = plan.name
         self.coalesce = plan.coalesce
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        handed = inherited().take(plan.address)
+        self.is_inherited = handed is not None
+        self.socket = handed or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
-            self.socket.bind(plan.address)
-            _want_receive_buffer(self.socket, plan)
+            if handed is None:
+                # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
+                self.socket.bind(plan.address)
+            if handed is None or receive_buffer(handed) < plan.receive_buffer:
+                _want_receive_buffer(self.socket, plan)
             self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
@@ -48,9 +57,13 @@ class Listener:
     def end_input(self) -> None:
         """Lets nothing new in. What has arrived can still be received; after it comes the end, peer None.
 
+        One that was inherited stays as it is, for whoever has it next: its receiver has to let go of it by himself.
+
         A socket that is connected to itself takes nothing from others, so that a flood cannot keep the
         receiver busy for ever; shutting down then wakes a receiver that waits.
         """
+        if self.is_inherited:
+            return
         host, port = self.address
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)  # or one that has a broadcast address may not
         # An interface may have lost the address meanwhile: then nothing comes in, and shutting down wakes all the same.

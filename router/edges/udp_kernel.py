@@ -45,11 +45,16 @@ def drops(opened: socket.socket) -> int:
 def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
     """Asks for `size` bytes, past the system's limit where that is allowed. Returns how many were granted."""
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
-    # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
-    if (granted := opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2) >= size:
+    if (granted := receive_buffer(opened)) >= size:
         return granted
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, size)
     except PermissionError:
         return granted
     return size
+
+
+def receive_buffer(opened: socket.socket) -> int:
+    """Its size in bytes, as it is asked for."""
+    # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
+    return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
