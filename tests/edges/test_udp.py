@@ -6,6 +6,7 @@ import errno
 import os
 import queue
 import socket
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -121,6 +122,48 @@ def test_stop_handles_what_has_arrived_and_ends(several: list[Listener], peer: s
     receiving.thread.start()
     receiving.thread.stop()
     assert receiving.all_received() == sent
+
+
+def test_what_is_called_can_be_replaced_between_two_datagrams(several: list[Listener], peer: socket.socket) -> None:
+    receiving = Receiving(several)
+    receiving.thread.start()
+    peer.sendto(b"old", several[0].address)
+    assert receiving.got.get(timeout=5)[1] == b"old"
+    new: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    receiving.thread.give_to({listener.name: lambda data, _: new.put(data) for listener in several})
+    peer.sendto(b"new", several[0].address)
+    assert new.get(timeout=5) == b"new"
+    receiving.thread.stop()
+    assert receiving.got.empty()
+
+
+def test_a_task_runs_on_the_thread_and_raises_where_it_was_asked_for(several: list[Listener]) -> None:
+    receiving = Receiving(several)
+    ran: list[str] = []
+
+    def task() -> None:
+        ran.append(threading.current_thread().name)
+        raise LookupError("a bug")
+
+    for _ in range(2):
+        with pytest.raises(LookupError, match="a bug"):
+            receiving.thread.between(task)
+        receiving.thread.start() if len(ran) == 1 else None
+    receiving.thread.stop()
+    with pytest.raises(LookupError, match="a bug"):
+        receiving.thread.between(task)
+    assert [name == "receive" for name in ran] == [False, True, False]
+
+
+def test_turns_go_on_while_nothing_comes(several: list[Listener]) -> None:
+    receiving = Receiving(several)
+    receiving.thread.start()
+    before, deadline = receiving.thread.turns, monotonic() + 5
+    while receiving.thread.turns < before + 3:
+        assert monotonic() < deadline
+        sleep(0.05)
+    receiving.thread.stop()
+    assert receiving.failures.empty()
 
 
 def test_a_flood_is_received_whole_and_in_order_and_nobody_else_waits_for_its_end(

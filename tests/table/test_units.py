@@ -8,9 +8,11 @@ from router.table.units import (
     parse_coalesce,
     parse_data_rate,
     parse_datagram_size,
+    parse_disk_size,
     parse_duration,
     parse_interval,
     parse_message_size,
+    parse_patience,
     parse_period,
     parse_rate,
     parse_size,
@@ -121,3 +123,17 @@ def test_an_interval_and_sizes_of_messages_have_bounds() -> None:
 def test_what_means_nothing_is_refused(parse: Callable[[object], object], text: object) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         parse(text)
+
+
+@pytest.mark.parametrize(("text", "size"), [("4GiB", 4 << 30), ("1.5 GB", 1_500_000_000), ("1MiB", 1 << 20)])
+def test_sizes_of_files_are_exact(text: str, size: int) -> None:
+    assert parse_disk_size(text) == size
+
+
+def test_a_file_has_at_least_a_mebibyte() -> None:
+    with pytest.raises(ValueError, match="at least 1048576"):
+        parse_disk_size("10kB")
+
+
+def test_patience_may_have_no_end() -> None:
+    assert (parse_patience("5s"), parse_patience("never")) == (5 * 10**9, 0)
