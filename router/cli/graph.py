@@ -1,0 +1,60 @@
+"""`router graph [TABLE] -o FILE`: what a table routes, as a picture or as text that other programs draw."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
+from router.cli.findings import print_findings
+
+if TYPE_CHECKING:
+    from router.table.model import RouteTable
+
+SUFFIXES = (".svg", ".mmd", ".dot")
+_DESCRIPTION = """Draw who sends which payload cases, and where each goes: an SVG that any browser shows, light or dark
+as the viewer likes, with addresses, types and conditions under the pointer; or text for Mermaid (.mmd) or Graphviz
+(.dot)."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser("graph", help=VERBS["graph"], description=_DESCRIPTION)
+    parser.add_argument(
+        "table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help="route table (default: %(default)s)"
+    )
+    what = f"what to write; its name ends in {', '.join(SUFFIXES)}"
+    parser.add_argument("-o", "--output", type=_output, required=True, metavar="FILE", help=what)
+
+
+def _output(text: str) -> Path:
+    path = Path(text)
+    if path.suffix not in SUFFIXES:
+        raise argparse.ArgumentTypeError(f"'{text}' does not end in {', '.join(SUFFIXES)}")
+    return path
+
+
+def run(args: argparse.Namespace) -> int:
+    from router.compiler import check_table
+
+    checked = check_table(args.table)
+    print_findings(checked.diagnostics, sys.stderr)
+    if checked.has_errors or checked.table is None:
+        return BAD_TABLE
+    try:
+        args.output.write_text(_drawn(checked.table, args.output.suffix), encoding="utf-8")
+    except OSError as error:
+        print(f"router graph: {args.output} cannot be written: {error.strerror}", file=sys.stderr)
+        return BAD_USAGE
+    return OK
+
+
+def _drawn(table: RouteTable, suffix: str) -> str:
+    from router.edges.route_map import route_map
+    from router.edges.route_map_svg import STYLE, svg
+    from router.tools.graph_text import dot, mermaid
+
+    if suffix == ".svg":
+        return svg(route_map(table), table.path.name, STYLE)
+    return dot(table, table.path.name) if suffix == ".dot" else mermaid(table)

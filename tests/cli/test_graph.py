@@ -1,0 +1,41 @@
+"""`router graph` writes what the suffix says, and nothing of a table that is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.assets import asset
+from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+
+ROVER = asset("routes") / "rover.yaml"
+
+
+@pytest.mark.parametrize(
+    ("suffix", "beginning"), [(".svg", "<svg "), (".mmd", "flowchart LR\n"), (".dot", 'digraph "rover.yaml" {\n')]
+)
+def test_the_suffix_chooses_what_is_written(tmp_path: Path, suffix: str, beginning: str) -> None:
+    output = tmp_path / f"routes{suffix}"
+    assert main(["graph", str(ROVER), "-o", str(output)]) == OK
+    assert output.read_text(encoding="utf-8").startswith(beginning)
+
+
+def test_another_suffix_is_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["graph", str(ROVER), "-o", "routes.png"])
+    assert ended.value.code == BAD_USAGE
+    assert "'routes.png' does not end in .svg, .mmd, .dot" in capsys.readouterr().err
+
+
+def test_a_wrong_table_is_not_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text("version: 2\n")
+    assert main(["graph", str(table), "-o", str(tmp_path / "x.svg")]) == BAD_TABLE
+    assert "error[" in capsys.readouterr().err
+    assert not (tmp_path / "x.svg").exists()
+
+
+def test_a_file_that_cannot_be_written_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["graph", str(ROVER), "-o", str(tmp_path / "no" / "x.svg")]) == BAD_USAGE
+    assert "No such file or directory" in capsys.readouterr().err

@@ -1,0 +1,59 @@
+"""The text for other programs: real `dot` reads it, and names cannot break out of their quotation marks."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from router.assets import asset
+from router.compiler import check_table
+from router.edges.route_map_parts import map_parts
+from router.table.model import RouteTable
+from router.tools.graph_text import dot, mermaid
+
+DOT = shutil.which("dot")
+HOSTILE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen: {{all: {{address: "127.0.0.1:5000"}}}}
+endpoints: {{a: {{address: "127.0.0.1:6000", kind: tool}}}}
+routes:
+  imu_info:
+    source: any
+    destinations: [{{endpoint: a, when: "str(state) != '\\"#<b>|\\\\\\\\'", max_rate: 5 Hz}}]
+"""
+
+
+@pytest.fixture(params=["rover.yaml", "legacy.yaml", "sim.yaml", "hostile"])
+def table(request: pytest.FixtureRequest, tmp_path: Path) -> RouteTable:
+    path = asset("routes") / request.param
+    if request.param == "hostile":
+        path = tmp_path / "hostile.yaml"
+        path.write_text(HOSTILE.format(protos=asset("protos")))
+    table = check_table(path).table
+    assert table is not None
+    return table
+
+
+@pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")
+def test_dot_draws_every_part_and_tie(table: RouteTable) -> None:
+    text = dot(table, 'with "quotes" \\')
+    drawn = subprocess.run([str(DOT), "-Tplain"], input=text, capture_output=True, text=True, check=True)
+    parts, ties = map_parts(table)
+    assert drawn.stderr == ""
+    assert drawn.stdout.count("\nnode ") == len(parts)
+    assert drawn.stdout.count("\nedge ") == len(ties)
+
+
+def test_mermaid_has_a_line_for_every_part_and_tie(table: RouteTable) -> None:
+    parts, ties = map_parts(table)
+    lines = mermaid(table).splitlines()
+    assert lines[0] == "flowchart LR"
+    nodes = [line for line in lines if re.fullmatch(r'    n\d+(\[|\(\(|\(\[)"[^"]*"(\]|\)\)|\]\))', line)]
+    links = [line for line in lines if re.fullmatch(r'  n\d+ -->(\|"[^"#<>]*"\|)? n\d+', line)]
+    assert (len(nodes), len(links)) == (len(parts), len(ties))
+    assert len(lines) == 1 + 2 * 3 + len(parts) + len(ties)
