@@ -18,7 +18,9 @@ from router.compiler.books import (
     GATEWAY_REJECT_REASONS,
     HISTOGRAM_BOUNDS_NS,
     METRICS,
+    RECORD_DROP_REASONS,
     REJECT_REASONS,
+    RELOAD_RESULTS,
     TOPIC_STATES,
 )
 from router.compiler.functions import FUNCTIONS
@@ -39,6 +41,9 @@ its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clie
 For what is not published of that, the reasons are those of routes. A deadman of a topic that is let in has gateway and
 topic for its route: `vr_headset:/cmd_vel`. Requests for schemas that are answered are datagrams received, and neither
 rejected nor accepted. [Gateways](gateway.md#metrics) has how these books balance."""
+_OWN = """\
+[Recordings](recording.md) and taps get datagrams beside routing: what they miss is counted here, and in no other books.
+A reload keeps all counters: the series of a route that is gone stays as long as the process, if it counted anything."""
 _LOG = """\
 The log writes the first drop of a kind (route, target, reason) at once, then at most a line in 10 s. That line shows
 the last one, and how many there were: `more`, in the `in_seconds` before the line. So a flood may have ended when its
@@ -82,6 +87,12 @@ def metrics_page() -> str:
         *_reasons("router_messages_dropped_total", GATEWAY_DROP_REASONS),
         *_reasons("router_client_messages_dropped_total", CLIENT_DROP_REASONS),
         *_reasons("router_gateway_topics", TOPIC_STATES, "state"),
+        "## Recordings and reloads",
+        "",
+        fill(_OWN, WIDTH),
+        "",
+        *_reasons("router_record_dropped_total", RECORD_DROP_REASONS),
+        *_reasons("router_config_reloads_total", RELOAD_RESULTS, "result"),
         "## Log and time",
         "",
         fill(_LOG, WIDTH),
