@@ -17,6 +17,7 @@ from router.engine.limiter import RateLimit
 from router.engine.machine import Guard
 from router.engine.outcome import MAPPING_FAILURES, FrameOutcome, Outcome, Report
 from router.engine.pacing import Pacer
+from router.engine.state import State
 from router.table.model import Keep
 
 Handle = Callable[..., None]
@@ -39,7 +40,8 @@ class Outlets:
     and may raise `publish_errors`. `wanted` says by topic whether anybody listens, in a list of one that
     its owner keeps up to date. `report` hears of every loss; it is called only for those. `counts` belong to the
     thread that calls the handlers. `feed` makes what tells deadmen of a route's commands (see engine.deadman).
-    `pacers` are those of the endpoints with a budget, served by `pacing`; `collecting` serves frames. Clocks in ns.
+    `pacers` are those of the endpoints with a budget, served by `pacing`; `collecting` serves frames. `state` has what
+    handlers remember. Clocks in ns.
     """
 
     counts: list[int]
@@ -54,6 +56,7 @@ class Outlets:
     feed: Callable[[str, Sequence[str]], Feed]
     publish_errors: tuple[type[Exception], ...] = ()
     pacers: Mapping[str, Pacer] = field(default_factory=dict)
+    state: State = field(default_factory=State)
 
 
 def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness) -> Handle:
@@ -67,20 +70,21 @@ def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness)
     if handler.collect_timeout is not None:
         namespace["collect"] = _collect(handler, handler.collect_timeout, books, outlets)
     for target in handler.targets:
-        namespace |= _bound(target, handler.route, books, outlets)
+        namespace |= _bound(target, handler, books, outlets)
     exec(handler.code, namespace)  # noqa: S102 - code that our compiler made of a checked table
     handle: Handle = namespace[handler.function]
     return handle
 
 
-def _bound(target: TargetPlan, route: str, books: Books, outlets: Outlets) -> dict[str, Any]:
-    name = target.name
+def _bound(target: TargetPlan, handler: Handler, books: Books, outlets: Outlets) -> dict[str, Any]:
+    name, route = target.name, handler.route
+    place = route, handler.topic, target
     bound: dict[str, Any] = {f"lost_{name}": Outcome(books, outlets.counts, route, target, outlets.report).failed}
     if target.is_topic:
         bound[f"wanted_{name}"] = outlets.wanted[target.target]
     if target.is_deferred:
         outcome = Outcome(books, outlets.pacing.counts, route, target, outlets.report)
-        bound[f"deliver_{name}"] = _deliver(target, outcome, outlets)
+        bound[f"deliver_{name}"] = _deliver(place, outcome, outlets)
     elif target.is_topic:
         bound[f"publish_{name}"] = outlets.publish[target.target]
     else:
@@ -88,33 +92,44 @@ def _bound(target: TargetPlan, route: str, books: Books, outlets: Outlets) -> di
     if target.deadmen:
         bound[f"feed_{name}"] = outlets.feed(route, target.deadmen)
     if target.max_rate is not None and target.keep is Keep.FIRST:
-        bound[f"limit_{name}"] = RateLimit(target.max_rate).may_pass
+        rate = target.max_rate
+        bound[f"limit_{name}"] = outlets.state.keep(("limit", *place), lambda: RateLimit(rate)).may_pass
     return bound
 
 
 def _collect(handler: Handler, timeout: int, books: Books, outlets: Outlets) -> Callable[..., list[object] | None]:
     counts = outlets.collecting.counts
-    outcomes = [
-        FrameOutcome(books, counts, handler.route, target, outlets.report)
-        for target in handler.targets
-        if target.is_topic
-    ]
-    collector = Collector(timeout, outcomes)
-    return outlets.collecting.guard(collector, collector.offer)
+    targets = tuple(target for target in handler.targets if target.is_topic)
+
+    def collector() -> Collector:
+        outcomes = [FrameOutcome(books, counts, handler.route, target, outlets.report) for target in targets]
+        return Collector(timeout, outcomes)
+
+    parts = handler.case.message_class  # those of another one would not make a frame with them
+    kept = outlets.state.keep(("collect", handler.route, timeout, parts, targets), collector)
+    return outlets.collecting.guard(kept, kept.offer)
 
 
-def _deliver(target: TargetPlan, outcome: Outcome, outlets: Outlets) -> Deliver:
+Place = tuple[str, "str | None", TargetPlan]
+"""A target of a route, for one of the topics that it comes from."""
+
+
+def _deliver(place: Place, outcome: Outcome, outlets: Outlets) -> Deliver:
     """Through what holds the target's messages back, to where they go and are counted."""
-    guard = outlets.pacing.guard
+    target, guard = place[-1], outlets.pacing.guard
+    end: object  # where they go, whatever is between
     pacer = None if target.is_topic else outlets.pacers.get(target.target)
     if pacer is not None:
-        deliver = pacer.queue(target.priority, outcome)
+        end, deliver = pacer, pacer.queue(target.priority, outcome)
     elif target.is_topic:
-        deliver = immediately(outlets.publish[target.target], outcome, outlets.publish_errors)
+        end = publish = outlets.publish[target.target]
+        deliver = immediately(publish, outcome, outlets.publish_errors)
     else:
-        deliver = immediately(outlets.send[target.target], outcome)
+        end = send = outlets.send[target.target]
+        deliver = immediately(send, outcome)
     if target.keep is Keep.LATEST and target.max_rate is not None:
-        latest = Latest(target.max_rate, deliver, outcome)
+        rate = target.max_rate
+        latest = outlets.state.keep(("latest", *place, end), lambda: Latest(rate, deliver, outcome))
         return guard(latest, latest.offer)
     assert pacer is not None  # noqa: S101 - the other reason to defer
     return guard(pacer, deliver)

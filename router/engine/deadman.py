@@ -76,6 +76,19 @@ class Deadman:
         self.next_due = None
         self._release()
 
+    def inherit(self, earlier: Deadman) -> None:
+        """Takes the place of `earlier`, the same route's in another table: armed by the same command, tripped if it was.
+
+        `earlier` keeps the destinations that are not ours, for its last word.
+        """
+        ours = {(each.endpoint, each.send) for each in self._destinations}
+        earlier._destinations = [each for each in earlier._destinations if (each.endpoint, each.send) not in ours]
+        if earlier.next_due is None or self.next_due is not None:
+            return
+        self._tripped = earlier._tripped
+        later = 0 if self._tripped else self._plan.timeout - earlier._plan.timeout
+        self.next_due = earlier.next_due + later
+
     def due(self, now: int) -> None:
         due, repeat = self.next_due, self._plan.repeat
         if due is None or now < due:
@@ -96,6 +109,10 @@ class Deadman:
         if self.next_due is not None:
             self.next_due = None
             self._send()
+
+    @property
+    def route(self) -> str:
+        return self._plan.route
 
     def _release(self) -> None:
         if self._tripped:

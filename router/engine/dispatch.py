@@ -56,7 +56,7 @@ class Engine:
         self._outlets = outlets
         self._counts = outlets.counts
         self._arrived_at = arrived_at
-        self._freshness = Freshness()
+        self._freshness = outlets.state.keep("freshness of datagrams", Freshness)
         by_host, self._by_address = recognisers(program.table.endpoints)
         self._addresses: list[tuple[object, str]] = [*by_host.items(), *self._by_address.items()]
         self._handles = {

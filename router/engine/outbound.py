@@ -28,7 +28,7 @@ class OutboundEngine:
     def __init__(self, program: Program, outlets: Outlets) -> None:
         self._program = program
         self._outlets = outlets
-        self._freshness = Freshness()
+        self._freshness = outlets.state.keep("freshness of ROS messages", Freshness)
 
     def taker(self, topic: str) -> Take:
         """The function that takes one topic's messages: CDR bytes, and when the middleware got them (wall clock, ns).
