@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import base64
 import re
-from hashlib import sha256
 from http import HTTPStatus
 
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from router.edges.page_policy import page_policy
+
 _HOST = re.compile(r"[A-Za-z0-9.:\[\]-]+")
 _LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
 """Addresses, and names that nobody can register for the whole internet."""
-_INLINE = re.compile(rb"<(script|style)[^>]*>(.*?)</\1>", re.DOTALL)
 
 
 class Page:
@@ -22,7 +21,7 @@ class Page:
 
     def __init__(self, html: bytes) -> None:
         self._html = html
-        self._policy = _policy(html)
+        self._policy = page_policy(html)
 
     def answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """What is answered to a request; None goes on to a websocket."""
@@ -61,15 +60,3 @@ def _is_from_elsewhere(headers: Headers) -> bool:
     hosts = [host.lower() for host in headers.get_all("Host")]
     origins = [origin.lower().partition("://")[2] for origin in headers.get_all("Origin")]
     return any([origin] != hosts or not _LOCAL.fullmatch(origin) for origin in origins)
-
-
-def _policy(page: bytes) -> str:
-    """What a browser lets the page do: run what is written in it, and nothing else."""
-    sources: dict[bytes, list[str]] = {b"script": [], b"style": []}
-    for kind, text in _INLINE.findall(page):
-        sources[kind].append(f"'sha256-{base64.b64encode(sha256(text).digest()).decode()}'")
-    scripts, styles = (" ".join(hashes) or "'none'" for hashes in sources.values())
-    return (
-        f"default-src 'none'; script-src {scripts}; style-src {styles}; img-src data:; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )

@@ -1,0 +1,35 @@
+"""Who may have a running router do something, or hand out what it receives: programs on the same computer.
+
+Knows addresses and headers only. Metrics and the status page are for everybody who can reach them.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from email.message import Message
+
+_BY_BROWSERS = ("Origin", "Sec-Fetch-Site", "Sec-Fetch-Mode")
+
+
+def refusal(peer: str, own: str, headers: Message) -> str | None:
+    """Why a caller at IP address `peer`, who reached us at `own`, is turned away; None where he is not.
+
+    A browser would call for any page that is open in it, and a name may have been made to lead here only after that
+    page was loaded (DNS rebinding): so no browsers, and no names.
+    """
+    if not ipaddress.ip_address(peer).is_loopback and peer != own:
+        return f"only from the router's own computer, not from {peer}"
+    if any(headers.get(name) for name in _BY_BROWSERS):
+        return "not for browsers: use the command line"
+    if not _is_plain(headers.get("Host", "")):
+        return "only by an IP address or localhost, not by a name"
+    return None
+
+
+def _is_plain(host: str) -> bool:
+    name = host.rpartition(":")[0] if ":" in host else host
+    try:
+        ipaddress.IPv4Address(name)
+    except ValueError:
+        return name == "localhost"
+    return True

@@ -1,0 +1,112 @@
+"""The newest datagram of each payload case, while somebody looks: for a page, not for a record.
+
+Knows the mirror and the envelope. Decodes when it is asked, and only what has come since.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from time import monotonic
+from typing import Any
+
+from google.protobuf.json_format import MessageToDict
+from google.protobuf.message import DecodeError as ProtobufError
+
+from router.compiler.network import recognisers
+from router.compiler.program import Program
+from router.edges.http_tap import first_field
+from router.edges.mirror import Seen
+from router.edges.running import Running
+from router.engine import MAX_DATAGRAM
+from router.engine.framing import restored
+
+LOOKED_AT_SECONDS = 5.0
+"""For so long after it was asked last it watches on; a page asks every second."""
+
+MOST_ELEMENTS = 24
+MOST_CHARACTERS = 200
+
+Value = dict[str, Any]
+
+
+class LastValues:
+    """Costs nothing while nobody asks."""
+
+    def __init__(self, running: Running) -> None:
+        self._running = running
+        self._fresh: dict[int, Seen] = {}
+        self._values: dict[str, Value] = {}
+        self._detach: Callable[[], None] | None = None
+        self._until = 0.0
+        self._lock = threading.Lock()
+        self._taking = threading.Lock()
+        self._closing = threading.Event()
+
+    def of(self, program: Program) -> Mapping[str, Value]:
+        """By payload case: `at` (s), `source`, `bytes`, and its `fields`. Nothing comes before it was asked once."""
+        with self._lock:
+            self._until = monotonic() + LOOKED_AT_SECONDS
+            if self._detach is None and not self._closing.is_set():
+                self._values = {}
+                self._detach = self._running.mirror.attach(self._take)
+                threading.Thread(target=self._end_when_idle, name="last values", daemon=True).start()
+            with self._taking:
+                fresh, self._fresh = self._fresh, {}
+            for seen in fresh.values():
+                self._keep(seen, program)
+            return dict(self._values)
+
+    def close(self) -> None:
+        self._closing.set()
+        with self._lock:
+            self._end()
+
+    def _take(self, batch: Sequence[Seen]) -> None:
+        """Called by the mirror's thread."""
+        with self._taking:
+            for seen in batch:
+                self._fresh[first_field(seen.data)] = seen
+
+    def _keep(self, seen: Seen, program: Program) -> None:
+        try:
+            envelope = program.envelope.message_class.FromString(restored(seen.data, MAX_DATAGRAM))
+        except ProtobufError:
+            return  # the page shows it among what was rejected
+        if (case := envelope.WhichOneof(program.envelope.oneof)) is None:
+            return
+        by_host, by_address = recognisers(program.table.endpoints)
+        host, port = seen.peer
+        fields = MessageToDict(
+            getattr(envelope, case), preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+        )
+        self._values[case] = {
+            "at": seen.at / 1e9,
+            "source": by_address.get(seen.peer) or by_host.get(host) or f"{host}:{port}",
+            "bytes": len(seen.data),
+            "fields": _shortened(fields),
+        }
+
+    def _end_when_idle(self) -> None:
+        while not self._closing.wait(max(0.0, self._until - monotonic())):
+            with self._lock:
+                if self._until <= monotonic():
+                    self._end()
+                    return
+
+    def _end(self) -> None:
+        if self._detach is not None:
+            self._detach()
+            self._detach = None
+
+
+def _shortened(value: Any) -> Any:
+    """Without what nobody reads on a page: the rest of long lists and of long texts."""
+    if isinstance(value, dict):
+        return {key: _shortened(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        left_out = len(value) - MOST_ELEMENTS
+        return [*map(_shortened, value[:MOST_ELEMENTS]), *([f"and {left_out} more"] if left_out > 0 else [])]
+    if isinstance(value, str) and len(value) > MOST_CHARACTERS:
+        return f"{value[:MOST_CHARACTERS]}… ({len(value)} characters)"
+    return value
