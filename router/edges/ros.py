@@ -5,19 +5,19 @@ Knows bytes and topics; what the bytes mean and why they are published is the en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from functools import partial
 
-from rclpy.event_handler import EventHandler
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from router.compiler.program import TopicPlan
-from router.edges.ros_arrivals import RawSubscription
+from router.edges.ros_change import RosChange, hand_over, left_by, opened_beside
 from router.edges.ros_node import RCL_ERRORS, close_node, open_node
-from router.edges.ros_qos import Incompatible, PeerEvents, qos_profile
+from router.edges.ros_opened import Publication, Subscription
+from router.edges.ros_qos import Incompatible, PeerEvents
 from router.edges.ros_threads import EventThread, MessageThread, Receive
 from router.edges.ros_topics import RosTopics
-from router.edges.ros_types import checked_class
 from router.errors import SourceSpan, StartError
 from router.table.model import NodeSettings
 
@@ -29,6 +29,9 @@ class RosEdge:
     anybody listens, or may want it later. `subscribed` has the topics with a subscriber now.
     `incompatible(topic, policy, peers)` is called by a thread of events, from opening on: peers whose QoS does not go
     with ours, so far. Nothing is received before `start`. `topics` are those that the node sees.
+
+    What is open can be replaced: `prepare` opens what is new, `apply` has it used, `finish` closes what is not used
+    any more. Or `abandon` closes what was opened.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
@@ -45,59 +48,31 @@ class RosEdge:
     ) -> None:
         self.publish: dict[str, Callable[[bytes], None]] = {}
         self.wanted: dict[str, list[bool]] = {}
-        self._subscriptions: dict[str, RawSubscription] = {}
+        self._publications: dict[str, Publication] = {}
+        self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
-        classes = {
-            plan.topic: checked_class(plan.type_name, plan.definitions, spans[plan.topic])
-            for plan in (*publishers, *subscriptions)
-        }
-        peers = PeerEvents(incompatible)
-        self.subscribed: Collection[str] = peers.subscribed
-        of_publishers: list[EventHandler] = []
-        of_subscriptions: list[EventHandler] = []
+        self._failed: Callable[[Exception], None] | None = None
+        self._peers = PeerEvents(incompatible)
+        self.subscribed: Collection[str] = self._peers.subscribed
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
             opening.callback(close_node, self._node)
             self.topics = RosTopics(self._node)
-            for plan in publishers:
-                with _refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be published"):
-                    of_publishers += self._open_publisher(plan, classes[plan.topic], peers, opening)
-            for plan in subscriptions:
-                with _refusing(f"{spans[plan.topic]}: topic '{plan.topic}' cannot be subscribed to"):
-                    of_subscriptions += self._open_subscription(plan, classes[plan.topic], peers)
-            thread = EventThread(self._node, of_publishers, of_subscriptions)
-            thread.start()
-            opening.callback(thread.stop)
+            opening.callback(self._close_topics)
+            change = self.prepare(publishers, subscriptions, spans)
+            self._use(change)
+            self._events = self._event_thread()
+            self._events.start()
+            opening.callback(self._stop_events)
             self._open = opening.pop_all()
-
-    def _open_publisher(
-        self, plan: TopicPlan, message: type, peers: PeerEvents, opening: ExitStack
-    ) -> list[EventHandler]:
-        wanted = [plan.qos.serves_late_joiners]
-        callbacks = peers.of_publisher(plan, wanted)
-        publisher = self._node.create_publisher(message, plan.topic, qos_profile(plan.qos), event_callbacks=callbacks)
-        # Publisher.publish() enters the handle and looks at the message's type each time, which doubles its cost.
-        handle = publisher.handle
-        opening.enter_context(handle)
-        self.publish[plan.topic] = handle.publish_raw
-        self.wanted[plan.topic] = wanted
-        return publisher.event_handlers  # type: ignore[no-any-return]
-
-    def _open_subscription(self, plan: TopicPlan, message: type, peers: PeerEvents) -> list[EventHandler]:
-        callbacks = peers.of_subscription(plan)
-        subscription = RawSubscription(self._node, message, plan.topic, qos_profile(plan.qos), callbacks)
-        self._subscriptions[plan.topic] = subscription
-        return subscription.events
 
     def start(self, receive: Mapping[str, Receive], failed: Callable[[Exception], None]) -> None:
         """Calls `receive[topic]` with each message's CDR bytes and the wall clock ns at which it set out.
 
         One thread does that. What it raises goes to `failed`. Raises StartError.
         """
-        if self._subscriptions:
-            with _refusing("ROS messages cannot be received"):
-                self._messages = MessageThread(self._subscriptions, receive, failed)
-            self._messages.start()
+        self._failed = failed
+        self._receive(receive)
 
     def stop_receiving(self) -> None:
         """Lets what has arrived be received, and nothing after that. Publishing goes on."""
@@ -110,10 +85,96 @@ class RosEdge:
         self.stop_receiving()
         self._open.close()
 
+    # -- another table's topics ----------------------------------------------------------------------------------
 
-@contextmanager
-def _refusing(problem: str) -> Iterator[None]:
-    try:
-        yield
-    except RCL_ERRORS as error:
-        raise StartError(f"{problem}: {error}") from error
+    def prepare(
+        self, publishers: Sequence[TopicPlan], subscriptions: Sequence[TopicPlan], spans: Mapping[str, SourceSpan]
+    ) -> RosChange:
+        """Opens what these plans want and what is not open, and nothing else changes. Raises StartError.
+
+        A plan that is the same as before keeps what was opened for it.
+        """
+        with ExitStack() as opening:
+            publications, published = opened_beside(
+                self._publications, publishers, spans, partial(Publication, self._node, self._peers)
+            )
+            for each in published:
+                opening.callback(each.close)
+            kept, subscribed = opened_beside(
+                self._subscriptions, subscriptions, spans, partial(Subscription, self._node, self._peers)
+            )
+            opening.pop_all()
+        for each in published:
+            earlier = self._publications.get(each.plan.topic)
+            if earlier is not None and earlier.wanted[0]:
+                each.meet()
+        return RosChange(publications, kept, [*published, *subscribed])
+
+    def abandon(self, change: RosChange) -> None:
+        """Closes what `prepare` opened."""
+        for opened in change.opened:
+            opened.close()
+
+    def paused(self) -> AbstractContextManager[None]:
+        """No message is received meanwhile; none is lost. Raises StuckError."""
+        return self._messages.paused() if self._messages else nullcontext()
+
+    def apply(self, change: RosChange, receive: Mapping[str, Receive]) -> None:
+        """From now on these are used. To be called while paused; `receive` is as in `start`.
+
+        What has arrived on what is to be closed is received before that, in the way it was until now.
+        """
+        change.left = [
+            *left_by(change.publications, self._publications),
+            *left_by(change.subscriptions, self._subscriptions),
+        ]
+        more = hand_over(self._messages, self._subscriptions, change.subscriptions) if self._messages else ()
+        self._use(change)
+        self._receive(receive)
+        for topic, cdr, sent_at in more:
+            receive[topic](cdr, sent_at)
+
+    def finish(self, change: RosChange) -> None:
+        """Closes what is not used any more: nobody may publish there when this is called."""
+        if change.left or change.opened:
+            self._events.stop()
+            for opened in change.left:
+                opened.close()
+            self._peers.forget_all_but(self._publications)
+            self._events = self._event_thread()
+            self._events.start()
+
+    def _use(self, change: RosChange) -> None:
+        self._publications, self._subscriptions = change.publications, change.subscriptions
+        self.publish.update((topic, each.publish) for topic, each in change.publications.items())
+        self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
+        for topic in self.publish.keys() - change.publications.keys():
+            del self.publish[topic], self.wanted[topic]
+
+    def _receive(self, receive: Mapping[str, Receive]) -> None:
+        if self._messages is None:
+            if not self._subscriptions:
+                return
+            assert self._failed is not None  # noqa: S101 - it has started
+            self._messages = MessageThread(self._failed)
+            self._messages.start()
+        try:
+            self._messages.serve({each.raw: receive[topic] for topic, each in self._subscriptions.items()})
+        except RCL_ERRORS as error:
+            raise StartError(f"ROS messages cannot be received: {error}") from error
+
+    def _event_thread(self) -> EventThread:
+        return EventThread(
+            self._node,
+            [event for each in self._publications.values() for event in each.events],
+            [event for each in self._subscriptions.values() for event in each.events],
+        )
+
+    def _stop_events(self) -> None:
+        self._events.stop()
+
+    def _close_topics(self) -> None:
+        for publication in self._publications.values():
+            publication.close()
+        for subscription in self._subscriptions.values():
+            subscription.close()

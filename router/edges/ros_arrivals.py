@@ -73,6 +73,10 @@ class RawSubscription:
         sent, came_in = info["source_timestamp"], info["received_timestamp"]  # 0 from a middleware that does not tell
         return cdr, min(sent or came_in, came_in or sent) or wall_ns()
 
+    def take_all(self) -> list[tuple[bytes, int]]:
+        """What has arrived, and no more than it holds, however fast they come."""
+        return [message for _ in range(self.capacity) if (message := self.take())]
+
     def announce_to(self, eventfd: int | None) -> None:
         """Has the middleware add the number of new messages to `eventfd`, or to nothing from now on.
 
@@ -99,24 +103,38 @@ class Arrivals:
     def __init__(self, subscriptions: Sequence[RawSubscription]) -> None:
         """Raises one of `ros_node.RCL_ERRORS`."""
         self._subscriptions: dict[int, RawSubscription] = {}
+        self._eventfds: dict[RawSubscription, int] = {}
         with ExitStack() as opening:
             self._epoll = opening.enter_context(select.epoll())
-            self._wake = self._watched(opening)
+            self._wake = os.eventfd(0, os.EFD_CLOEXEC)
+            opening.callback(os.close, self._wake)
+            self._epoll.register(self._wake, select.EPOLLIN | select.EPOLLET)
+            opening.callback(self._remove_all)
             for subscription in subscriptions:
-                eventfd = self._watched(opening)
-                self._subscriptions[eventfd] = subscription
-                subscription.announce_to(eventfd)
-                opening.callback(subscription.announce_to, None)
+                self.add(subscription)
             self._open = opening.pop_all()
-        self._eventfds = {subscription: eventfd for eventfd, subscription in self._subscriptions.items()}
-        for subscription in subscriptions:
-            self.again(subscription)  # what came before somebody was told of it
 
-    def _watched(self, opening: ExitStack) -> int:
-        eventfd = os.eventfd(0, os.EFD_CLOEXEC)
-        opening.callback(os.close, eventfd)
-        self._epoll.register(eventfd, select.EPOLLIN | select.EPOLLET)
-        return eventfd
+    def add(self, subscription: RawSubscription) -> None:
+        """Waits for this one too. Nobody may wait meanwhile. Raises one of `ros_node.RCL_ERRORS`, or OSError."""
+        with ExitStack() as opening:
+            eventfd = os.eventfd(0, os.EFD_CLOEXEC)
+            opening.callback(os.close, eventfd)
+            self._epoll.register(eventfd, select.EPOLLIN | select.EPOLLET)
+            subscription.announce_to(eventfd)
+            opening.pop_all()
+        self._subscriptions[eventfd], self._eventfds[subscription] = subscription, eventfd
+        self.again(subscription)  # what came before somebody was told of it
+
+    def remove(self, subscription: RawSubscription) -> None:
+        """Does not wait for this one any more. Nobody may wait meanwhile."""
+        eventfd = self._eventfds.pop(subscription)
+        del self._subscriptions[eventfd]
+        subscription.announce_to(None)
+        os.close(eventfd)  # which ends that epoll watches it
+
+    def _remove_all(self) -> None:
+        for subscription in list(self._eventfds):
+            self.remove(subscription)
 
     def wait(self, timeout: float | None = None) -> list[RawSubscription]:
         """Those on which something may have arrived since they were last named. Waits for that, at most `timeout` s."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from rclpy.duration import Duration, Infinite
@@ -71,6 +71,16 @@ class PeerEvents:
         return PublisherEventCallbacks(
             matched=on_matched, incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type
         )
+
+    def forget_all_but(self, published: Collection[str]) -> None:
+        """Nobody subscribes to what is not published any more. To be called while no thread calls the callbacks."""
+        self.subscribed.intersection_update(published)
+
+    def tell(self) -> None:
+        """All peers that were kept away so far, once more: for books in which their topics are new."""
+        for (topic, policy), peers in list(self._peers.items()):
+            if policy in QOS_POLICIES:
+                self._incompatible(topic, policy, peers)
 
     def of_subscription(self, plan: TopicPlan) -> SubscriptionEventCallbacks:
         def on_incompatible_qos(status: Any) -> None:

@@ -6,13 +6,16 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 
 from rclpy.event_handler import EventHandler
 from rclpy.node import Node
 
 from router.edges.clock import monotonic_ns
 from router.edges.log import logger
+from router.edges.parking import parked
 from router.edges.ros_arrivals import Arrivals, RawSubscription
 from router.edges.ros_wait import WaitSet
 
@@ -87,32 +90,62 @@ class EventThread(_WaitThread):
 
 
 class MessageThread(_WaitThread):
-    """Calls `receive[topic]` with each message's CDR bytes and the wall clock ns at which it set out.
+    """Gives each message's CDR bytes, and the wall clock ns at which it set out, to whoever `serve` names.
 
     What that raises goes to `failed`, and receiving goes on. Stopping serves what has arrived by then.
     """
 
-    def __init__(
-        self,
-        subscriptions: Mapping[str, RawSubscription],
-        receive: Mapping[str, Receive],
-        failed: Callable[[Exception], None],
-    ) -> None:
-        self._receive = {subscription: receive[topic] for topic, subscription in subscriptions.items()}
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        """Raises one of `ros_node.RCL_ERRORS`."""
+        self._receive: dict[RawSubscription, Receive] = {}
         self._failed = failed
-        self._arrivals = Arrivals(list(self._receive))
+        self._arrivals = Arrivals([])
+        self._tasks: deque[Callable[[], None]] = deque()
         super().__init__("ros", self._arrivals)
+
+    def paused(self) -> AbstractContextManager[None]:
+        """The thread takes nothing meanwhile. Raises StuckError."""
+        return parked(self._ask)
+
+    def serve(self, receive: Mapping[RawSubscription, Receive]) -> None:
+        """From now on these and no others, each by its function. To be called before the start, or while paused.
+
+        Raises one of `ros_node.RCL_ERRORS`.
+        """
+        for subscription in receive.keys() - self._receive.keys():
+            self._arrivals.add(subscription)
+        for subscription in self._receive.keys() - receive.keys():
+            self._arrivals.remove(subscription)
+        self._receive = dict(receive)
+
+    def finish(self, subscription: RawSubscription) -> list[tuple[bytes, int]]:
+        """Serves what has arrived on one that is not served any more afterwards, and returns it. While paused."""
+        messages = subscription.take_all()
+        for message in messages:
+            self._hand_on(self._receive[subscription], message)
+        return messages
+
+    def _ask(self, task: Callable[[], None]) -> None:
+        self._tasks.append(task)
+        self._waits_on.wake()
 
     def _run(self) -> None:
         while not self._stopping:
             for subscription in self._arrivals.wait():
-                self._serve(subscription, TURN)
+                self._do_tasks()
+                if subscription in self._receive:
+                    self._serve(subscription)
+            self._do_tasks()
         for subscription in self._receive:
-            self._serve(subscription, subscription.capacity)  # no more than that, however fast they come
+            self.finish(subscription)
 
-    def _serve(self, subscription: RawSubscription, most: int) -> None:
+    def _do_tasks(self) -> None:
+        while self._tasks:
+            self._tasks.popleft()()
+
+    def _serve(self, subscription: RawSubscription) -> None:
         receive = self._receive[subscription]
-        for _ in range(most):
+        for _ in range(TURN):
             try:
                 if (message := subscription.take()) is None:
                     return
@@ -120,3 +153,9 @@ class MessageThread(_WaitThread):
             except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, is no reason to stop receiving
                 self._failed(error)
         self._arrivals.again(subscription)
+
+    def _hand_on(self, receive: Receive, message: tuple[bytes, int]) -> None:
+        try:
+            receive(*message)
+        except Exception as error:  # noqa: BLE001 as above
+            self._failed(error)

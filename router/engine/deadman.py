@@ -83,7 +83,10 @@ class Deadman:
         """
         ours = {(each.endpoint, each.send) for each in self._destinations}
         earlier._destinations = [each for each in earlier._destinations if (each.endpoint, each.send) not in ours]
-        if earlier.next_due is None or self.next_due is not None:
+        if earlier.next_due is None:
+            return
+        if self.next_due is not None:  # it has heard of a command already, which was a later one
+            earlier._release()
             return
         self._tripped = earlier._tripped
         later = 0 if self._tripped else self._plan.timeout - earlier._plan.timeout
