@@ -1,0 +1,106 @@
+"""`router new NAME --number N --board BOARD`: a message of its own, in every file that has to know of it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
+from router.cli.findings import print_findings
+from router.cli.tool_options import explained
+
+if TYPE_CHECKING:
+    from router.compiler import Checked
+    from router.errors import Diagnostic
+    from router.tools.new_message import NewMessage, Site
+    from router.tools.new_message_files import Written
+
+_DESCRIPTION = """Add a message that a board sends: its .proto file, its number in the envelope and in the lock, the ROS
+message, a route from the board to ROS and the basestation, and a test of it. Files keep their comments and their
+layout. What cannot be is refused, and then nothing is written."""
+_FIELDS = """such as `dose_rate:float state:SensorState`, or, with its unit, a single 'dose_rate:float # uSv/h'; types
+are bool, float, double, int32, int64, uint32, uint64, and enums and messages of the protos"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser("new", help=VERBS["new"], description=_DESCRIPTION)
+    parser.add_argument("name", metavar="NAME", help="of the message: its board, then what it is, as one word each")
+    parser.add_argument("--number", type=int, required=True, metavar="N", help="in the envelope, never used before")
+    parser.add_argument(
+        "--board", required=True, metavar="BOARD", help="endpoint that sends it, `_board` may be missing"
+    )
+    parser.add_argument("--fields", nargs="+", default=(), metavar="FIELD", help=_FIELDS)
+    parser.add_argument(
+        "--table", type=Path, default=DEFAULT_TABLE, help="route table of the boards (default: %(default)s)"
+    )
+
+
+@explained
+def run(args: argparse.Namespace) -> int:
+    from router.tools.new_message import new_message
+    from router.tools.new_message_files import Written, changes
+
+    before = _check(args.table)
+    errors = [finding for checked in before for finding in checked.diagnostics if checked.has_errors]
+    if errors:
+        print_findings(errors, sys.stderr)
+        print("router new: repair that first; nothing was written", file=sys.stderr)
+        return BAD_TABLE
+    site = _site(before[0])
+    message = new_message(args.name, args.number, args.board, args.fields, site)
+    planned = changes(message, site, [checked.table for checked in before[1:] if checked.table is not None])
+    written = Written(planned.texts)
+    after = _check(args.table)
+    findings = _news(before, after)
+    print_findings(findings, sys.stderr)
+    if any(checked.has_errors for checked in after):
+        written.undo()
+        print("router new: the message would be wrong like this; nothing was written", file=sys.stderr)
+        return BAD_TABLE
+    _report(message, written, planned.unrouted, site, _site(after[0]))
+    return OK
+
+
+def _check(table: Path) -> list[Checked]:
+    """The table, and those beside it."""
+    from router.cli.validate import find_tables
+    from router.compiler import check_table
+    from router.compiler.definitions import Definitions
+
+    definitions = Definitions()
+    beside = [path for path in find_tables([table.parent]) if path.resolve() != table.resolve()]
+    return [check_table(path, definitions=definitions) for path in (table, *beside)]
+
+
+def _site(checked: Checked) -> Site:
+    from router.assets import asset
+    from router.tools.new_message import site_of
+
+    return site_of(checked, asset("schemas") / "comms" / "msg")
+
+
+def _news(before: Sequence[Checked], after: Sequence[Checked]) -> list[Diagnostic]:
+    """What is said of the tables now and was not before, by what it says: lines have moved."""
+    known = {(finding.code, finding.message) for checked in before for finding in checked.diagnostics}
+    found = {finding: None for checked in after for finding in checked.diagnostics}
+    return [finding for finding in found if (finding.code, finding.message) not in known]
+
+
+def _report(message: NewMessage, written: Written, unrouted: Sequence[Path], before: Site, after: Site) -> None:
+    from router.errors import shown_path
+
+    fields = ", ".join(f"{field.name}: {field.type}" for field in message.fields)
+    print(f"{message.name} is payload case {message.case}, number {message.number}: {fields}")
+    for path in written.new:
+        print(f"  new      {shown_path(path)}")
+    for path in written.changed:
+        print(f"  changed  {shown_path(path)}")
+    for path in unrouted:
+        print(f"  route it yourself in {shown_path(path)}: what that does with it nobody but you knows")
+    if after.envelope.max_size > before.envelope.max_size:
+        print(f"The largest envelope grew from {before.envelope.max_size} to {after.envelope.max_size} bytes:")
+        print("flash all boards, because those that decode it have to have room for that.")
+    print("Next: `make setup` builds the ROS message; `router test` and `router validate --strict` prove the table.")

@@ -1,0 +1,229 @@
+"""A message that the rover shall have: what it is called, its number and fields, and why there can be none like it.
+
+Knows the table, the payload cases and the lock that there are, and writes nothing. What is written of it is the
+business of `new_message_proto`, `new_message_ros` and `new_message_tables`.
+"""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from router.compiler import Checked
+from router.errors import did_you_mean
+from router.table.model import Endpoint, EndpointKind, RouteTable
+from router.tools import UsageError
+from router.types.lock_file import read_lock
+from router.types.model import Enum, MessageType
+from router.types.protobuf import Envelope, ProtoSchema
+
+SCALARS = {
+    "bool": "bool", "float": "float32", "double": "float64", "int32": "int32", "int64": "int64", "uint32": "uint32",
+    "uint64": "uint64",
+}  # fmt: skip
+"""What a field can be beside an enum or a message: protobuf's spelling, and ROS's. Boards take all of these."""
+
+LARGEST_NUMBER = (1 << 29) - 1
+_OF_PROTOBUF = range(19_000, 20_000)
+_MESSAGE_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
+_FIELD_NAME = re.compile(r"[a-z](_?[a-z0-9])*")
+_WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
+
+
+@dataclass(frozen=True, slots=True)
+class NewField:
+    """`type` is one of SCALARS, or the full name of an enum or a message of the protos."""
+
+    name: str
+    type: str
+    comment: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NewMessage:
+    """`board` is the endpoint that sends it, `case` its payload case, `fields` in the order of their numbers."""
+
+    name: str
+    number: int
+    board: str
+    case: str
+    fields: tuple[NewField, ...]
+
+    @property
+    def prefix(self) -> str:
+        """What the names of the board's messages begin with."""
+        return prefix_of(self.board)
+
+    @property
+    def board_words(self) -> str:
+        return self.board.replace("_", " ")
+
+    @property
+    def title(self) -> str:
+        return f"{self.case.replace('_', ' ').capitalize()} from the {self.board_words}"
+
+    @property
+    def stem(self) -> str:
+        """What its file is called: that a message is information need not be said there."""
+        return self.case.removesuffix("_info")
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What there is: a table without errors, what it refers to, and the folder of our ROS messages."""
+
+    table: RouteTable
+    schema: ProtoSchema
+    envelope: Envelope
+    messages: Path
+
+    def file(self, name: str) -> str:
+        """The `.proto` file of a message or an enum, relative to the folder of the protos."""
+        return self.schema.sources.file(name)
+
+    def new_file(self, message: NewMessage) -> str:
+        """Where its `.proto` file goes: the folder of its board, beside that of the envelope."""
+        common = PurePosixPath(self.file(self.envelope.name)).parent
+        return (common.parent / message.board / f"{message.stem}.proto").as_posix()
+
+
+def site_of(checked: Checked, messages: Path) -> Site:
+    """`checked` is a table without errors."""
+    if checked.table is None or checked.schema is None or checked.envelope is None:
+        raise ValueError(f"{checked.path} has errors")
+    return Site(checked.table, checked.schema, checked.envelope, messages)
+
+
+def new_message(name: str, number: int, board: str, fields: Sequence[str], site: Site) -> NewMessage:
+    """The message as asked for, `fields` as `parsed_fields` has them. Raises UsageError for what cannot be."""
+    endpoint = _endpoint(board, site.table)
+    case = _case(name, endpoint.name)
+    _check_names(name, case, site)
+    _check_number(number, case, site)
+    asked = parsed_fields(fields, site) if fields else usual_fields(prefix_of(endpoint.name), site)
+    message = NewMessage(name, number, endpoint.name, case, asked)
+    for path in (site.schema.root / site.new_file(message), site.messages / f"{name}.msg"):
+        if path.exists():
+            raise UsageError(f"there is a file {path} already")
+    return message
+
+
+def parsed_fields(texts: Sequence[str], site: Site) -> tuple[NewField, ...]:
+    """Of `dose_rate:float state:SensorState`, or a single field with its unit, `dose_rate:float # uSv/h`."""
+    fields: list[NewField] = []
+    for text in texts:
+        declared, _, comment = text.partition("#")
+        words = declared.split()
+        if comment and len(words) != 1:
+            raise UsageError(f"'{text}': a comment belongs to one field, as in 'dose_rate:float # uSv/h'")
+        fields += [_field(word, " ".join(comment.split()), site) for word in words]
+    for name, times in Counter(field.name for field in fields).items():
+        if times > 1:
+            raise UsageError(f"there are {times} fields '{name}'")
+    if not fields:
+        raise UsageError("--fields names no field")
+    return tuple(fields)
+
+
+def usual_fields(prefix: str, site: Site) -> tuple[NewField, ...]:
+    """One number to begin with, and what most messages of that board have."""
+    siblings = [case.type for case in site.envelope.cases.values() if case.type.short_name.startswith(prefix)]
+    shared = Counter(
+        NewField(field.name, field.type.name)
+        for type_ in siblings
+        for field in type_.fields
+        if isinstance(field.type, (Enum, MessageType))
+    )
+    return (NewField("value", "float"), *(field for field, times in shared.items() if times * 2 > len(siblings)))
+
+
+def _field(text: str, comment: str, site: Site) -> NewField:
+    name, colon, type_ = text.partition(":")
+    if not colon:
+        raise UsageError(f"'{text}' is no field; write name:type, as in dose_rate:float")
+    if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise UsageError(f"'{name}' is no name of a field; write it as dose_rate")
+    if type_ in SCALARS:
+        return NewField(name, type_, comment)
+    named = (*site.schema.messages, *site.schema.enums)
+    own = [full for full in named if type_ in (full, full.rpartition(".")[2])]
+    if not own:
+        known = [*SCALARS, *named]
+        hint = did_you_mean(type_, known) or f"there are {', '.join(SCALARS)}, and the enums and messages of the protos"
+        raise UsageError(f"there is no type '{type_}' for '{name}'; {hint}")
+    return NewField(name, own[0], comment)
+
+
+def _endpoint(board: str, table: RouteTable) -> Endpoint:
+    """By its name, or without `_board`."""
+    senders = {name: each for name, each in table.endpoints.items() if each.kind is not EndpointKind.TOOL}
+    found = senders.get(board) or senders.get(f"{board}_board")
+    if found is None:
+        names = [name.removesuffix("_board") for name in senders]
+        hint = did_you_mean(board, names) or f"there are {', '.join(names)}"
+        raise UsageError(f"{table.path.name} has no board '{board}'; {hint}")
+    return found
+
+
+def prefix_of(board: str) -> str:
+    return "".join(word.capitalize() for word in board.split("_"))
+
+
+def _case(name: str, board: str) -> str:
+    """`radiation_info` of `SensorBoardRadiationInfo`."""
+    prefix = prefix_of(board)
+    rest = name.removeprefix(prefix)
+    if not _MESSAGE_NAME.fullmatch(name) or rest == name or not _MESSAGE_NAME.fullmatch(rest):
+        raise UsageError(f"'{name}' is no name for a message of {board}; write it as {prefix}RadiationInfo")
+    return _WORD_BORDER.sub("_", rest).lower()
+
+
+def _check_names(name: str, case: str, site: Site) -> None:
+    taken: Iterable[str] = (known.rpartition(".")[2] for known in (*site.schema.messages, *site.schema.enums))
+    if name in taken:
+        raise UsageError(f"there is a message '{name}' already")
+    if case in site.envelope.cases:
+        number = site.envelope.cases[case].number
+        raise UsageError(
+            f"{site.envelope.name} has a payload case '{case}' already, number {number}; take another name"
+        )
+    topics = {topic.topic.value: route.name for route in site.table.routes for topic in route.topics}
+    if case in topics:
+        raise UsageError(f"the route {topics[case]} has a topic '{case}' already; take another name")
+
+
+def _check_number(number: int, case: str, site: Site) -> None:
+    """It must never have been another's: boards in the field remember."""
+    lock, envelope = read_lock(site.schema.root), site.envelope.name
+    entries = lock.messages[envelope].entries if lock is not None and envelope in lock.messages else frozenset()
+    holders = {entry.number: entry.name for entry in entries}
+    holders |= {field.number: field.name for field in site.schema.messages[envelope].fields}
+    above = range(max(holders, default=0) + 1, LARGEST_NUMBER)
+    free = next(candidate for candidate in above if _is_free(candidate, site))
+    if not 1 <= number <= LARGEST_NUMBER or number in _OF_PROTOBUF:
+        raise UsageError(f"{number} is no field number of protobuf; {free} is free")
+    if number in holders:
+        raise UsageError(f"number {number} belongs to '{holders[number]}', for ever; {free} is free")
+    if any(number in span for span in site.schema.reserved_numbers(envelope)):
+        raise UsageError(f"{envelope} reserves number {number}; {free} is free")
+    if promised := _promise(number, site):
+        raise UsageError(f"{site.file(envelope)} says: {promised} {free} is free")
+    if case in holders.values():
+        was = next(old for old, name in holders.items() if name == case)
+        raise UsageError(f"'{case}' had number {was} once, and cannot come back with another; take another name")
+
+
+def _is_free(number: int, site: Site) -> bool:
+    reserved = any(number in span for span in site.schema.reserved_numbers(site.envelope.name))
+    return not reserved and number not in _OF_PROTOBUF and not _promise(number, site)
+
+
+def _promise(number: int, site: Site) -> str:
+    """The comment of the envelope's file that speaks of the number, such as `Number 30 is promised to ...`."""
+    text = (site.schema.root / site.file(site.envelope.name)).read_text(encoding="utf-8")
+    found = re.search(rf"//\s*(.*\b[Nn]umber {number}\b.*)", text)
+    return found[1] if found else ""

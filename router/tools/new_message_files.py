@@ -1,0 +1,80 @@
+"""Which files a new message changes and to what, and writing them: all, or none.
+
+Decides nothing about the message, and prints nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from router.errors import shown_path
+from router.table.model import RouteTable
+from router.tools import UsageError
+from router.tools.new_message import NewMessage, Site
+from router.tools.new_message_proto import proto_texts
+from router.tools.new_message_ros import msg_text
+from router.tools.new_message_tables import board_table_text, forwarding_table_text
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """`texts` are the whole contents of each file. `unrouted` are tables beside that need a person to route it."""
+
+    texts: Mapping[Path, str]
+    unrouted: tuple[Path, ...]
+
+
+def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Changes:
+    """`others` are the tables beside the site's. Raises UsageError."""
+    texts = {site.schema.root / name: text for name, text in proto_texts(message, site).items()}
+    texts[site.messages / f"{message.name}.msg"] = msg_text(message, site)
+    path = site.table.path
+    package = site.messages.parent.name
+    texts[path] = board_table_text(_read(path), message, site.table, shown_path(path), package)
+    unrouted = []
+    for other in others:
+        if path in other.files or other.envelope.protos.value != site.table.envelope.protos.value:
+            continue
+        text = forwarding_table_text(_read(other.path), message, other, shown_path(other.path))
+        if text is None:
+            unrouted.append(other.path)
+        else:
+            texts[other.path] = text
+    return Changes(texts, tuple(unrouted))
+
+
+class Written:
+    """The files of some changes, written. Raises UsageError when one cannot be, and then none is."""
+
+    def __init__(self, texts: Mapping[Path, str]) -> None:
+        self._before: dict[Path, str | None] = {}
+        try:
+            for path, text in texts.items():
+                self._before[path] = _read(path) if path.exists() else None
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            self.undo()
+            raise UsageError(f"{error.filename} cannot be written: {error.strerror}") from error
+
+    @property
+    def new(self) -> list[Path]:
+        return [path for path, before in self._before.items() if before is None]
+
+    @property
+    def changed(self) -> list[Path]:
+        return [path for path, before in self._before.items() if before is not None]
+
+    def undo(self) -> None:
+        """Everything as it was; a folder that was made stays."""
+        for path, before in self._before.items():
+            if before is None:
+                path.unlink(missing_ok=True)
+            else:
+                path.write_text(before, encoding="utf-8")
+
+
+def _read(path: Path) -> str:
+    return path.read_text(encoding="utf-8")

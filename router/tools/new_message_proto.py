@@ -1,0 +1,109 @@
+"""A new message in protobuf: its `.proto` file, its place in the envelope, its numbers in the lock.
+
+Texts in, texts out; only for protoc the changed files are put in a folder that is gone afterwards.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from router.errors import Severity, SourceSpan, TableError
+from router.table.model import EnvelopeSettings, Located
+from router.tools import UsageError
+from router.tools.new_message import SCALARS, NewMessage, Site
+from router.types.lock import check_lock, extended_lock
+from router.types.lock_file import LOCK_NAME, write_lock
+from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
+
+_IMPORT = re.compile(r'import "(.*)";')
+_COMMENT_GAP = 3
+
+
+def proto_texts(message: NewMessage, site: Site) -> Mapping[str, str]:
+    """The contents of every file of the protos that is new or changes, by name relative to their folder, lock included.
+
+    Raises UsageError when protoc or the lock refuses what came of it.
+    """
+    envelope_file = site.file(site.envelope.name)
+    before = (site.schema.root / envelope_file).read_text(encoding="utf-8")
+    texts = {site.new_file(message): _declared(message, site), envelope_file: _in_envelope(before, message, site)}
+    return {**texts, LOCK_NAME: _locked(texts, site)}
+
+
+def aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
+    """Lines of declarations with their comments below each other."""
+    rows = list(rows)
+    width = max((len(code) for code, comment in rows if comment), default=0) + _COMMENT_GAP
+    for code, comment in rows:
+        yield f"{code:{width}}{mark} {comment}" if comment else code
+
+
+def _declared(message: NewMessage, site: Site) -> str:
+    """The new `.proto` file."""
+    imports = sorted({site.file(field.type) for field in message.fields if field.type not in SCALARS})
+    rows = [
+        (f"  {field.type} {field.name} = {number};", field.comment) for number, field in enumerate(message.fields, 1)
+    ]
+    lines = [
+        f"// {message.title}.",
+        'syntax = "proto3";',
+        "",
+        *(f'import "{name}";' for name in imports),
+        *([""] if imports else []),
+        f"message {message.name} {{",
+        *aligned(rows, "//"),
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _in_envelope(text: str, message: NewMessage, site: Site) -> str:
+    """The envelope's file with the import, in its order, and the payload case after the last one."""
+    lines = text.split("\n")
+    cases = site.schema.messages[site.envelope.name].fields
+    places = {
+        field: site.schema.span(site.envelope.name, field.name).line
+        for field in cases
+        if field.oneof == site.envelope.oneof
+    }
+    last = max(places, key=lambda field: places[field])
+    end = next(index for index in range(places[last] - 1, len(lines)) if ";" in lines[index])
+    indent = lines[end][: len(lines[end]) - len(lines[end].lstrip())]
+    own = f"{indent}{message.name} {message.case} = {message.number};"
+    is_of_same_board = site.envelope.cases[last.name].type.short_name.startswith(message.prefix)
+    lines[end + 1 : end + 1] = [own] if is_of_same_board else ["", f"{indent}// {message.board_words}", own]
+    imports = {index: found[1] for index, line in enumerate(lines) if (found := _IMPORT.match(line))}
+    new = site.new_file(message)
+    place = next((index for index, name in imports.items() if name > new), max(imports, default=0) + 1)
+    lines.insert(place, f'import "{new}";')
+    return "\n".join(lines)
+
+
+def _locked(texts: Mapping[str, str], site: Site) -> str:
+    """The lock as `router schema lock` would write it after the changes."""
+    with tempfile.TemporaryDirectory(prefix="router_new_") as folder:
+        root = Path(folder, "protos")
+        shutil.copytree(site.schema.root, root)
+        for name, text in texts.items():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / name).write_text(text, encoding="utf-8")
+        try:
+            schema = load_protos(root)
+            envelope = _envelope(schema, site)
+            errors = [each for each in check_lock(schema, envelope) if each.severity is Severity.ERROR]
+        except TableError as error:
+            errors = list(error.diagnostics)
+        if errors:
+            raise UsageError("; ".join(each.message for each in errors))
+        write_lock(root, extended_lock(schema, envelope))
+        return (root / LOCK_NAME).read_text(encoding="utf-8")
+
+
+def _envelope(schema: ProtoSchema, site: Site) -> Envelope:
+    nowhere = SourceSpan(str(schema.root))
+    names = Located(site.envelope.name, nowhere), Located(site.envelope.oneof, nowhere)
+    return find_envelope(schema, EnvelopeSettings(Located(schema.root, nowhere), *names))

@@ -1,0 +1,223 @@
+"""`router new` writes a message as a person would: everywhere it belongs, and nothing of what cannot be."""
+
+from __future__ import annotations
+
+import difflib
+import shutil
+from pathlib import Path
+
+import pytest
+
+import router.assets
+from router.assets import asset
+from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+
+RADIATION = ("SensorBoardRadiationInfo", "--number", "27", "--board", "sensor")
+FIELDS = ("--fields", "dose_rate:float # microsievert per hour", "state:SensorState status:SensorStatus")
+ROUTE = """\
+  radiation_info:
+    source: sensor_board
+    destinations: [basestation]
+    topics: [{topic: radiation_info, type: comms/msg/SensorBoardRadiationInfo, queue_depth: 10, fields: auto}]
+
+"""
+Files = dict[str, str]
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of everything that a new message touches, in which the router then works."""
+    for folder in ("protos", "routes", "schemas"):
+        shutil.copytree(asset(folder), tmp_path / folder)
+    monkeypatch.setattr(router.assets, "_PLACES", (tmp_path,))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def contents(site: Path) -> Files:
+    return {str(path.relative_to(site)): path.read_text(encoding="utf-8") for path in site.rglob("*") if path.is_file()}
+
+
+def added(before: Files, after: Files) -> dict[str, list[str]]:
+    """The lines that each file has more; asserts that none is gone."""
+    found = {}
+    for name, text in after.items():
+        lines = list(difflib.ndiff(before.get(name, "").splitlines(), text.splitlines()))
+        if name != "protos/envelope.lock.json":
+            assert [line for line in lines if line.startswith("- ")] == []
+        if new := [line[2:] for line in lines if line.startswith("+ ")]:
+            found[name] = new
+    return found
+
+
+def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(site: Path) -> None:
+    before = contents(site)
+    assert main(["new", *RADIATION, *FIELDS]) == OK
+    new = added(before, contents(site))
+    lock = new.pop("protos/envelope.lock.json")
+    assert '        "27": "SensorBoardRadiationInfo radiation_info"' in lock
+    assert new.pop("protos/components/sensor_board/radiation.proto") == [
+        "// Radiation info from the sensor board.",
+        'syntax = "proto3";',
+        "",
+        'import "components/sensor_board/sensor.proto";',
+        "",
+        "message SensorBoardRadiationInfo {",
+        "  float dose_rate = 1;   // microsievert per hour",
+        "  SensorState state = 2;",
+        "  SensorStatus status = 3;",
+        "}",
+    ]
+    assert new.pop("protos/components/common/envelope.proto") == [
+        'import "components/sensor_board/radiation.proto";',
+        "",
+        "    // sensor board",
+        "    SensorBoardRadiationInfo radiation_info = 27;",
+    ]
+    assert new.pop("schemas/comms/msg/SensorBoardRadiationInfo.msg") == [
+        "# Radiation info from the sensor board.",
+        "",
+        "uint8 STATUS_UNKNOWN=0",
+        "uint8 STATUS_OK=1",
+        "uint8 STATUS_ERROR=2",
+        "uint8 STATUS_DISCONNECTED=3",
+        "uint8 STATUS_INITIALIZING=4",
+        "",
+        "float32 dose_rate   # microsievert per hour",
+        "SensorState state",
+        "uint8 status        # STATUS_*",
+    ]
+    assert new.pop("routes/rover.yaml") == ROUTE.splitlines()
+    assert new.pop("routes/legacy.yaml") == ["  radiation_info:       {source: any, destinations: [dst_a, dst_b]}"]
+    assert new == {}
+
+
+def test_the_tables_are_clean_afterwards_and_the_lock_has_it_all(site: Path) -> None:
+    assert main(["new", *RADIATION, *FIELDS]) == OK
+    locked = contents(site)["protos/envelope.lock.json"]
+    assert main(["validate", "--strict", "routes"]) == OK
+    assert main(["schema", "lock", "--protos", "protos"]) == OK
+    assert contents(site)["protos/envelope.lock.json"] == locked
+
+
+def test_a_second_one_of_the_board_stands_beside_the_first(site: Path) -> None:
+    assert main(["new", *RADIATION]) == OK
+    before = contents(site)
+    assert main(["new", "SensorBoardDustInfo", "--number", "28", "--board", "sensor_board"]) == OK
+    envelope = added(before, contents(site))["protos/components/common/envelope.proto"]
+    assert envelope == ['import "components/sensor_board/dust.proto";', "    SensorBoardDustInfo dust_info = 28;"]
+
+
+def test_without_fields_it_has_a_number_and_what_most_messages_of_the_board_have(site: Path) -> None:
+    assert main(["new", *RADIATION]) == OK
+    text = (site / "protos/components/sensor_board/radiation.proto").read_text(encoding="utf-8")
+    assert "{\n  float value = 1;\n  SensorState state = 2;\n}\n" in text
+
+
+def test_what_the_basestation_sends_goes_to_ros_alone(site: Path) -> None:
+    before = contents(site)
+    assert main(["new", "BasestationHorn", "--number", "29", "--board", "basestation", "--fields", "on:bool"]) == OK
+    assert added(before, contents(site))["routes/rover.yaml"] == [
+        "  horn:",
+        "    source: basestation",
+        "    topics: [{topic: horn, type: comms/msg/BasestationHorn, queue_depth: 10, fields: auto}]",
+        "",
+    ]
+
+
+def test_a_board_without_routes_gets_a_section_at_the_end(site: Path) -> None:
+    before = contents(site)
+    assert main(["new", "ContainerBoardLid", "--number", "31", "--board", "container"]) == OK
+    lines = added(before, contents(site))["routes/rover.yaml"]
+    assert lines[1].startswith("  # ---- container board ----")
+    assert lines[3] == "  lid:"
+    assert main(["validate", "--strict", "routes"]) == OK
+
+
+def test_long_names_do_not_make_long_lines(site: Path) -> None:
+    name = "DrivingBoardWheelSlipAndWhateverElseThereIsToKnow"
+    fields = ("--fields", "motor:MotorInformation")
+    assert main(["new", name, "--number", "27", "--board", "driving", *fields]) == OK
+    assert main(["validate", "--strict", "routes"]) == OK
+    assert all(len(line) <= 120 for line in contents(site)["routes/rover.yaml"].splitlines())
+
+
+def test_a_table_beside_that_routes_in_its_own_way_is_left_to_a_person(
+    site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    legacy = (site / "routes/legacy.yaml").read_text(encoding="utf-8")
+    (site / "routes/own.yaml").write_text(legacy.replace("[dst_a, dst_b]", "[dst_a]", 1), encoding="utf-8")
+    before = contents(site)
+    assert main(["new", *RADIATION]) == OK
+    assert "routes/own.yaml" not in added(before, contents(site))
+    said = capsys.readouterr()
+    assert "route it yourself in routes/own.yaml" in said.out
+    assert "no route for the payload case radiation_info" in said.err
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("SensorBoardRadiationInfo", "26", "sensor"), "number 26 belongs to 'manual_arm', for ever; 27 is free"),
+        (("SensorBoardRadiationInfo", "30", "sensor"), "says: Number 30 is promised"),
+        (("SensorBoardRadiationInfo", "0", "sensor"), "0 is no field number of protobuf; 27 is free"),
+        (("SensorBoardRadiationInfo", "19500", "sensor"), "19500 is no field number of protobuf"),
+        (("SensorBoardRadiationInfo", "27", "sensors"), "has no board 'sensors'; did you mean 'sensor'?"),
+        (("RadiationInfo", "27", "sensor"), "write it as SensorBoardRadiationInfo"),
+        (("SensorBoardradiation", "27", "sensor"), "is no name for a message of sensor_board"),
+        (("SensorBoardPumpInfo", "27", "sensor"), "there is a message 'SensorBoardPumpInfo' already"),
+        (("SensorBoardManualArm", "27", "sensor"), "has a payload case 'manual_arm' already, number 26"),
+        (("SensorBoardDetectedObjects", "27", "sensor"), "has a topic 'detected_objects' already"),
+        (("SensorBoardImuSensorInfo", "27", "sensor"), "imu_sensor.proto already"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose"), "'dose' is no field; write name:type"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose:flot"), "did you mean 'float'?"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose:string"), "there is no type 'string'"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "Dose:float"), "'Dose' is no name of a field"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "from:float"), "'from' is no name of a field"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool b:bool # both"), "belongs to one field"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool a:float"), "there are 2 fields 'a'"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", " "), "--fields names no field"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_nothing_is_written(
+    site: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], why: str
+) -> None:
+    before = contents(site)
+    name, number, board, *rest = words
+    assert main(["new", name, "--number", number, "--board", board, *rest]) == BAD_USAGE
+    assert why in capsys.readouterr().err
+    assert contents(site) == before
+
+
+def test_a_number_that_was_given_out_once_stays_taken(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lock = site / "protos/envelope.lock.json"
+    text = lock.read_text(encoding="utf-8")
+    was = '"26": "BasestationManualArmMovement manual_arm"'
+    lock.write_text(text.replace(was, f'{was},\n        "27": "Gone gone_info"'), encoding="utf-8")
+    envelope = site / "protos/components/common/envelope.proto"
+    declared = envelope.read_text(encoding="utf-8")
+    envelope.write_text(declared.replace("  oneof payload {", "  reserved 27;\n  oneof payload {"), encoding="utf-8")
+    assert main(["new", *RADIATION]) == BAD_USAGE
+    assert "number 27 belongs to 'gone_info', for ever; 28 is free" in capsys.readouterr().err
+    assert main(["new", "SensorBoardGoneInfo", "--number", "28", "--board", "sensor"]) == BAD_USAGE
+    assert "'gone_info' had number 27 once" in capsys.readouterr().err
+
+
+def test_what_turns_out_wrong_is_taken_back(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (site / "protos/odd.proto").write_text('syntax = "proto3";\nmessage Odd { float x = 1; }\n', encoding="utf-8")
+    (site / "schemas/comms/msg/Odd.msg").write_text("string x\n", encoding="utf-8")
+    before = contents(site)
+    assert main(["new", *RADIATION, "--fields", "odd:Odd"]) == BAD_TABLE
+    said = capsys.readouterr().err
+    assert "error[" in said
+    assert "nothing was written" in said
+    assert contents(site) == before
+
+
+def test_a_table_with_errors_is_repaired_first(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = site / "routes/rover.yaml"
+    path.write_text(path.read_text(encoding="utf-8").replace("y: accel_y", "y: accel_q"), encoding="utf-8")
+    before = contents(site)
+    assert main(["new", *RADIATION]) == BAD_TABLE
+    assert "repair that first" in capsys.readouterr().err
+    assert contents(site) == before
