@@ -1,0 +1,57 @@
+"""The directory of recordings: names for new ones, and what has to go when they become too many.
+
+Knows names and sizes, and nothing of what is in a file.
+"""
+
+from __future__ import annotations
+
+import errno
+import re
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+
+from router.edges.log import logger
+from router.edges.recorder_channels import Channels
+from router.edges.recorder_file import RecordingFile
+
+SUFFIX = ".mcap"
+_TIME = "%Y%m%dT%H%M%S.%fZ"
+
+
+class RecordingDirectory:
+    """The files `STEM_TIME[_REASON].mcap` below `path` are ours; others are left alone.
+
+    They have at most `keep` bytes. Makes the directory; raises OSError.
+    """
+
+    def __init__(self, path: Path, stem: str, keep: int) -> None:
+        path.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self._stem = stem
+        self._keep = keep
+        self._ours = re.compile(re.escape(stem) + r"_\d{8}T\d{6}\.\d{6}Z(_[a-z0-9_.-]+)?" + re.escape(SUFFIX))
+
+    def new(self, wall: int, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
+        """A file that is not there yet; two at one time, as where the clock begins anew at each start, get numbers."""
+        time = datetime.fromtimestamp(wall / 1e9, timezone.utc).strftime(_TIME)
+        words = [self._stem, time, *([re.sub(r"[^a-z0-9_.-]+", "-", reason.lower())] if reason else [])]
+        for number in range(1, 1000):
+            name = "_".join([*words, *([str(number)] if number > 1 else [])]) + SUFFIX
+            try:
+                return RecordingFile(self.path / name, channels, about)
+            except FileExistsError:
+                continue
+        raise FileExistsError(errno.EEXIST, f"there are a thousand recordings of {time}", str(self.path))
+
+    def make_room(self, coming: int, writing: Path | None = None) -> None:
+        """Removes the oldest, by name, until there is room for `coming` bytes. The one at `writing` is not counted."""
+        ours = sorted(path for path in self.path.iterdir() if path != writing and self._ours.fullmatch(path.name))
+        sizes = {path: path.stat().st_size for path in ours}
+        total = sum(sizes.values())
+        for path, size in sizes.items():
+            if total + coming <= self._keep:
+                return
+            path.unlink(missing_ok=True)
+            total -= size
+            logger.info("removed the oldest recording, to keep within 'keep'", file=str(path), bytes=size)

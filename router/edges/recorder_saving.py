@@ -1,0 +1,71 @@
+"""Writes what is in memory to a file of its own: because somebody asked, or because a deadman tripped.
+
+Knows no thread. What is called with `now` is monotonic, in ns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from router.edges.clock import wall_ns
+from router.edges.log import logger
+from router.edges.recorder_channels import Channels
+from router.edges.recorder_chunk import Chunk
+from router.edges.recorder_directory import RecordingDirectory
+from router.edges.recorder_ring import Ring
+from router.errors import RouterError
+
+
+class RecordError(RouterError):
+    """The last datagrams could not be saved; the message says why."""
+
+
+class Saving:
+    """What came within `last` ns. `about` is asked for each file, with the reason."""
+
+    def __init__(
+        self,
+        last: int,
+        max_size: int,
+        directory: RecordingDirectory,
+        channels: Channels,
+        about: Callable[[str], Mapping[str, str]],
+    ) -> None:
+        self._last = last
+        self._max_size = max_size
+        self._ring = Ring(last, max_size)
+        self._directory = directory
+        self._channels = channels
+        self._about = about
+        self._trips_saved_at: int | None = None
+
+    def add(self, chunk: Chunk) -> None:
+        self._ring.add(chunk)
+
+    def save(self, reason: str, writing: Path | None) -> Path:
+        """`writing` is the file that all goes to, where there is one. Raises RecordError."""
+        try:
+            path = self._write(reason, writing)
+        except OSError as error:
+            logger.error("the last datagrams could not be saved", reason=reason, problem=error.strerror)
+            raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
+        logger.info("saved the last datagrams", reason=reason, file=str(path))
+        return path
+
+    def may_save_trips(self, now: int) -> bool:
+        """Once in the time that is kept: a deadman that trips again and again fills no disk, and nothing is missed."""
+        if self._trips_saved_at is not None and now - self._trips_saved_at < self._last:
+            return False
+        self._trips_saved_at = now
+        return True
+
+    def _write(self, reason: str, writing: Path | None) -> Path:
+        self._directory.make_room(self._ring.size + (self._max_size if writing is not None else 0), writing)
+        file = self._directory.new(wall_ns(), reason, self._channels, self._about(reason))
+        try:
+            for chunk in self._ring:
+                file.write(chunk)
+        finally:
+            file.close()
+        return file.path
