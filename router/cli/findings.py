@@ -80,8 +80,8 @@ def as_github(finding: Diagnostic, *, strict: bool) -> str:
         "endColumn": span.end_column,
         "title": finding.code.value,
     }
-    listed = ",".join(f"{name}={_github_escaped(str(value), ':,')}" for name, value in properties.items())
-    return f"::{severity(finding, strict=strict).value} {listed}::{_github_escaped(text, '')}"
+    listed = ",".join(f"{name}={github_escaped(str(value), ':,')}" for name, value in properties.items())
+    return f"::{severity(finding, strict=strict).value} {listed}::{github_escaped(text, '')}"
 
 
 def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
@@ -94,7 +94,7 @@ def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
         first = f"{head}{visible(finding.message)}{_RESET}{visible(hint)}"
     else:
         first = visible(f"{finding.span}: {level.value}[{finding.code.value}]: {finding.message}{hint}")
-    return "\n".join((first, *_excerpt(finding.span, colour if coloured else "")))
+    return "\n".join((first, *excerpt(finding.span, colour if coloured else "")))
 
 
 def is_coloured(out: TextIO) -> bool:
@@ -106,7 +106,8 @@ def visible(text: str) -> str:
     return _INVISIBLE.sub(lambda match: repr(match[0])[1:-1], text)
 
 
-def _excerpt(span: SourceSpan, colour: str) -> list[str]:
+def excerpt(span: SourceSpan, colour: str) -> list[str]:
+    """The source line with carets below what is blamed; none where the file does not have it."""
     lines = _lines(span.file)
     text = lines[span.line - 1] if span.line <= len(lines) else ""
     if not text.strip():
@@ -149,7 +150,7 @@ def _lines(file: str) -> tuple[str, ...]:
     return tuple(re.split(r"\r\n|\r|\n", data.decode("utf-8", "replace").removeprefix("\ufeff")))
 
 
-def _github_escaped(text: str, more: str) -> str:
+def github_escaped(text: str, more: str) -> str:
     for character in "%\r\n" + more:
         text = text.replace(character, f"%{ord(character):02X}")
     return text

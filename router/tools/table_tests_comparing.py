@@ -1,0 +1,240 @@
+"""Compares what happened in a step with what a test expects: each difference with its place in test and table."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from router.compiler import reference_cdr
+from router.errors import DecodeError, SourceSpan
+from router.table.model import Located, RouteTable
+from router.tools.rehearsal_events import Dropped, Event, Filtered, Published, Received, Rejected, Sent
+from router.tools.table_tests_matching import Difference, Moments, shown
+from router.tools.table_tests_model import Counted, Expected, Item, Message, Payload, Step, Unchanged
+from router.tools.table_tests_places import Place, Places
+from router.tools.wire import Wire
+from router.types.model import MessageType
+
+_SHOWN = 3
+"""So many of what came are told where their number is not what was expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One thing that a table does not do as a test expects. `table` is the place there that has to do with it."""
+
+    span: SourceSpan
+    message: str
+    table: Place | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Happened:
+    """What a step came to: `early` before its time, `events` in it; `given` is when what came in."""
+
+    step: Step
+    start: int
+    early: Sequence[Event]
+    events: Sequence[Event]
+    given: Sequence[tuple[int, bytes]]
+
+    def moments(self, at: int) -> Moments:
+        """`now` is when the message came in that was the last one at `at`."""
+        times = [time for time, _ in self.given if time <= at]
+        return Moments(self.start, times[-1] if times else at)
+
+    def time(self, event: Event) -> str:
+        return f"at {(event.at - self.start) / 1e6:g} ms"
+
+
+class Comparison:
+    def __init__(self, wire: Wire, places: Places, table: RouteTable) -> None:
+        self._wire = wire
+        self._places = places
+        self._table = table
+
+    def failures(self, step: Step, happened: Happened) -> Iterator[Failure]:
+        """In the order in which a person would look for them."""
+        expected = step.expected
+        for event in happened.early:
+            if isinstance(event, (Sent, Published, Dropped)):
+                what = f"before this step, {self._told(event, happened)}; no step expects it"
+                yield Failure(expected.span, what, self._place(event))
+        rejected = [event for event in happened.events if isinstance(event, Rejected)]
+        yield from self._rejected(expected, rejected)
+        yield from self._routes(expected, happened.events)
+        sent = [event for event in happened.events if isinstance(event, Sent)]
+        yield from self._delivered(expected.sent, _by_target(sent), happened, bool(rejected))
+        published = [event for event in happened.events if isinstance(event, Published)]
+        yield from self._delivered(expected.published, _by_target(published), happened, bool(rejected))
+        yield from self._dropped(expected, happened)
+        yield from self._filtered(expected, happened.events)
+
+    # what is delivered
+
+    def _delivered(
+        self,
+        expected: Mapping[str, tuple[Item, ...]],
+        came: Mapping[str, list[Sent | Published]],
+        happened: Happened,
+        is_rejected: bool,
+    ) -> Iterator[Failure]:
+        for target in dict.fromkeys((*expected, *came)):
+            items, events = expected.get(target, ()), came.get(target, [])
+            if items and not events:
+                if not is_rejected:
+                    yield self._missing(target, items, happened)
+            elif not items:
+                yield from self._unexpected(events, happened)
+            elif len(items) != len(events):
+                listed = "; ".join(self._told(event, happened) for event in events[:_SHOWN])
+                more = f"; and {len(events) - _SHOWN} more" if len(events) > _SHOWN else ""
+                message = f"{len(events)} for {target}, not {len(items)}: {listed}{more}"
+                yield Failure(items[0].span, message, self._place(events[-1]))
+            else:
+                for item, event in zip(items, events, strict=True):
+                    yield from self._differences(item, event, happened)
+
+    def _missing(self, target: str, items: Sequence[Item], happened: Happened) -> Failure:
+        """With what became of the message instead, where the books know."""
+        for event in happened.events:
+            if isinstance(event, Dropped) and event.target == target:
+                why = f"it was dropped as {event.reason}" + (f" ({event.detail})" if event.detail else "")
+                return Failure(items[0].span, f"nothing for {target}: {why}", self._place(event))
+            if isinstance(event, Filtered) and event.target == target:
+                place = self._places.condition(event.route, target)
+                return Failure(items[0].span, f"nothing for {target}: it was withheld", place)
+        return Failure(items[0].span, f"nothing for {target}", self._places.of_name(target))
+
+    def _unexpected(self, events: Sequence[Sent | Published], happened: Happened) -> Iterator[Failure]:
+        first, count = events[0], len(events)
+        times = f", {count} times" if count > 1 else ""
+        message = f"{self._told(first, happened)}{times}; it is not expected"
+        yield Failure(happened.step.expected.span, message, self._place(first))
+
+    def _differences(self, item: Item, event: Sent | Published, happened: Happened) -> Iterator[Failure]:
+        content, moments = item.content, happened.moments(event.at)
+        match content, event:
+            case Unchanged(), Sent():
+                trims = self._table.endpoints[event.endpoint].trim_trailing_zeros
+                if event.data not in {data.rstrip(b"\0") if trims else data for _, data in happened.given}:
+                    yield Failure(item.span, f"{self._told(event, happened)}, not what was given", self._place(event))
+            case bytes(), Sent():
+                if event.data != content:
+                    message = f"{event.endpoint} gets the bytes {event.data.hex(' ')}, not {content.hex(' ')}"
+                    yield Failure(item.span, message, self._place(event))
+            case Payload(), Sent():
+                yield from self._payload(content, item.span, event, happened)
+            case Message(), Published():
+                found = reference_cdr.parse(content.type, event.cdr)
+                for difference in content.fields.differences((), content.type, found, moments):
+                    yield self._failure(difference, event, event.topic, happened)
+
+    def _payload(self, expected: Payload, span: SourceSpan, event: Sent, happened: Happened) -> Iterator[Failure]:
+        try:
+            decoded = self._wire.decode(event.data)
+        except DecodeError as error:
+            yield Failure(span, f"{event.endpoint} gets no envelope: {error}", self._place(event))
+            return
+        if decoded.case.name != expected.case.name:
+            message = f"{self._told(event, happened)}, not {expected.case.name}"
+            yield Failure(span, message, self._place(event))
+        elif expected.fields is not None:
+            kind, moments = expected.case.type, happened.moments(event.at)
+            for difference in expected.fields.differences((), kind, decoded.message, moments):
+                yield self._failure(difference, event, event.endpoint, happened)
+
+    def _failure(self, difference: Difference, event: Sent | Published, target: str, happened: Happened) -> Failure:
+        is_mapped = not (isinstance(event, Sent) and event.by_deadman)
+        field = self._places.field(event.route, target, difference.path) if is_mapped else None
+        when = f", {happened.time(event)}" if event.at != happened.start else ""
+        return Failure(difference.span, f"{target}{when}: {difference}", field or self._place(event))
+
+    # what is not delivered
+
+    def _rejected(self, expected: Expected, events: Sequence[Rejected]) -> Iterator[Failure]:
+        came = Counter(event.reason for event in events)
+        wanted = expected.rejected or Located({}, expected.span)
+        if came != Counter(wanted.value):
+            detail = events[0].detail if events else ""
+            message = f"rejected: {_counts(came)}, not {_counts(wanted.value)}" + (f" ({detail})" if detail else "")
+            yield Failure(wanted.span, message)
+
+    def _routes(self, expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
+        taken = {event.route for event in events if isinstance(event, Received)}
+        if expected.route is not None and taken != {expected.route.value}:
+            found = f"the route is {', '.join(sorted(taken))}" if taken else "no route takes it"
+            yield Failure(expected.route.span, f"{found}, not {expected.route.value}")
+
+    def _dropped(self, expected: Expected, happened: Happened) -> Iterator[Failure]:
+        came: dict[str, list[Dropped]] = {}
+        for event in happened.events:
+            if isinstance(event, Dropped):
+                came.setdefault(event.target, []).append(event)
+        for target in dict.fromkeys((*expected.dropped, *came)):
+            wanted = expected.dropped.get(target, Located[Counted]({}, expected.span))
+            counts = Counter(event.reason for event in came.get(target, ()))
+            if counts != Counter(wanted.value):
+                details = {event.detail: None for event in came.get(target, ()) if event.detail}
+                detail = f" ({next(iter(details))})" if details else ""
+                message = f"dropped for {target}: {_counts(counts)}, not {_counts(wanted.value)}{detail}"
+                place = self._place(came[target][0]) if target in came else self._places.of_name(target)
+                yield Failure(wanted.span, message, place)
+
+    def _filtered(self, expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
+        came = Counter(event.target for event in events if isinstance(event, Filtered))
+        if expected.filtered is not None and came != Counter(expected.filtered.value):
+            message = f"withheld from: {_counts(came)}, not {_counts(expected.filtered.value)}"
+            yield Failure(expected.filtered.span, message)
+
+    # words
+
+    def _told(self, event: Event, happened: Happened) -> str:
+        when = happened.time(event)
+        match event:
+            case Sent():
+                by = f" by the deadman of {event.route}" if event.by_deadman else ""
+                return f"{when} {self._datagram(event.data)} is sent to {event.endpoint}{by}"
+            case Published():
+                kind = self._type(event)
+                inside = f" {shown(kind, reference_cdr.parse(kind, event.cdr))}" if kind else ""
+                return f"{when}{inside} is published on {event.topic}"
+            case Dropped():
+                return f"{when} {event.target} misses one as {event.reason}"
+        return when
+
+    def _datagram(self, data: bytes) -> str:
+        try:
+            decoded = self._wire.decode(data)
+        except DecodeError:
+            return data.hex(" ")
+        return f"{decoded.case.name} {shown(decoded.case.type, decoded.message)}"
+
+    def _type(self, event: Published) -> MessageType | None:
+        return self._places.type(event.route, event.topic)
+
+    def _place(self, event: Event) -> Place | None:
+        match event:
+            case Sent(by_deadman=True):
+                return self._places.deadman(event.route)
+            case Sent():
+                return self._places.target(event.route, event.endpoint)
+            case Published():
+                return self._places.target(event.route, event.topic)
+            case Dropped() | Filtered():
+                return self._places.target(event.route, event.target)
+        return None
+
+
+def _by_target(events: Iterable[Sent | Published]) -> Mapping[str, list[Sent | Published]]:
+    found: dict[str, list[Sent | Published]] = {}
+    for event in events:
+        found.setdefault(event.endpoint if isinstance(event, Sent) else event.topic, []).append(event)
+    return found
+
+
+def _counts(counts: Counted) -> str:
+    """`stale, 3 rate_limited`."""
+    listed = (f"{count} {name}" if count > 1 else name for name, count in sorted(counts.items()))
+    return ", ".join(listed) or "nothing"

@@ -1,0 +1,73 @@
+"""The shape of a test file: schemas/table-test.schema.json decides, what does not fit is told as tables tell it."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from router.assets import asset
+from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
+from router.table.compose import compose
+from router.table.nodes import MappingNode, Node, is_sound, key_at, node_at, to_data
+from router.table.sentences import Misfit, finding, subject
+from router.table.source import read_source
+
+if TYPE_CHECKING:
+    from jsonschema import Draft7Validator
+
+SCHEMA = "schemas/table-test.schema.json"
+
+
+def read_shape(path: Path) -> MappingNode:
+    """The nodes of a test file whose shape is right. Raises TableError with every finding."""
+    findings: list[Diagnostic] = []
+    source = read_source(path)
+    root = compose(source, {}, findings)
+    if not isinstance(root, MappingNode):
+        message = "a test file is a mapping with the key 'tests'"
+        raise TableError([*findings, Diagnostic(root.span, Code.WRONG_TYPE, message)])
+    if not findings and is_sound(root):
+        findings += _findings(root, SourceSpan(source.file))
+    if findings:
+        raise TableError(sorted(findings, key=lambda found: (found.span, found.message)))
+    return root
+
+
+def _findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
+    for error in _validator().iter_errors(to_data(root)):
+        misfit = Misfit.of(error)
+        if misfit.keyword == "additionalProperties":
+            yield from _unknown_keys(misfit, node_at(root, misfit.path))
+        elif not misfit.path:
+            yield Diagnostic(whole, Code.MISSING_KEY, "a test file has its tests under the key 'tests'")
+        elif misfit.keyword == "anyOf":
+            yield replace(finding(misfit, root), code=Code.BAD_VALUE)
+        elif misfit.keyword == "required":
+            key = key_at(root, misfit.path)
+            missing = misfit.message.split("'")[1]
+            what = f"a step says what it expects: '{missing}' is missing"
+            yield Diagnostic(key.span if key else node_at(root, misfit.path).span, Code.MISSING_KEY, what)
+        else:
+            yield finding(misfit, root)
+
+
+def _unknown_keys(misfit: Misfit, node: Node) -> Iterator[Diagnostic]:
+    assert isinstance(node, MappingNode)  # noqa: S101 - only a mapping has keys
+    known = list(misfit.schema["properties"])
+    owner = "a test file" if not misfit.path else subject(misfit.path)
+    for name, entry in node.entries.items():
+        if name not in known:
+            hint = did_you_mean(name, known)
+            yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
+
+
+@functools.lru_cache(maxsize=1)
+def _validator() -> Draft7Validator:
+    from jsonschema import Draft7Validator  # takes as long to import as all the rest
+
+    schema: Any = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))
+    return Draft7Validator(schema)

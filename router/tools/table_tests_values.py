@@ -1,0 +1,215 @@
+"""Fields of a test file as what is expected of a message, and as messages that are given to a table.
+
+Knows nodes and types. What does not fit is raised as UnsoundError, with its place.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from router.compiler.implementations import NS_PER_SECOND
+from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.table.reading import UnsoundError
+from router.table.units import parse_duration
+from router.tools import UsageError
+from router.tools.fields import parse
+from router.tools.table_tests_matching import (
+    TIMES,
+    AnyValue,
+    Exactly,
+    ListMatch,
+    Match,
+    MessageMatch,
+    Moment,
+    Moments,
+    Near,
+    default_of,
+)
+from router.types.model import Bytes, Enum, Float, Int, List, MessageType, Type
+
+RECEIVED_AT = "received_at"
+ANY = "any"
+_ROUGHLY = re.compile(r"~ ?([-+]?[0-9]+(?:\.([0-9]*))?(?:[eE]([-+]?[0-9]+))?)")
+_WITHIN = re.compile(r"(\S+) *(?:\+-|\+/-|±) *(\S+)")
+
+
+class FieldReader:
+    """`enums` are those whose values may be named. Of what is `given`, every value is said exactly."""
+
+    def __init__(self, enums: Iterable[Enum], given: bool = False) -> None:
+        self._numbers = {name: number for enum in enums for name, number in enum.values}
+        self._given = given
+
+    def message(self, kind: MessageType, node: Node) -> MessageMatch:
+        if not isinstance(node, MappingNode):
+            raise _unsound(node.span, Code.WRONG_TYPE, f"{kind} is a message: write its fields, {{name: value}}")
+        members: dict[str, Match] = {}
+        for path, span, value in _flat(node):
+            self._put(members, kind, path, span, value)
+        return MessageMatch(members, node.span)
+
+    def _put(self, members: dict[str, Match], kind: MessageType, path: str, span: SourceSpan, value: Node) -> None:
+        name, dot, rest = path.partition(".")
+        field = kind.field(name)
+        if field is None:
+            hint = did_you_mean(name, [member.name for member in kind.fields])
+            raise _unsound(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
+        if not dot:
+            if name in members:
+                raise _unsound(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
+            members[name] = self.value(field.type, value, kind)
+            return
+        if not isinstance(field.type, MessageType):
+            raise _unsound(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields")
+        inner = members.get(name)
+        if inner is not None and not isinstance(inner, MessageMatch):
+            raise _unsound(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
+        below = dict(inner.members) if inner else {}
+        self._put(below, field.type, rest, span, value)
+        members[name] = MessageMatch(below, span)
+
+    def value(self, kind: Type, node: Node, holder: MessageType) -> Match:
+        if not self._given and _is_word(node, ANY):
+            return AnyValue(node.span)
+        if isinstance(kind, MessageType):
+            return self._submessage(kind, node)
+        if isinstance(kind, List):
+            return self._list(kind, node, holder)
+        if not isinstance(node, ScalarNode):
+            raise _unsound(node.span, Code.WRONG_TYPE, f"a {kind} takes one value")
+        return self._scalar(kind, node, holder)
+
+    def _submessage(self, kind: MessageType, node: Node) -> Match:
+        if isinstance(node, ScalarNode) and kind.name in TIMES:
+            return Moment(_offset(node), node.span)
+        if isinstance(node, ScalarNode) and len(kind.fields) == 1:  # as a table fills it
+            (only,) = kind.fields
+            return MessageMatch({only.name: self.value(only.type, node, kind)}, node.span)
+        return self.message(kind, node)
+
+    def _list(self, kind: List, node: Node, holder: MessageType) -> Match:
+        if not isinstance(node, SequenceNode):
+            raise _unsound(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
+        if kind.length is not None and len(node.items) != kind.length:
+            message = f"{kind} has {kind.length} elements, not {len(node.items)}"
+            raise _unsound(node.span, Code.TYPE_MISMATCH, message)
+        return ListMatch(tuple(self.value(kind.element, item, holder) for item in node.items), node.span)
+
+    def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Match:
+        text = node.text
+        if isinstance(kind, (Int, Float)) and not self._given and (near := _near(text, node.span)):
+            return near
+        if isinstance(kind, Int) and (number := self._named(text, holder)) is not None:
+            text = str(number)
+        if isinstance(kind, Bytes):
+            text = text.replace(" ", "")
+        try:
+            return Exactly(parse(kind, text, ""), node.span)
+        except UsageError as error:
+            raise _unsound(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
+
+    def _named(self, text: str, holder: MessageType) -> int | None:
+        """The value of a ROS constant or a protobuf enum's value: `STATUS_FIX`, `NavSatStatus.STATUS_FIX`."""
+        name = text.rpartition(".")[2]
+        if not name.isidentifier():
+            return None
+        found = holder.constants.get(name, self._numbers.get(name))
+        return found if isinstance(found, int) else None
+
+
+def _flat(node: MappingNode) -> Iterator[tuple[str, SourceSpan, Node]]:
+    for name, entry in node.entries.items():
+        yield name, entry.key.span, entry.value
+
+
+def _near(text: str, span: SourceSpan) -> Near | None:
+    """`~1.571` is what rounds to that, `1.57 +- 0.01` what is that near."""
+    if found := _ROUGHLY.fullmatch(text):
+        digits = len(found[2] or "") - int(found[3] or 0)
+        return Near(float(found[1]), 0.5 * 10.0**-digits, text, span)
+    if found := _WITHIN.fullmatch(text):
+        try:
+            return Near(float(found[1]), float(found[2]), text, span)
+        except ValueError:
+            raise _unsound(span, Code.BAD_VALUE, f"'{text}' is not two numbers, as in 1.57 +- 0.01") from None
+    return None
+
+
+def _offset(node: ScalarNode) -> int | None:
+    if node.text == RECEIVED_AT:
+        return None
+    if node.value == 0:
+        return 0
+    try:
+        return parse_duration(node.text)
+    except ValueError as error:
+        hint = f"a time is '{RECEIVED_AT}', or so long after the beginning of the test, such as 300ms"
+        raise _unsound(node.span, Code.BAD_VALUE, str(error), hint) from error
+
+
+def _is_word(node: Node, word: str) -> bool:
+    """The word without quotes: with them it is text."""
+    return isinstance(node, ScalarNode) and node.text == word and node.place.is_whole_line
+
+
+def _unsound(span: SourceSpan, code: Code, message: str, hint: str = "") -> UnsoundError:
+    return UnsoundError(Diagnostic(span, code, message, hint))
+
+
+# messages to give to a table
+
+
+def fill(message: Any, kind: MessageType, given: MessageMatch, moments: Moments) -> None:
+    """Sets the fields of a protobuf message."""
+    for name, match in given.members.items():
+        field = kind.field(name)
+        assert field is not None  # noqa: S101 - it was read with this type
+        member = getattr(message, name)
+        match match:
+            case MessageMatch():
+                member.SetInParent()
+                assert isinstance(field.type, MessageType)  # noqa: S101
+                fill(member, field.type, match, moments)
+            case Moment():
+                member.seconds, member.nanos = divmod(match.time(moments), NS_PER_SECOND)
+            case ListMatch():
+                assert isinstance(field.type, List)  # noqa: S101
+                _extend(member, field.type.element, match, moments)
+            case Exactly():
+                setattr(message, name, match.value)
+
+
+def _extend(values: Any, element: Type, given: ListMatch, moments: Moments) -> None:
+    for item in given.items:
+        if isinstance(item, MessageMatch) and isinstance(element, MessageType):
+            fill(values.add(), element, item, moments)
+        elif isinstance(item, Exactly):
+            values.append(item.value)
+
+
+def values(kind: MessageType, given: MessageMatch, moments: Moments) -> Mapping[str, Any]:
+    """A ROS message as its values by name, those that were not given at their default."""
+    made = default_of(kind)
+    for name, match in given.members.items():
+        field = kind.field(name)
+        assert field is not None  # noqa: S101 - it was read with this type
+        made[name] = _plain(field.type, match, moments)
+    found: Mapping[str, Any] = made
+    return found
+
+
+def _plain(kind: Type, match: Match, moments: Moments) -> Any:
+    match match:
+        case MessageMatch() if isinstance(kind, MessageType):
+            return values(kind, match, moments)
+        case Moment():
+            seconds, nanoseconds = divmod(match.time(moments), NS_PER_SECOND)
+            return {"sec": seconds, "nanosec": nanoseconds}
+        case ListMatch() if isinstance(kind, List):
+            return [_plain(kind.element, item, moments) for item in match.items]
+        case Exactly():
+            return match.value
+    raise AssertionError(f"{match} cannot be given")
