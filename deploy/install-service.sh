@@ -1,0 +1,96 @@
+#!/usr/bin/env bash
+# Installs the router of this checkout as a systemd service, and starts it. `make install-service` calls it, as root.
+#
+#   deploy/install-service.sh [TABLE]     the table is routes/rover.yaml unless said; run it again after changing
+#                                         the addresses of its listeners, its `record.directory`, or the checkout's place
+#
+# It writes rover-router.service, .socket and -hold.service to /etc/systemd/system, /etc/default/rover-router once, and
+# makes the user rover-router. docs/operations.md tells how to live with the service, and how to remove it.
+set -euo pipefail
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+units=/etc/systemd/system
+settings=/etc/default/rover-router
+user=rover-router
+
+die() {
+  printf 'install-service: %s\n' "$@" >&2
+  exit 1
+}
+
+[ "$(id -u)" = 0 ] || die "needs root: sudo make install-service"
+[ -x "$root/.venv/bin/router" ] || die "$root has no .venv yet: run 'make setup' first, as yourself"
+command -v systemctl >/dev/null || die "this computer has no systemd"
+
+if [ ! -e "$settings" ]; then
+  cat >"$settings" <<END
+# What rover-router.service is started with, for its next restart. After another ROUTER_TABLE, or other addresses of its
+# listeners, run deploy/install-service.sh again.
+ROUTER_TABLE=$root/routes/rover.yaml
+ROS_DOMAIN_ID=0
+#BASESTATION=192.168.0.10:9000
+END
+fi
+if [ $# -gt 0 ]; then
+  table=$(realpath -e "$1") || die "there is no table $1"
+  sed -i "s|^ROUTER_TABLE=.*|ROUTER_TABLE=$table|" "$settings"
+fi
+
+# What the units have to know of the table: "socket ADDRESS", "write FOLDER", "read FOLDER"; findings go to stderr.
+facts=$(
+  set -a
+  # shellcheck disable=SC1090
+  . "$settings"
+  # shellcheck disable=SC1091
+  . "$root/.venv/env.sh"
+  "$root/.venv/bin/python" - "$root" <<'END'
+import os, sys
+from pathlib import Path
+from router.cli.findings import print_findings
+from router.compiler import check_table
+
+checked = check_table(Path(os.environ["ROUTER_TABLE"]))
+print_findings(checked.diagnostics, sys.stderr)
+if checked.program is None:
+    sys.exit(78)
+table = checked.program.table
+for listener in checked.program.listeners:
+    print("socket", listener.address)
+if table.record is not None:
+    print("write", table.record.directory.resolve())
+read = {Path(sys.argv[1]), Path(sys.base_prefix), *(file.resolve().parent for file in table.files)}
+for folder in sorted(read):
+    if folder.parts[:2] in (("/", "home"), ("/", "root")):
+        print("read", folder)
+END
+) || die "the table that $settings names has errors"
+
+id "$user" >/dev/null 2>&1 || useradd --system --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin "$user"
+
+for unit in rover-router.service rover-router.socket rover-router-hold.service; do
+  sed -e "s|/opt/rover-router|$root|g" "$root/deploy/systemd/$unit" >"$units/$unit.new"
+done
+addresses=$(printf '%s\n' "$facts" | sed -n 's/^socket /ListenDatagram=/p')
+awk -v addresses="$addresses" '/^ListenDatagram=/ { print addresses; next } { print }' \
+  "$units/rover-router.socket.new" >"$units/rover-router.socket.newer"
+mv "$units/rover-router.socket.newer" "$units/rover-router.socket.new"
+
+# Home folders are hidden from the service, but for what it needs there.
+mkdir -p "$units/rover-router.service.d"
+{
+  printf '# Written by deploy/install-service.sh.\n[Service]\n'
+  printf '%s\n' "$facts" | sed -n 's/^read /BindReadOnlyPaths=/p; s/^write /BindPaths=/p'
+} >"$units/rover-router.service.d/places.conf"
+printf '%s\n' "$facts" | sed -n 's/^write //p' | while read -r folder; do
+  [ -d "$folder" ] || install -d -o "$user" -g "$user" "$folder"
+done
+
+same_socket=$(cmp -s "$units/rover-router.socket.new" "$units/rover-router.socket" && echo yes || echo no)
+for unit in rover-router.service rover-router.socket rover-router-hold.service; do
+  mv "$units/$unit.new" "$units/$unit"
+done
+systemctl daemon-reload
+if [ "$same_socket" = no ]; then systemctl stop rover-router.service rover-router.socket rover-router-hold.service; fi
+systemctl enable --quiet rover-router.socket rover-router.service
+systemctl start rover-router.socket
+systemctl restart rover-router.service || die "it did not start; see: journalctl -u rover-router -e"
+echo "install-service: rover-router is running; see: systemctl status rover-router, journalctl -u rover-router -f"

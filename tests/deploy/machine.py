@@ -1,0 +1,172 @@
+"""A small machine of its own: a real systemd as process 1, in namespaces, over a copy-on-write view of this computer.
+
+What is installed there is gone with it. Needs root, overlayfs and a systemd; where one is missing, tests skip.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+SYSTEMD = Path("/usr/lib/systemd/systemd")
+PATIENCE = 60.0
+
+BOOT = r"""
+set -e
+base=$1
+mount --make-rprivate /
+mount -t tmpfs tmpfs "$base"
+mkdir -p "$base"/upper "$base"/work "$base"/root
+mount -t overlay overlay -o lowerdir=/,upperdir="$base"/upper,workdir="$base"/work "$base"/root
+cd "$base"/root
+mount -t proc proc proc
+mount -t sysfs sysfs sys
+mount -t cgroup2 cgroup2 sys/fs/cgroup
+mount --rbind /dev dev
+for folder in run tmp dev/shm var/lib/systemd; do mount -t tmpfs -o mode=1777 tmpfs $folder; done
+chmod 755 run var/lib/systemd
+ip link set lo up
+# Of what this computer starts at boot, nothing.
+rm -rf etc/systemd/system etc/systemd/journald.conf.d etc/machine-id
+mkdir -p etc/systemd/system etc/systemd/journald.conf.d
+printf '[Journal]\nStorage=volatile\nReadKMsg=no\nAudit=no\nForwardToSyslog=no\n' > etc/systemd/journald.conf.d/test.conf
+cd etc/systemd/system
+ln -s /lib/systemd/system/basic.target default.target
+for unit in systemd-udevd systemd-udev-trigger systemd-tmpfiles-setup systemd-tmpfiles-setup-dev systemd-sysctl \
+  systemd-modules-load systemd-random-seed systemd-update-utmp systemd-remount-fs systemd-sysusers ldconfig \
+  systemd-network-generator networking systemd-pstore; do ln -s /dev/null $unit.service; done
+for unit in dev-hugepages dev-mqueue sys-kernel-debug sys-kernel-tracing sys-kernel-config sys-fs-fuse-connections tmp
+do ln -s /dev/null $unit.mount; done
+cd "$base"/root
+mkdir -p old
+pivot_root . old
+umount -l /old
+export container=test
+exec /usr/lib/systemd/systemd --system --log-target=null --show-status=0
+"""
+
+
+class Machine:
+    """`run` runs a command there, as root."""
+
+    def __init__(self, init: int) -> None:
+        self._enter = ["nsenter", "-t", str(init), "--mount", "--pid", "--net", "--uts", "--ipc", "--cgroup"]
+
+    def run(self, *command: object, check: bool = True, **more: str) -> subprocess.CompletedProcess[str]:
+        finished = subprocess.run(
+            [*self._enter, "--", *map(str, command)],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE,
+            cwd="/",
+            env={"PATH": os.environ["PATH"], "LANG": "C.UTF-8", **more},
+        )
+        assert not check or finished.returncode == 0, f"{command}\n{finished.stdout}\n{finished.stderr}"
+        return finished
+
+    def shell(self, script: str, check: bool = True) -> str:
+        finished = self.run("sh", "-c", script, check=check)
+        return finished.stdout + finished.stderr
+
+    def journal(self, unit: str = "rover-router") -> str:
+        return self.run("journalctl", "--unit", unit, "--no-pager", "--output", "cat").stdout
+
+    def state(self, unit: str = "rover-router") -> str:
+        return self.run("systemctl", "is-active", unit, check=False).stdout.strip()
+
+    def show(self, name: str, unit: str = "rover-router") -> str:
+        return self.run("systemctl", "show", "--property", name, "--value", unit).stdout.strip()
+
+    def wait_for(self, script: str) -> None:
+        deadline = monotonic() + PATIENCE
+        while self.run("sh", "-c", script, check=False).returncode:
+            assert monotonic() < deadline, f"{script}\n{self.journal()}"
+            sleep(0.05)
+
+
+def why_not() -> str | None:
+    """What keeps this computer from running a machine within it."""
+    if os.geteuid() != 0:
+        return "needs root"
+    for tool in ("unshare", "nsenter", "pivot_root", "ip", "systemctl"):
+        if shutil.which(tool) is None:
+            return f"needs {tool}"
+    if not SYSTEMD.exists():
+        return "needs systemd"
+    if "overlay" not in Path("/proc/filesystems").read_text():
+        return "needs overlayfs"
+    return None if _cgroups() else "needs cgroup2"
+
+
+def _cgroups() -> Path | None:
+    mounts = (line.split() for line in Path("/proc/self/mounts").read_text().splitlines())
+    return next((Path(folder) for _, folder, kind, *_ in mounts if kind == "cgroup2"), None)
+
+
+@contextmanager
+def machine(base: Path) -> Iterator[Machine]:
+    """Booted; `base` is an empty folder."""
+    if reason := why_not():
+        pytest.skip(f"no machine within this one: {reason}")
+    cgroups = _cgroups()
+    assert cgroups is not None
+    own = cgroups / f"router-test-{os.getpid()}"
+    own.mkdir()
+    script = f'echo $$ > {own}/cgroup.procs; exec unshare -mpnuiC --fork --kill-child bash -c "$1" boot "$2"'
+    booting = subprocess.Popen(
+        ["bash", "-c", script, "enter", BOOT, str(base)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        yield _booted(booting)
+    finally:
+        booting.kill()  # and with it, by --kill-child, everything in there
+        booting.communicate()
+        _remove(own)
+
+
+def _booted(booting: subprocess.Popen[str]) -> Machine:
+    deadline = monotonic() + PATIENCE
+    children = Path(f"/proc/{booting.pid}/task/{booting.pid}/children")
+    while monotonic() < deadline:
+        if booting.poll() is not None:
+            pytest.skip(f"no machine within this one: {booting.communicate()[0]}")
+        child = children.read_text().split()
+        if child and Path(f"/proc/{child[0]}/comm").read_text().strip() == "systemd":
+            found = Machine(int(child[0]))
+            if found.run("systemctl", "is-system-running", check=False).stdout.strip() in ("running", "degraded"):
+                return found
+        sleep(0.05)
+    raise AssertionError("the machine did not come up")
+
+
+def _remove(cgroup: Path) -> None:
+    """Those below it first. The kernel needs a moment to see the last process gone."""
+    deadline = monotonic() + PATIENCE
+    for folder in sorted(cgroup.rglob("*/"), key=lambda each: -len(each.parts)):
+        if folder.is_dir():
+            _remove_one(folder, deadline)
+    _remove_one(cgroup, deadline)
+
+
+def _remove_one(folder: Path, deadline: float) -> None:
+    while True:
+        try:
+            folder.rmdir()
+        except OSError:
+            if monotonic() > deadline:
+                raise
+            sleep(0.05)
+        else:
+            return
