@@ -18,7 +18,11 @@ from router.errors import shown_path
 
 FRESH_SECONDS = 0.5
 
-MEASURES: dict[str, Measures] = {"narrow": NARROW, "wide": WIDE._replace(width=860, letters=30)}
+MEASURES: dict[str, Measures] = {
+    "narrow": NARROW._replace(letters=17, letter=5.5),
+    "wide": WIDE._replace(width=880, letters=30, pad=22),
+}
+"""In wide boxes there is room for a number beside the name."""
 
 
 class Status:
@@ -96,6 +100,7 @@ def _as_json(drawing: RouteMap) -> dict[str, Any]:
         "pad": measures.pad,
         "head": measures.head,
         "port": measures.port,
+        "rates": measures.pad > NARROW.pad,
         "nodes": nodes,
         "links": links,
     }
