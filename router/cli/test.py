@@ -12,6 +12,7 @@ from router.cli.findings import FORMATS, print_findings
 from router.cli.test_report import print_results, summary
 from router.compiler.definitions import Definitions
 from router.errors import Diagnostic, TableError
+from router.table import in_order
 from router.tools.table_tests import find_test_files, prove
 from router.tools.table_tests_coverage import Coverage
 from router.tools.table_tests_reading import read_test_file
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     if findings:
         print_findings(findings, sys.stderr, "github" if args.format == "github" else "text")
     print_results(results, coverages or {}, sys.stdout, args.format)
-    if args.format == "text":
+    if args.format == "text" and (results or not findings):
         print(summary(results, len(files)))
     if findings:
         return BAD_TABLE
@@ -73,4 +74,4 @@ def _proven(
             coverage = coverages.setdefault(file.checked.path, Coverage.of(file))
         results += prove(file, only, coverage)
     findings.update(dict.fromkeys(finding for result in results for finding in result.findings))
-    return results, list(findings)
+    return results, in_order(list(findings))

@@ -45,7 +45,8 @@ class Happened:
         return Moments(self.start, times[-1] if times else at)
 
     def time(self, event: Event) -> str:
-        return f"at {(event.at - self.start) / 1e6:g} ms"
+        """`at 500 ms `, nothing at the beginning of the test."""
+        return f"at {(event.at - self.start) / 1e6:g} ms " if event.at != self.start else ""
 
 
 class Comparison:
@@ -57,10 +58,7 @@ class Comparison:
     def failures(self, step: Step, happened: Happened) -> Iterator[Failure]:
         """In the order in which a person would look for them."""
         expected = step.expected
-        for event in happened.early:
-            if isinstance(event, (Sent, Published, Dropped)):
-                what = f"before this step, {self._told(event, happened)}; no step expects it"
-                yield Failure(expected.span, what, self._place(event))
+        yield from self._early(expected, happened)
         rejected = [event for event in happened.events if isinstance(event, Rejected)]
         yield from self._rejected(expected, rejected)
         yield from self._routes(expected, happened.events)
@@ -70,6 +68,17 @@ class Comparison:
         yield from self._delivered(expected.published, _by_target(published), happened, bool(rejected))
         yield from self._dropped(expected, happened)
         yield from self._filtered(expected, happened.events)
+
+    def _early(self, expected: Expected, happened: Happened) -> Iterator[Failure]:
+        """What happened since the step before, at no time that a step has."""
+        by_place: dict[Place | None, list[Event]] = {}
+        for event in happened.early:
+            if isinstance(event, (Sent, Published, Dropped)):
+                by_place.setdefault(self._place(event), []).append(event)
+        for place, events in by_place.items():
+            more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
+            message = f"before this step, {self._told(events[0], happened)}{more}; no step expects it"
+            yield Failure(expected.span, message, place)
 
     # what is delivered
 
@@ -148,8 +157,8 @@ class Comparison:
     def _failure(self, difference: Difference, event: Sent | Published, target: str, happened: Happened) -> Failure:
         is_mapped = not (isinstance(event, Sent) and event.by_deadman)
         field = self._places.field(event.route, target, difference.path) if is_mapped else None
-        when = f", {happened.time(event)}" if event.at != happened.start else ""
-        return Failure(difference.span, f"{target}{when}: {difference}", field or self._place(event))
+        when = happened.time(event)
+        return Failure(difference.span, f"{when}{target}: {difference}", field or self._place(event))
 
     # what is not delivered
 
@@ -168,14 +177,16 @@ class Comparison:
             yield Failure(expected.route.span, f"{found}, not {expected.route.value}")
 
     def _dropped(self, expected: Expected, happened: Happened) -> Iterator[Failure]:
+        nothing: Located[Counted] = Located({}, expected.span)
         came: dict[str, list[Dropped]] = {}
         for event in happened.events:
             if isinstance(event, Dropped):
                 came.setdefault(event.target, []).append(event)
         for target in dict.fromkeys((*expected.dropped, *came)):
-            wanted = expected.dropped.get(target, Located[Counted]({}, expected.span))
+            wanted = expected.dropped.get(target, nothing)
             counts = Counter(event.reason for event in came.get(target, ()))
-            if counts != Counter(wanted.value):
+            is_told = target not in expected.dropped and (target in expected.sent or target in expected.published)
+            if counts != Counter(wanted.value) and not is_told:
                 details = {event.detail: None for event in came.get(target, ()) if event.detail}
                 detail = f" ({next(iter(details))})" if details else ""
                 message = f"dropped for {target}: {_counts(counts)}, not {_counts(wanted.value)}{detail}"
@@ -195,13 +206,13 @@ class Comparison:
         match event:
             case Sent():
                 by = f" by the deadman of {event.route}" if event.by_deadman else ""
-                return f"{when} {self._datagram(event.data)} is sent to {event.endpoint}{by}"
+                return f"{when}{self._datagram(event.data)} is sent to {event.endpoint}{by}"
             case Published():
                 kind = self._type(event)
-                inside = f" {shown(kind, reference_cdr.parse(kind, event.cdr))}" if kind else ""
+                inside = shown(kind, reference_cdr.parse(kind, event.cdr)) if kind else "a message"
                 return f"{when}{inside} is published on {event.topic}"
             case Dropped():
-                return f"{when} {event.target} misses one as {event.reason}"
+                return f"{when}{event.target} misses one as {event.reason}"
         return when
 
     def _datagram(self, data: bytes) -> str:

@@ -16,6 +16,7 @@ from google.protobuf.message import Message
 
 from router.compiler.implementations import NS_PER_SECOND
 from router.errors import SourceSpan
+from router.tools.rehearsal import START
 from router.tools.show import float_text
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
@@ -91,8 +92,7 @@ class Moment:
         return moments.now if self.offset is None else moments.start + self.offset
 
     def differences(self, path: Path, kind: Type, actual: Any, moments: Moments) -> Iterator[Difference]:
-        seconds, nanoseconds = (getattr(actual, field.name) for field in _fields(kind))
-        found = seconds * NS_PER_SECOND + nanoseconds
+        found = _time(kind, actual)
         if found != self.time(moments):
             expected = self.time(moments) - moments.start
             yield Difference(path, f"{expected / 1e6:g} ms", f"{(found - moments.start) / 1e6:g} ms", self.span)
@@ -142,6 +142,8 @@ def path_text(path: Path) -> str:
 def shown(kind: Type, value: Any) -> str:
     """A value as a test would write it, on one line."""
     match kind:
+        case MessageType() if kind.name in TIMES:
+            return f"{(_time(kind, value) - START) / 1e6:g} ms"
         case MessageType():
             inner = ", ".join(words(kind, value))
             return f"{{{inner}}}"
@@ -214,6 +216,12 @@ def _same(kind: Type, expected: Any, actual: Any) -> bool:
     if isinstance(kind, Int):
         return int(expected) == int(actual)
     return bool(expected == actual)
+
+
+def _time(kind: Type, value: Any) -> int:
+    """A message of TIMES in ns."""
+    seconds, nanoseconds = (getattr(value, field.name) for field in _fields(kind))
+    return int(seconds * NS_PER_SECOND + nanoseconds)
 
 
 def _fields(kind: Type) -> tuple[Field, ...]:

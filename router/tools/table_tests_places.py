@@ -8,7 +8,7 @@ from router.compiler import Checked
 from router.compiler.checked import CheckedTarget
 from router.compiler.plan import Each, Items, Leaf, Plan, Record
 from router.errors import SourceSpan
-from router.tools.table_tests_matching import Path
+from router.tools.table_tests_matching import Path, path_text
 from router.types.model import MessageType
 
 
@@ -58,7 +58,7 @@ class Places:
             if plan is None:
                 return Place(served.target.span, "forwarded here")
             if (span := _filled(plan, path)) is not None:
-                return Place(span, f"what fills {path[-1]}")
+                return Place(span, f"what fills {path_text(path)}")
         return self.target(route, target, "nothing here fills it")
 
 

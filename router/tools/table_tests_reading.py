@@ -5,6 +5,7 @@ Knows the language of tests; what a field's value may be is `table_tests_values`
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -45,7 +46,7 @@ def read_test_file(path: Path, definitions: Definitions) -> TableTestFile:
 def _table_of(root: MappingNode, path: Path) -> Path:
     named = root.get("table")
     if isinstance(named, ScalarNode):
-        table = path.parent / named.text
+        table = Path(os.path.normpath(path.parent / named.text))
         if not table.is_file():
             message = f"there is no table '{named.text}' beside this file"
             raise TableError([Diagnostic(named.span, Code.BAD_FILE, message)])

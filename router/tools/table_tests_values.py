@@ -40,7 +40,11 @@ class FieldReader:
     """`enums` are those whose values may be named. Of what is `given`, every value is said exactly."""
 
     def __init__(self, enums: Iterable[Enum], given: bool = False) -> None:
-        self._numbers = {name: number for enum in enums for name, number in enum.values}
+        self._numbers: dict[str, set[int]] = {}
+        for enum in enums:
+            for name, number in enum.values:
+                for known in (name, f"{enum.name.rpartition('.')[2]}.{name}"):
+                    self._numbers.setdefault(known, set()).add(number)
         self._given = given
 
     def message(self, kind: MessageType, node: Node) -> MessageMatch:
@@ -102,7 +106,7 @@ class FieldReader:
         text = node.text
         if isinstance(kind, (Int, Float)) and not self._given and (near := _near(text, node.span)):
             return near
-        if isinstance(kind, Int) and (number := self._named(text, holder)) is not None:
+        if isinstance(kind, Int) and (number := self._named(text, holder, node.span)) is not None:
             text = str(number)
         if isinstance(kind, Bytes):
             text = text.replace(" ", "")
@@ -111,13 +115,16 @@ class FieldReader:
         except UsageError as error:
             raise _unsound(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
 
-    def _named(self, text: str, holder: MessageType) -> int | None:
-        """The value of a ROS constant or a protobuf enum's value: `STATUS_FIX`, `NavSatStatus.STATUS_FIX`."""
-        name = text.rpartition(".")[2]
-        if not name.isidentifier():
-            return None
-        found = holder.constants.get(name, self._numbers.get(name))
-        return found if isinstance(found, int) else None
+    def _named(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
+        """The value of a ROS constant of the message, or of a protobuf enum: `STATUS_FIX`, `GPSFixQuality.RTK_FIX`."""
+        found = holder.constants.get(text.removeprefix(f"{holder.short_name}."))
+        if isinstance(found, int):
+            return found
+        numbers = self._numbers.get(text, set())
+        if len(numbers) > 1:
+            message = f"several enums have a value '{text}', with different numbers"
+            raise _unsound(span, Code.BAD_VALUE, message, f"say of which enum, as in State.{text}")
+        return next(iter(numbers), None)
 
 
 def _flat(node: MappingNode) -> Iterator[tuple[str, SourceSpan, Node]]:
