@@ -31,6 +31,9 @@ _PATIENCE = 0.25
 
 _TIMEVAL = struct.Struct("@ll")
 
+_MOST_WAITING = 1 << 16
+"""Datagrams that are taken from a socket at its end, at most: more than a receive buffer holds."""
+
 _TURN = 4
 """The most that one of several listeners may hand in while the others wait."""
 
@@ -52,8 +55,10 @@ class ReceiveThread:
         enough: Callable[[], int],
         failed: Callable[[Exception], None],
     ) -> None:
-        self._listeners = listeners
-        self._intakes = [_Intake(listener, receive[listener.name], limit + 1, enough) for listener in listeners]
+        self._size = limit + 1
+        self._enough = enough
+        self._intakes: list[_Intake] = []
+        self.serve(listeners, receive)
         self._failed = failed
         self._ended = False
         self._turns = 0
@@ -68,14 +73,21 @@ class ReceiveThread:
     def start(self) -> None:
         self._thread.start()
 
+    def serve(self, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
+        """From now on these listeners, each by `receive[listener.name]`. For a task only, once it has started."""
+        self._listeners = listeners
+        self._intakes = [_Intake(each, receive[each.name], self._size, self._enough) for each in listeners]
+
     def give_to(self, receive: Mapping[str, Receive]) -> None:
-        """From the next datagram on, each listener's go to `receive[listener]`. Returns when that is so."""
+        """From now on each listener's datagrams go to `receive[listener.name]`. For a task only."""
+        for intake in self._intakes:
+            intake.receive = receive[intake.listener.name]
 
-        def give() -> None:
-            for intake in self._intakes:
-                intake.receive = receive[intake.name]
-
-        self.between(give)
+    def finish(self, listener: Listener) -> None:
+        """Lets nothing new in, and handles what the kernel already holds. For a task, before `serve` without it."""
+        listener.end_input()
+        [intake] = (each for each in self._intakes if each.listener is listener)
+        self._empty(intake)
 
     def between(self, task: Callable[[], None]) -> None:
         """Has the thread call `task` between two datagrams, and returns when that is done; raises what it raises.
@@ -105,24 +117,43 @@ class ReceiveThread:
                 self._tasks.popleft()()
 
     def stop(self) -> None:
-        """Lets nothing new in, handles what the kernel already holds, and returns when that is done."""
+        """Lets nothing new in, handles what the kernel already holds, and returns when that is done.
+
+        What is in a socket that was inherited stays there, for whoever has it next.
+        """
         for listener in self._listeners:
             listener.end_input()
-        self._ended = True
+        self._tasks.append(self._end)
         self._thread.join()
 
-    def _run(self) -> None:
-        receive_all = self._from_one if len(self._intakes) == 1 else self._from_many
-        while True:
+    def _end(self) -> None:
+        for intake in self._intakes:
+            if not intake.listener.is_inherited:
+                self._empty(intake)
+        self._ended = True
+
+    def _empty(self, intake: _Intake) -> None:
+        for _ in range(_MOST_WAITING):
             try:
-                if receive_all():
-                    return self._do_tasks()
+                if not intake.take(1):
+                    return
+            except Exception as error:  # noqa: BLE001 as below
+                self._failed(error)
+
+    def _run(self) -> None:
+        while not self._ended:
+            try:
+                if len(self._intakes) == 1:
+                    self._from_one()
+                else:
+                    self._from_many()
                 self._do_tasks()
             except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, is no reason to stop receiving
                 self._failed(error)
+        self._do_tasks()
 
-    def _from_one(self) -> bool:
-        """One system call per datagram: a blocking receive is also the wait. True at the end, False for tasks."""
+    def _from_one(self) -> None:
+        """Until there are tasks. One system call per datagram: a blocking receive is also the wait."""
         [intake] = self._intakes
         receive, receive_from, size, tasks = intake.receive, intake.receive_from, intake.size, self._tasks
         intake.wait_at_most(_PATIENCE)
@@ -134,43 +165,36 @@ class ReceiveThread:
                     data, peer = receive_from(size, _WAIT)
                 except BlockingIOError:
                     break
-                if peer is None:
-                    return True
+                if peer is None:  # input has ended
+                    return
                 receive(data, peer)
                 if tasks:
-                    return False
+                    return
             rest = intake.coalescing.first(monotonic_ns() - since)
             while rest and not tasks:
                 self._turns += 1
                 time.sleep(rest)
                 rest = intake.coalescing.next(intake.take(sys.maxsize))
-        return False
 
-    def _from_many(self) -> bool:
-        """Few datagrams per listener and turn, so that a flooded one cannot starve the others. Returns as `_from_one`.
+    def _from_many(self) -> None:
+        """The same; few datagrams per listener and turn, so that a flooded one cannot starve the others.
 
         Those that coalesce are not waited for, but looked at when they have rested.
         """
         with select.epoll() as waiting:
-            open_ones = {intake.descriptor: intake for intake in self._intakes}
-            for descriptor in open_ones:
+            intakes = {intake.descriptor: intake for intake in self._intakes}
+            for descriptor in intakes:
                 waiting.register(descriptor, select.EPOLLIN)
             looks: dict[int, float] = {}  # of those that coalesce: when, by time.monotonic
-            while open_ones:
-                if self._tasks:
-                    return False
+            while not self._tasks:
                 self._turns += 1
-                ended = self._ended  # before looking: what arrives after that is still taken
                 for descriptor in _ready(waiting, looks):
-                    taken, rest = open_ones[descriptor].take_one()
+                    _, rest = intakes[descriptor].take_one()
                     if rest:
                         waiting.modify(descriptor, 0)
                         looks[descriptor] = time.monotonic() + rest
-                    elif not taken and ended:
-                        waiting.unregister(descriptor)
-                        del open_ones[descriptor]
                 for descriptor in _due(looks):
-                    taken, rest = open_ones[descriptor].take_some()
+                    taken, rest = intakes[descriptor].take_some()
                     if taken == _TURN:
                         continue
                     if rest:
@@ -178,7 +202,6 @@ class ReceiveThread:
                     else:
                         waiting.modify(descriptor, select.EPOLLIN)
                         del looks[descriptor]
-        return True
 
 
 def _ready(waiting: select.epoll, looks: Mapping[int, float]) -> list[int]:
@@ -199,7 +222,7 @@ class _Intake:
     """One listener's datagrams, and how long it rests between looks."""
 
     def __init__(self, listener: Listener, receive: Receive, size: int, enough: Callable[[], int]) -> None:
-        self.name = listener.name
+        self.listener = listener
         self.descriptor = listener.socket.fileno()
         self._socket = listener.socket
         self.receive_from = listener.socket.recvfrom

@@ -32,8 +32,7 @@ class Listener:
     """
 
     def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
-        self.name = plan.name
-        self.coalesce = plan.coalesce
+        self._plan = plan
         handed = inherited().take(plan.address)
         self.is_inherited = handed is not None
         self.socket = handed or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -49,6 +48,21 @@ class Listener:
             raise StartError(f"{span}: {_why_not_bound(plan, error)}") from error
         self.address = Address(*self.socket.getsockname())
         self._drops_at_close = 0
+
+    @property
+    def name(self) -> str:
+        return self._plan.name
+
+    @property
+    def coalesce(self) -> int:
+        """The longest rest, in ns."""
+        return self._plan.coalesce
+
+    def follow(self, plan: ListenerPlan) -> None:
+        """Is what another table calls and wants of the same address."""
+        if plan.receive_buffer != self._plan.receive_buffer:
+            _want_receive_buffer(self.socket, plan)
+        self._plan = plan
 
     def kernel_drops(self) -> int:
         """Datagrams that the kernel threw away before anybody received them, since the socket was opened."""
