@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from router.compiler.books import Books
 from router.compiler.checked import CheckedGateway, CheckedRoute
 from router.compiler.definitions import Definitions
 from router.compiler.gateways import check_gateways
@@ -47,11 +48,15 @@ class Checked:
     @cached_property
     def program(self) -> Program | None:
         """Made when first asked for: `validate` needs none, nor what makes it."""
+        return self.program_in(None)
+
+    def program_in(self, books: Books | None) -> Program | None:
+        """A program that counts in these books, if they are given: they continue those of another one."""
         from router.compiler.link import link
 
         if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
             return None
-        return link(self.table, self.schema, self.envelope, self.routes, self.gateways, self.own_topics)
+        return link(self.table, self.schema, self.envelope, self.routes, self.gateways, self.own_topics, books)
 
 
 def check_table(

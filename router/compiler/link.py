@@ -44,9 +44,13 @@ def link(
     routes: Sequence[CheckedRoute],
     gateways: Sequence[CheckedGateway] = (),
     own_topics: Sequence[tuple[Topic, MessageType]] = (),
+    books: Books | None = None,
 ) -> Program:
-    """`own_topics` are published by the router itself, whatever its routes do."""
-    books = Books()
+    """`own_topics` are published by the router itself, whatever its routes do.
+
+    `books` are to be counted in, where the program takes over from another one (`Books.continued`).
+    """
+    books = books or Books()
     _open_books(books, table, envelope)
     _open_own_books(books, table)
     served = [checked for checked in routes if not checked.route.ignore]
@@ -83,7 +87,7 @@ def link(
         outbound=outbound,
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
-        protos_sha256=schema.sha256,
+        protos=schema,
         gateways=tuple(link_gateway(checked, books) for checked in gateways),
     )
 

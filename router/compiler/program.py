@@ -13,7 +13,7 @@ from types import CodeType
 from router.compiler.books import Books
 from router.table.model import Address, Framing, Gateway, Keep, Priority, RouteTable
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, PayloadCase
+from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
 STRANGER = None
 """Stands among a handler's sources for a sender that is no endpoint of the table."""
@@ -170,5 +170,9 @@ class Program:
     outbound: Mapping[str, tuple[Handler, ...]]
     deadmen: tuple[DeadmanPlan, ...]
     ignored: frozenset[int]
-    protos_sha256: str
+    protos: ProtoSchema
     gateways: tuple[GatewayPlan, ...] = ()
+
+    @property
+    def protos_sha256(self) -> str:
+        return self.protos.sha256

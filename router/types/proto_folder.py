@@ -71,3 +71,8 @@ def sha256_of(files: Mapping[str, bytes]) -> str:
         digest.update(f"{name}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()
+
+
+def folder_sha256(root: Path, blame: SourceSpan) -> str:
+    """Of a folder as it is now. Raises TableError, as `read_folder` does."""
+    return sha256_of(read_folder(root, blame))
