@@ -38,14 +38,17 @@ def read_shape(path: Path) -> MappingNode:
 
 
 def _findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
-    for error in _validator().iter_errors(to_data(root)):
-        misfit = Misfit.of(error)
+    misfits = [Misfit.of(error) for error in _validator().iter_errors(to_data(root))]
+    misspelt = {misfit.path for misfit in misfits if misfit.keyword == "additionalProperties"}
+    for misfit in misfits:
         if misfit.keyword == "additionalProperties":
             yield from _unknown_keys(misfit, node_at(root, misfit.path))
-        elif not misfit.path:
+        elif not misfit.path and misfit.path not in misspelt:
             yield Diagnostic(whole, Code.MISSING_KEY, "a test file has its tests under the key 'tests'")
         elif misfit.keyword == "anyOf":
             yield replace(finding(misfit, root), code=Code.BAD_VALUE)
+        elif misfit.keyword == "required" and misfit.path in misspelt:
+            continue  # the key that is missing may be the one that is misspelt
         elif misfit.keyword == "required":
             key = key_at(root, misfit.path)
             missing = misfit.message.split("'")[1]
