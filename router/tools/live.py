@@ -23,7 +23,11 @@ SCRAPE_TIMEOUT = 2.0
 Labels = tuple[str, ...]
 Counts = Mapping[Labels, float]
 
+BUCKETS = "_bucket"
+"""Stands behind the name of a histogram. Its values are those of Prometheus: how many were not slower than `le`."""
+
 _LABELS = {metric.name: metric.labels for metric in METRICS}
+_LABELS |= {f"{metric.name}{BUCKETS}": (*metric.labels, "le") for metric in METRICS if metric.kind == "histogram"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +86,16 @@ class View:
 
 def scrape(address: Address) -> str:
     """The text of a router's metrics. Raises TransportError when nobody answers there."""
-    url = f"http://{address}/metrics"
+    return metrics_text(f"http://{address}")
+
+
+def metrics_text(base: str) -> str:
+    """The same of what serves HTTP at `base`, a URL or just host and port."""
+    url = f"{base.rstrip('/')}/metrics" if "://" in base else f"http://{base}/metrics"
     try:
-        with urllib.request.urlopen(url, timeout=SCRAPE_TIMEOUT) as answer:
+        with urllib.request.urlopen(url, timeout=SCRAPE_TIMEOUT) as answer:  # noqa: S310 - whoever says where says how
             text: str = answer.read().decode()
-    except (OSError, http.client.HTTPException) as error:
+    except (OSError, ValueError, http.client.HTTPException) as error:
         raise TransportError(f"no metrics at {url}: {error}") from error
     return text
 

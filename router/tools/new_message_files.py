@@ -16,6 +16,7 @@ from router.tools.new_message import NewMessage, Site
 from router.tools.new_message_proto import proto_texts
 from router.tools.new_message_ros import msg_text
 from router.tools.new_message_tables import board_table_text, forwarding_table_text
+from router.tools.new_message_testing import with_test
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +28,15 @@ class Changes:
 
 
 def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Changes:
-    """`others` are the tables beside the site's. Raises UsageError."""
+    """`others` are the tables beside the site's. Raises UsageError, and TableError for a broken test file."""
     texts = {site.schema.root / name: text for name, text in proto_texts(message, site).items()}
     texts[site.messages / f"{message.name}.msg"] = msg_text(message, site)
     path = site.table.path
     package = site.messages.parent.name
     texts[path] = board_table_text(_read(path), message, site.table, shown_path(path), package)
+    tests = path.with_name(f"{path.stem}.test{path.suffix}")
+    if tests.exists():
+        texts[tests] = with_test(tests, _read(tests), message, site)
     unrouted = []
     for other in others:
         if path in other.files or other.envelope.protos.value != site.table.envelope.protos.value:

@@ -8,19 +8,19 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from router.errors import Severity, SourceSpan, TableError
 from router.table.model import EnvelopeSettings, Located
 from router.tools import UsageError
 from router.tools.new_message import SCALARS, NewMessage, Site
+from router.tools.new_message_layout import aligned
 from router.types.lock import check_lock, extended_lock
 from router.types.lock_file import LOCK_NAME, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 
 _IMPORT = re.compile(r'import "(.*)";')
-_COMMENT_GAP = 3
 
 
 def proto_texts(message: NewMessage, site: Site) -> Mapping[str, str]:
@@ -32,14 +32,6 @@ def proto_texts(message: NewMessage, site: Site) -> Mapping[str, str]:
     before = (site.schema.root / envelope_file).read_text(encoding="utf-8")
     texts = {site.new_file(message): _declared(message, site), envelope_file: _in_envelope(before, message, site)}
     return {**texts, LOCK_NAME: _locked(texts, site)}
-
-
-def aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
-    """Lines of declarations with their comments below each other."""
-    rows = list(rows)
-    width = max((len(code) for code, comment in rows if comment), default=0) + _COMMENT_GAP
-    for code, comment in rows:
-        yield f"{code:{width}}{mark} {comment}" if comment else code
 
 
 def _declared(message: NewMessage, site: Site) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from router.tools import UsageError
 from router.tools.new_message import SCALARS, NewField, NewMessage, Site
-from router.tools.new_message_proto import aligned
+from router.tools.new_message_layout import aligned
 
 _LARGEST_CONSTANT = 255
 

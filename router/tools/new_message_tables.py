@@ -7,23 +7,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from router.table.model import ANY, EndpointKind, Route, RouteTable
 from router.tools.new_message import NewMessage
+from router.tools.new_message_layout import WIDEST, Stanza, stanza_at, with_stanza_after
 
-_WIDEST = 120
-_SECTION_WIDTH = 115
 _ONE_LINE = re.compile(r"(?P<indent> *)[\w]+:(?P<gap> +)(?P<rest>\{.*\}) *$")
-
-
-@dataclass(frozen=True, slots=True)
-class _Stanza:
-    """A route's lines in a file: `first` is that of its payload case, `end` the one behind its last; from 0."""
-
-    first: int
-    end: int
-    indent: int
 
 
 def board_table_text(text: str, message: NewMessage, table: RouteTable, file: str, package: str) -> str:
@@ -32,11 +21,8 @@ def board_table_text(text: str, message: NewMessage, table: RouteTable, file: st
     own = [route for route in table.routes if route.span.file == file]
     of_board = [route for route in own if message.board in (source.value for source in route.sources)]
     stanza = _last(of_board or own, lines)
-    indent = " " * stanza.indent
-    written = ["", *(indent + line for line in _route(message, table, package, stanza.indent))]
-    if not of_board:
-        written[:0] = ["", f"{indent}# ---- {message.board_words} ".ljust(_SECTION_WIDTH, "-")]
-    return "\n".join([*lines[: stanza.end], *written, *lines[stanza.end :]])
+    route = _route(message, table, package, stanza.indent)
+    return with_stanza_after(lines, stanza, route, "" if of_board else message.board_words)
 
 
 def forwarding_table_text(text: str, message: NewMessage, table: RouteTable, file: str) -> str | None:
@@ -55,19 +41,21 @@ def forwarding_table_text(text: str, message: NewMessage, table: RouteTable, fil
     return "\n".join([*lines[: stanza.end], line, *lines[stanza.end :]])
 
 
+def told_endpoints(message: NewMessage, table: RouteTable) -> list[str]:
+    """Who gets everything that a board says: those that are basestations."""
+    endpoints = table.endpoints.items()
+    return [name for name, each in endpoints if each.kind is EndpointKind.BASESTATION and name != message.board]
+
+
 def _forwarding(route: Route) -> tuple[tuple[str, ...], tuple[str, ...]]:
     sources = tuple(source.value for source in route.sources)
     return sources, tuple(destination.endpoint.value for destination in route.destinations)
 
 
 def _route(message: NewMessage, table: RouteTable, package: str, indent: int) -> list[str]:
-    told = [
-        name
-        for name, endpoint in table.endpoints.items()
-        if endpoint.kind is EndpointKind.BASESTATION and name != message.board
-    ]
+    told = told_endpoints(message, table)
     destinations = [f"  destinations: [{', '.join(told)}]"] if told else []
-    topics = _topics(message, package, _WIDEST - indent)
+    topics = _topics(message, package, WIDEST - indent)
     return [f"{message.case}:", f"  source: {message.board}", *destinations, *topics]
 
 
@@ -84,20 +72,5 @@ def _topics(message: NewMessage, package: str, width: int) -> list[str]:
     return ["  topics:", f"    - {keys[0]}", *(f"      {key}" for key in keys[1:])]
 
 
-def _last(routes: Sequence[Route], lines: Sequence[str]) -> _Stanza:
-    first = max(route.case.span.line for route in routes) - 1
-    indent = _indent(lines[first])
-    end = first + 1
-    while end < len(lines) and (_says_nothing(lines[end]) or _indent(lines[end]) > indent):
-        end += 1
-    while _says_nothing(lines[end - 1]):  # what stands above the next route belongs to that
-        end -= 1
-    return _Stanza(first, end, indent)
-
-
-def _says_nothing(line: str) -> bool:
-    return not line.strip() or line.lstrip().startswith("#")
-
-
-def _indent(line: str) -> int:
-    return len(line) - len(line.lstrip())
+def _last(routes: Sequence[Route], lines: Sequence[str]) -> Stanza:
+    return stanza_at(lines, max(route.case.span.line for route in routes) - 1)

@@ -21,6 +21,17 @@ ROUTE = """\
     topics: [{topic: radiation_info, type: comms/msg/SensorBoardRadiationInfo, queue_depth: 10, fields: auto}]
 
 """
+TEST = """\
+  radiation info reaches the operator and ROS as it is:
+    given:
+      case: radiation_info
+      from: sensor_board
+      fields: {dose_rate: 1.5, state: SENSOR_OPERATING, status: STATUS_OK}
+    expect:
+      sent: basestation
+      published: {radiation_info: unchanged}
+
+"""
 Files = dict[str, str]
 
 
@@ -88,14 +99,16 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
         "uint8 status        # STATUS_*",
     ]
     assert new.pop("routes/rover.yaml") == ROUTE.splitlines()
+    assert new.pop("routes/rover.test.yaml") == TEST.splitlines()
     assert new.pop("routes/legacy.yaml") == ["  radiation_info:       {source: any, destinations: [dst_a, dst_b]}"]
     assert new == {}
 
 
-def test_the_tables_are_clean_afterwards_and_the_lock_has_it_all(site: Path) -> None:
+def test_tables_and_tests_are_clean_afterwards_and_the_lock_has_it_all(site: Path) -> None:
     assert main(["new", *RADIATION, *FIELDS]) == OK
     locked = contents(site)["protos/envelope.lock.json"]
     assert main(["validate", "--strict", "routes"]) == OK
+    assert main(["test", "routes"]) == OK
     assert main(["schema", "lock", "--protos", "protos"]) == OK
     assert contents(site)["protos/envelope.lock.json"] == locked
 
@@ -132,14 +145,18 @@ def test_a_board_without_routes_gets_a_section_at_the_end(site: Path) -> None:
     assert lines[1].startswith("  # ---- container board ----")
     assert lines[3] == "  lid:"
     assert main(["validate", "--strict", "routes"]) == OK
+    assert main(["test", "routes"]) == OK
 
 
 def test_long_names_do_not_make_long_lines(site: Path) -> None:
     name = "DrivingBoardWheelSlipAndWhateverElseThereIsToKnow"
-    fields = ("--fields", "motor:MotorInformation")
+    fields = ("--fields", "left:MotorInformation right:MotorInformation")
     assert main(["new", name, "--number", "27", "--board", "driving", *fields]) == OK
     assert main(["validate", "--strict", "routes"]) == OK
-    assert all(len(line) <= 120 for line in contents(site)["routes/rover.yaml"].splitlines())
+    assert main(["test", "routes"]) == OK
+    after = contents(site)
+    lines = [*after["routes/rover.yaml"].splitlines(), *after["routes/rover.test.yaml"].splitlines()]
+    assert max(map(len, lines)) <= 120
 
 
 def test_a_table_beside_that_routes_in_its_own_way_is_left_to_a_person(

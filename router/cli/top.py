@@ -1,0 +1,111 @@
+"""`router top [TABLE]`: a running router at a glance, from its metrics."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from router.cli import DEFAULT_TABLE, OK, VERBS
+from router.cli.tool_options import explained, positive
+from router.errors import TransportError
+
+if TYPE_CHECKING:
+    from router.tools.live import Snapshot
+    from router.tools.top import Order
+
+ORDERS = ("table", "rate", "drops", "age", "latency")
+WINDOW = 3.0
+"""Seconds over which rates and latencies are told: over less, one message in two seconds is a flicker."""
+_DESCRIPTION = """Show each route of a running router: messages per second, where they went, what was dropped and why,
+the time since the last one, and how long routes took in the middle (p50) and at worst, but for one of 100 (p99). On a
+terminal it is shown again and again, and keys sort it."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser("top", help=VERBS["top"], description=_DESCRIPTION)
+    where = parser.add_mutually_exclusive_group()
+    table = "the table that it runs, for its metrics.address (default: %(default)s)"
+    where.add_argument("table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help=table)
+    where.add_argument("--url", help="where it answers instead, as http://10.0.0.5:9108")
+    parser.add_argument(
+        "--sort", choices=ORDERS, default=ORDERS[0], help="the largest first (default: as in the table)"
+    )
+    parser.add_argument("--interval", type=positive, default=1.0, metavar="SECONDS", help="(default: %(default)g)")
+    parser.add_argument("--once", action="store_true", help="show it once and end, as where there is no terminal")
+
+
+@explained
+def run(args: argparse.Namespace) -> int:
+    """Raises TableError for a table that cannot be read."""
+    from router.tools.running_router import url_of
+    from router.tools.top import Order
+    from router.tools.wire import read_table
+
+    url = args.url or url_of(read_table(args.table))
+    if args.once or not sys.stdout.isatty():
+        _show_once(url, Order(args.sort), args.interval)
+    else:
+        _show(url, Order(args.sort), args.interval)
+    return OK
+
+
+def _look(url: str) -> Snapshot:
+    from router.tools.live import metrics_text, parse_metrics
+
+    return parse_metrics(metrics_text(url), time.time())
+
+
+def _show_once(url: str, order: Order, interval: float) -> None:
+    from rich.console import Console
+
+    from router.tools.top import top
+    from router.tools.top_view import page
+
+    before = _look(url)
+    time.sleep(interval)
+    after = _look(url)
+    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+    console.print(page(top(before, after, after.at, order)))
+
+
+_PLAIN_WIDTH = 160
+"""Columns where there is no terminal to say."""
+
+
+def _show(url: str, order: Order, interval: float) -> None:
+    """Until `q` or Ctrl-C. A router that does not answer is asked again: it may be just starting."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from router.tools.top import Order, top
+    from router.tools.top_keys import Keys
+    from router.tools.top_view import screen
+
+    console, orders = Console(), {each.key: each for each in Order}
+    looks, note = [_look(url)], ""
+    with Live(console=console, screen=True, auto_refresh=False) as live, Keys() as keys:
+        key, due = "", 0.0
+        while key != "q":
+            if time.monotonic() >= due:
+                due = time.monotonic() + interval
+                try:
+                    looks, note = [*_recent(looks), _look(url)], ""
+                except TransportError as error:
+                    note = str(error)
+            shown = top(looks[0], looks[-1], time.time(), order)
+            live.update(screen(shown, f"router top {url}", order, console.height, note), refresh=True)
+            try:
+                key = keys.wait(max(due - time.monotonic(), 0.0))
+            except KeyboardInterrupt:
+                return
+            order = orders.get(key, order)
+
+
+def _recent(looks: list[Snapshot]) -> list[Snapshot]:
+    """The last ones, of which the first is as old as the window, if there are so old ones."""
+    while len(looks) > 1 and looks[-1].at - looks[1].at >= WINDOW:
+        looks = looks[1:]
+    return looks
