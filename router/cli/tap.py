@@ -1,35 +1,57 @@
-"""`router tap [HOST:]PORT | --topic NAME`: what arrives on a UDP port or a ROS topic, one line each."""
+"""`router tap [CASE...]`: what a running router receives; with PLACE or `--topic NAME`, a UDP port or a ROS topic."""
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import add_wire_options, explained, load_wire, whole
-from router.errors import StartError
+from router.errors import StartError, nearest
 from router.tools import UsageError
 
 if TYPE_CHECKING:
+    from router.table.model import RouteTable
     from router.tools.tapping import Heard, HeardMessage
+    from router.tools.wire import Wire
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "tap",
         help=VERBS["tap"],
-        description="Print each envelope that arrives on a UDP port, or each message on a ROS topic, as one line: "
-        "the fields that are not default.",
+        description="Print what a running router receives, before it routes it, one line for each datagram: the fields "
+        "that are not default. The router is asked where the table's 'metrics.address' says, on this computer; it "
+        "does not wait for this terminal, and says how many datagrams were too many for it. With a port, or the name "
+        "of an endpoint or listener, it is that UDP port instead, which must be free: no router then has part in it.",
+        epilog="router tap;  router tap imu_info gps_info;  router tap --from arm_board;  "
+        "router tap imu_info --where 'accel_z < 0 or not is_calibrated';  router tap 9000;  "
+        "router tap --topic imu_data",
     )
-    where = parser.add_mutually_exclusive_group(required=True)
-    where.add_argument("place", nargs="?", metavar="[HOST:]PORT", help="or an endpoint or listener of the table")
-    where.add_argument("--topic", metavar="NAME", help="a ROS topic instead")
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="CASE",
+        help="of a running router only these payload cases (default: all); or one [HOST:]PORT, endpoint or listener",
+    )
+    parser.add_argument(
+        "--from",
+        dest="sources",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="only from this endpoint or IP address; several are possible",
+    )
+    parser.add_argument(
+        "--where", metavar="EXPR", help="only what this expression of the table's language holds for: 'satellites < 4'"
+    )
+    parser.add_argument("--url", metavar="URL", help="of the running router (default: the table's metrics.address)")
+    parser.add_argument("--topic", metavar="NAME", help="a ROS topic instead")
     parser.add_argument("--type", metavar="TYPE", help="of the topic (default: what its publishers say)")
-    parser.add_argument("--count", type=whole, metavar="N", help="end after N (default: at Ctrl-C)")
+    parser.add_argument("--count", type=whole, metavar="N", help="end after N messages (default: at Ctrl-C)")
     parser.add_argument("--json", action="store_true", help="one JSON object per line")
     parser.add_argument("--hex", action="store_true", help="with the bytes of each")
     add_wire_options(parser)
@@ -39,29 +61,85 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     if args.type and not args.topic:
         raise UsageError("--type belongs to --topic")
+    if args.topic and args.words:
+        raise UsageError(f"either --topic {args.topic} or '{args.words[0]}'")
     try:
-        with _topic(args) if args.topic else _port(args) as hearing:
-            for heard in itertools.islice(hearing, args.count):
-                print(heard.json(args.hex) if args.json else heard.line(args.hex), flush=True)
+        if args.topic:
+            with _topic(args) as hearing:
+                _print(([heard] for heard in hearing), args)
+        else:
+            _tap_datagrams(args)
     except KeyboardInterrupt:
         return 0
     return 0
 
 
+def _tap_datagrams(args: argparse.Namespace) -> None:
+    wire, table = load_wire(args)
+    if not args.words or all(word in wire.envelope.cases for word in args.words) or len(args.words) > 1:
+        _running(args, wire, table)
+        return
+    word, names = args.words[0], (*table.endpoints, *table.listeners) if table else ()
+    if nearest(word, (*wire.envelope.cases, *names)) in set(wire.envelope.cases).difference(names):
+        wire.case(word)  # which says which one was meant
+    if args.sources or args.where or args.url:
+        raise UsageError("--from, --where and --url belong to a running router")
+    with _port(args, wire, table) as hearing:
+        _print(([heard] for heard in hearing), args)
+
+
+def _print(batches: Iterable[Sequence[Heard | HeardMessage]], args: argparse.Namespace) -> None:
+    """A batch is written at once: a system call for each line would cost more than the line."""
+    left = args.count
+    for batch in batches:
+        shown = batch[:left]
+        if shown:
+            lines = (heard.json(args.hex) if args.json else heard.line(args.hex) for heard in shown)
+            print("\n".join(lines), flush=True)
+        if left is not None and (left := left - len(shown)) == 0:
+            return
+
+
+def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> None:
+    from router.edges.background import background_threads
+    from router.tools.conditions import Condition
+    from router.tools.places import peer_names
+    from router.tools.running_router import tap, url_of
+    from router.tools.running_tap import RunningTap
+
+    cases = [wire.case(word) for word in args.words]
+    condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
+    if args.url is None and table is None:
+        raise UsageError("--table or --url says which running router")
+    url = args.url or url_of(table) if table is not None else args.url
+    taken = RunningTap(wire, peer_names(table), args.words, condition)
+    wanted = args.words or (sorted(condition.cases) if condition else [])
+    # The router goes before whatever runs on its computer to watch it.
+    with background_threads(), tap(url, wanted, args.sources) as batches:
+        _say(f"tapping the router at {url}; Ctrl-C ends it")
+        try:
+            _print(taken.take(batches), args)
+        finally:
+            if taken.missed:
+                _say(f"{taken.missed} datagrams were too many for this terminal; the router routed them all the same")
+            if condition is not None and condition.failure:
+                _say(f"where --where fails nothing is shown: {condition.failure}")
+
+
 @contextmanager
-def _port(args: argparse.Namespace) -> Iterator[Iterator[Heard | HeardMessage]]:
+def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Iterator[Iterator[Heard]]:
     from router.tools import places
     from router.tools.tapping import listen
 
-    wire, table = load_wire(args)
-    with places.open_udp(places.listening(args.place, table), args.place) as receiver:
+    place = args.words[0]
+    with places.open_udp(places.listening(place, table), place) as receiver:
         host, port = receiver.getsockname()
         _say(f"listening on {host}:{port}; Ctrl-C ends it")
         yield listen(receiver, wire, places.peer_names(table))
 
 
 @contextmanager
-def _topic(args: argparse.Namespace) -> Iterator[Iterator[Heard | HeardMessage]]:
+def _topic(args: argparse.Namespace) -> Iterator[Iterator[HeardMessage]]:
     try:
         from router.edges.ros_listen import TopicListener
     except ImportError as error:

@@ -52,10 +52,12 @@ def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
 
 
 @contextmanager
-def tap(url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()) -> Iterator[Iterator[Seen | Lost]]:
+def tap(url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()) -> Iterator[Iterator[list[Seen | Lost]]]:
     """What a running router receives from now on: of these payload cases, from these endpoints; none means all.
 
-    Raises UsageError for what the router refuses, TransportError where none answers, and later when it has ended.
+    It comes in batches, of which there is an empty one each second while nothing comes. What is of no known payload
+    case comes in any case. Raises UsageError for what the router refuses, TransportError where none answers, and
+    later when it has ended.
     """
     words = urlencode([*(("case", case) for case in cases), *(("from", source) for source in sources)])
     with closing(_connection(url, PATIENCE)) as connection:
@@ -65,7 +67,7 @@ def tap(url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()) -> Ite
         yield _stream(response, url)
 
 
-def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[Seen | Lost]:
+def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[Seen | Lost]]:
     reader = StreamReader()
     while True:
         try:
@@ -74,7 +76,7 @@ def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[Seen | Los
             raise TransportError(f"the router at {url} has fallen silent: {error}") from error
         if not piece:
             raise TransportError(f"the router at {url} has ended")
-        yield from reader.take(piece)
+        yield list(reader.take(piece))
 
 
 def _connection(url: str, patience: float) -> http.client.HTTPConnection:
