@@ -1,0 +1,102 @@
+"""`router top` on a terminal and without one, and a router that does not answer."""
+
+from __future__ import annotations
+
+import fcntl
+import http.server
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from router.cli import OK, main
+from tests.ports import free_port
+
+PATIENCE = 30.0
+METRICS = b"""\
+router_datagrams_received_total{listener="rover"} 7
+router_messages_received_total{route="imu_info",source="sensor_board"} 7
+router_messages_received_total{route="gps_info",source="sensor_board"} 0
+router_datagrams_sent_total{route="imu_info",destination="basestation"} 7
+router_messages_dropped_total{route="gps_info",target="basestation",reason="stale"} 2
+router_datagrams_sent_total{route="gps_info",destination="basestation"} 0
+router_endpoint_last_seen_timestamp_seconds{endpoint="sensor_board"} 0
+"""
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        assert self.path == "/metrics"
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(METRICS)
+
+    def log_message(self, *_: object) -> None:
+        """Keep quiet."""
+
+
+@pytest.fixture
+def served() -> Iterator[str]:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+def test_without_a_terminal_it_is_shown_once(served: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["top", "--url", served, "--interval", "0.01", "--sort", "drops"]) == OK
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("in 7 (0.0/s), delivered 7") or lines[0].startswith("in 7 (0/s), delivered 7")
+    assert [line.split()[0] for line in lines[3:]] == ["gps_info", "imu_info"]
+
+
+def test_the_address_is_that_of_the_table(served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "table.yaml"
+    base = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
+    table.write_text(f"version: 1\nextends: {base}\nmetrics: {{address: {served.removeprefix('http://')}}}\n")
+    assert main(["top", str(table), "--once", "--interval", "0.01"]) == OK
+    assert "imu_info" in capsys.readouterr().out
+
+
+def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["top", "--url", f"127.0.0.1:{free_port()}"]) == 1
+    assert re.fullmatch(r"router top: no metrics at http://127\.0\.0\.1:\d+/metrics: .*\n", capsys.readouterr().err)
+
+
+def read_until(terminal: int, wanted: str, seen: str = "") -> str:
+    """What the terminal shows until it shows `wanted`."""
+    limit = time.monotonic() + PATIENCE
+    while wanted not in seen:
+        ready, _, _ = select.select([terminal], [], [], limit - time.monotonic())
+        assert ready, f"no {wanted!r} in {seen!r}"
+        seen += os.read(terminal, 65536).decode()
+    return seen
+
+
+def test_on_a_terminal_keys_sort_and_end_it(served: str) -> None:
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 20, 100, 0, 0))
+    before = termios.tcgetattr(theirs)
+    command = [sys.executable, "-m", "router", "top", "--url", served, "--interval", "60"]
+    environment = {**os.environ, "TERM": "xterm"}
+    with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment) as process:
+        read_until(ours, "sorted by table")
+        os.write(ours, b"d")
+        read_until(ours, "sorted by drops")
+        os.write(ours, b"q")
+        assert process.wait(PATIENCE) == OK
+    assert termios.tcgetattr(theirs) == before
+    os.close(ours)
+    os.close(theirs)
