@@ -1,0 +1,87 @@
+"""The real Prometheus with what deploy/prometheus has, beside a router of a test."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tests.acceptance.ros_peer import PATIENCE
+from tests.acceptance.site import ROOT, wait_until
+from tests.ports import free_port
+
+PROGRAM = shutil.which("prometheus")
+SCRAPED = "127.0.0.1:9108"
+"""Whom prometheus.yml scrapes."""
+
+
+class PrometheusServer:
+    """Scrapes `router` four times a second; keeps everything in `folder`."""
+
+    def __init__(self, folder: Path, router: str) -> None:
+        assert PROGRAM
+        self.address = f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
+        config = folder / "config"
+        shutil.copytree(ROOT / "deploy/prometheus", config)
+        _patch(config / "prometheus.yml", {SCRAPED: router, "_interval: 5s": "_interval: 250ms"})
+        with (folder / "prometheus.log").open("w") as log:
+            self._process = subprocess.Popen(
+                [
+                    PROGRAM,
+                    f"--config.file={config / 'prometheus.yml'}",
+                    f"--storage.tsdb.path={folder / 'data'}",
+                    f"--web.listen-address={self.address}",
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+
+    def __enter__(self) -> PrometheusServer:
+        wait_until(self._is_ready, "Prometheus being ready")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.terminate()
+        self._process.wait(PATIENCE)
+
+    def query(self, expression: str) -> list[dict[str, Any]]:
+        """The series that an expression gives now, each with `metric` (labels) and `value`."""
+        found: list[dict[str, Any]] = self._get("query", query=expression)["result"]
+        return found
+
+    def firing(self, alert: str) -> list[Mapping[str, str]]:
+        """The labels with which an alert fires now."""
+        alerts = self._get("alerts")["alerts"]
+        return [each["labels"] for each in alerts if each["labels"]["alertname"] == alert and each["state"] == "firing"]
+
+    def _get(self, what: str, **parameters: str) -> Any:
+        url = f"http://{self.address}/api/v1/{what}?{urllib.parse.urlencode(parameters)}"
+        try:
+            with urllib.request.urlopen(url, timeout=PATIENCE) as answer:
+                return json.load(answer)["data"]
+        except urllib.error.HTTPError as error:
+            raise AssertionError(f"{parameters}: {error.read().decode()}") from error
+
+    def _is_ready(self) -> bool:
+        assert self._process.poll() is None, "Prometheus ended; see prometheus.log"
+        try:
+            with urllib.request.urlopen(f"http://{self.address}/-/ready", timeout=PATIENCE) as answer:
+                return bool(answer.status == 200)
+        except OSError:
+            return False
+
+
+def _patch(file: Path, changes: Mapping[str, str]) -> None:
+    text = file.read_text()
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    file.write_text(text)

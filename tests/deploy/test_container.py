@@ -1,0 +1,107 @@
+"""deploy/container, as far as it can be checked where no container runs."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from router.compiler import check_table
+from tests.deploy.prometheus_server import SCRAPED
+
+ROOT = Path(__file__).parent.parent.parent
+FOLDER = ROOT / "deploy/container"
+DOCKERFILE = (FOLDER / "Dockerfile").read_text()
+COMPOSE = yaml.safe_load((FOLDER / "compose.yaml").read_text())
+HADOLINT = shutil.which("hadolint", path=f"{Path(sys.executable).parent}:/usr/local/bin:/usr/bin:/bin")
+
+
+@pytest.mark.skipif(HADOLINT is None, reason="hadolint is not installed")
+def test_hadolint_has_nothing_to_say() -> None:
+    assert HADOLINT
+    told = subprocess.run([HADOLINT, FOLDER / "Dockerfile"], stdout=subprocess.PIPE, text=True, check=False)
+    assert told.stdout == ""
+    assert told.returncode == 0
+
+
+def test_what_is_copied_exists_and_reaches_the_build() -> None:
+    copied = [words.split()[:-1] for words in re.findall(r"^COPY (?!--from)(.+)$", DOCKERFILE, re.MULTILINE)]
+    files = [file for files in copied for file in files]
+    allowed = [line[1:] for line in (FOLDER / "Dockerfile.dockerignore").read_text().splitlines() if line[:1] == "!"]
+    assert files
+    for file in files:
+        assert (ROOT / file).exists()
+        assert any(Path(file).is_relative_to(folder) for folder in allowed)
+    assert all(any(Path(file).is_relative_to(folder) for file in files) for folder in allowed)
+
+
+def test_the_entry_point_is_a_program_that_bash_can_read() -> None:
+    bash = shutil.which("bash")
+    assert bash
+    entry = FOLDER / "entrypoint.sh"
+    assert entry.stat().st_mode & 0o111 == 0o111
+    assert subprocess.run([bash, "-n", entry], check=False).returncode == 0
+    assert f'ENTRYPOINT ["/opt/rover_router/{entry.name}"]' in DOCKERFILE
+
+
+def test_health_is_asked_where_the_rovers_table_serves_it() -> None:
+    table = check_table(ROOT / "routes/rover.yaml").table
+    assert table is not None
+    assert table.metrics is not None
+    assert str(table.metrics.value) == SCRAPED
+    assert f"ROUTER_METRICS={SCRAPED}\n" in DOCKERFILE
+    [command] = re.findall(r"^ +CMD (\[.+\])$", DOCKERFILE, re.MULTILINE)
+    interpreter, option, code = yaml.safe_load(command)
+    assert (interpreter, option) == ("python3", "-c")
+    compile(code, "HEALTHCHECK", "exec")
+    assert "/ready" in code
+
+
+@pytest.mark.parametrize("name", COMPOSE["services"])
+def test_a_service_uses_the_hosts_network_and_mounts_what_there_is(name: str) -> None:
+    service = COMPOSE["services"][name]
+    assert service["network_mode"] == "host"
+    assert "ports" not in service
+    for mounted in service["volumes"]:
+        source = mounted.split(":")[0]
+        assert (FOLDER / source).exists() if source.startswith(".") else source in COMPOSE["volumes"]
+    assert "build" in service or re.search(r":v?\d+\.\d+\.\d+$", service["image"])
+
+
+def test_compose_builds_this_dockerfile_in_the_root_of_the_checkout() -> None:
+    build = COMPOSE["services"]["router"]["build"]
+    assert (FOLDER / build["context"]).resolve() == ROOT
+    assert ROOT / build["dockerfile"] == FOLDER / "Dockerfile"
+
+
+def test_grafana_is_provisioned_with_our_prometheus_and_our_dashboard() -> None:
+    provisioning = ROOT / "deploy/grafana/provisioning"
+    [source] = _provisioned(provisioning / "datasources/prometheus.yml")["datasources"]
+    [provider] = _provisioned(provisioning / "dashboards/rover.yml")["providers"]
+    listening = COMPOSE["services"]["prometheus"]["command"][-1]
+    assert source["type"] == "prometheus"
+    assert listening == f"--web.listen-address={source['url'].removeprefix('http://')}"
+    grafana = COMPOSE["services"]["grafana"]
+    home = f"{provider['options']['path']}/rover.json"
+    assert grafana["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"] == home
+    assert f"../grafana/rover.json:{home}:ro" in grafana["volumes"]
+    assert "../grafana/provisioning:/etc/grafana/provisioning:ro" in grafana["volumes"]
+
+
+def test_nobody_can_log_in_to_change_things() -> None:
+    environment = COMPOSE["services"]["grafana"]["environment"]
+    assert environment["GF_AUTH_ANONYMOUS_ORG_ROLE"] == "Viewer"
+    assert environment["GF_SECURITY_DISABLE_INITIAL_ADMIN_CREATION"] == "true"
+    assert environment["GF_AUTH_BASIC_ENABLED"] == "false"
+
+
+def _provisioned(file: Path) -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load(file.read_text())
+    assert found["apiVersion"] == 1
+    return found

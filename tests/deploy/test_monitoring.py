@@ -1,0 +1,176 @@
+"""A running router, the real Prometheus and our rules: every series exists, every query has an answer, alerts fire."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from threading import Event, Thread
+from typing import Any
+from urllib.request import urlopen
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from websockets.sync.client import connect
+
+from tests.acceptance.payloads import generated
+from tests.acceptance.rover_map import FLOWS
+from tests.acceptance.site import ROOT, ROVER, RouterProcess, Site, site, wait_until
+from tests.deploy.prometheus_server import PROGRAM, PrometheusServer
+from tests.deploy.promql import selectors
+from tests.deploy.test_prometheus import ALERTS, RECORDED
+from tests.ports import free_port
+
+MONITORED = (
+    ROVER.replace("tests/acceptance/patient.yaml", "routes/rover.yaml")
+    + """
+gateways:
+  dashboard: {{transport: {{websocket: 127.0.0.1:@}}}}
+record: {{directory: recordings}}
+"""
+)
+"""The rover, with all that has metrics, and its own times for what is silent and for its deadmen."""
+
+MADE_BY_PROMETHEUS = {"up"}
+
+
+@dataclass
+class Traffic:
+    """Every case from who sends it, ten times a second, but for what is `paused`."""
+
+    place: Site
+    paused: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._datagrams = {case: next(generated(case)).datagram for case in FLOWS}
+        self._end = Event()
+        self._thread = Thread(target=self._run)
+
+    def __enter__(self) -> Traffic:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._end.wait(0.1):
+            for case in FLOWS.keys() - self.paused:
+                self.place.send(FLOWS[case].source, self._datagrams[case])
+            self.place.waiting()
+
+
+@dataclass
+class Monitored:
+    address: str
+    traffic: Traffic
+
+
+@pytest.fixture(scope="module")
+def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
+    """A router with traffic, and a browser at its gateway."""
+    folder, gateway = tmp_path_factory.mktemp("monitored"), free_port(kind=socket.SOCK_STREAM)
+    with (
+        site(folder) as place,
+        RouterProcess(folder, place.table(MONITORED.replace("@", str(gateway)))),
+        connect(f"ws://127.0.0.1:{gateway}", close_timeout=0.1),  # it reads nothing, so that it is behind
+        Traffic(place) as traffic,
+    ):
+        yield Monitored(f"127.0.0.1:{place.metrics}", traffic)
+
+
+@pytest.fixture(scope="module")
+def prometheus(monitored: Monitored, tmp_path_factory: pytest.TempPathFactory) -> Iterator[PrometheusServer]:
+    if PROGRAM is None:
+        pytest.skip("prometheus is not installed; it is a package of Debian's")
+    with PrometheusServer(tmp_path_factory.mktemp("prometheus"), monitored.address) as server:
+        wait_until(lambda: bool(server.query("count_over_time(up[1m]) > 2")), "the third scrape")
+        yield server
+
+
+def queries() -> list[str]:
+    """All of the dashboard's."""
+    dashboard = json.loads((ROOT / "deploy/grafana/rover.json").read_text())
+    panels = [inner for panel in dashboard["panels"] for inner in (panel, *panel.get("panels", ()))]
+    return [target["expr"] for panel in panels for target in panel.get("targets", ())]
+
+
+EXPRESSIONS = {*queries(), *(alert["expr"] for alert in ALERTS.values()), *RECORDED.values()}
+
+
+def test_every_series_that_dashboard_rules_and_alerts_ask_for_is_exposed(monitored: Monitored) -> None:
+    with urlopen(f"http://{monitored.address}/metrics", timeout=10) as answer:
+        families = text_string_to_metric_families(answer.read().decode())
+    exposed = [(sample.name, sample.labels) for family in families for sample in family.samples]
+    asked = {selector for expression in EXPRESSIONS for selector in selectors(expression)}
+    missing = [
+        selector
+        for selector in asked
+        if selector.metric not in MADE_BY_PROMETHEUS | set(RECORDED)
+        and not any(selector.selects(name, labels) for name, labels in exposed)
+    ]
+    assert asked
+    assert missing == []
+
+
+def test_the_rover_is_scraped_as_it_is_configured(monitored: Monitored, prometheus: PrometheusServer) -> None:
+    [target] = prometheus.query("up")
+    assert target["metric"] == {"__name__": "up", "job": "rover_router", "instance": monitored.address}
+    assert target["value"][1] == "1"
+
+
+def test_every_rule_records_something(prometheus: PrometheusServer) -> None:
+    wait_until(lambda: all(prometheus.query(name) for name in RECORDED), "the first evaluation")
+
+
+def test_every_query_of_the_dashboard_has_an_answer(monitored: Monitored, prometheus: PrometheusServer) -> None:
+    """Those that leave out what is 0 may have none: there all is well, or nothing came."""
+    empty = []
+    for query in queries():
+        filled = query.replace("$instance", monitored.address).replace("$__rate_interval", "1m")
+        assert "$" not in filled
+        if not prometheus.query(filled) and "> 0" not in query:
+            empty.append(query)
+    assert empty == []
+
+
+@pytest.mark.parametrize("case", FLOWS)
+def test_a_routes_panels_show_what_it_does(case: str, monitored: Monitored, prometheus: PrometheusServer) -> None:
+    about = [query for query in queries() if f'route="{case}"' in query]
+    shown: dict[str, Any] = {}
+    for query in about:
+        filled = query.replace("$instance", monitored.address).replace("$__rate_interval", "1m")
+        shown |= {selector.metric: prometheus.query(filled) for selector in selectors(query)}
+    [age] = shown["router_route_last_message_timestamp_seconds"]
+    assert 0 <= float(age["value"][1]) < 60
+    assert float(shown["router_messages_received_total"][0]["value"][1]) > 0
+    assert any(float(bucket["value"][1]) > 0 for bucket in shown["router_route_seconds_bucket"])
+    targets = {each["metric"]["destination"] for each in shown.get("router_datagrams_sent_total", ())}
+    assert targets == set(FLOWS[case].destinations)
+
+
+def test_a_deadman_that_takes_over_is_an_alert_until_commands_come_again(
+    monitored: Monitored, prometheus: PrometheusServer
+) -> None:
+    def halted() -> set[str]:
+        return {labels["route"] for labels in prometheus.firing("DeadmanActive")}
+
+    assert halted() == set()
+    monitored.traffic.paused.add("manual_drive")
+    wait_until(lambda: halted() == {"manual_drive"}, "the alert")
+    monitored.traffic.paused.clear()
+    wait_until(lambda: halted() == set(), "the end of the alert")
+
+
+def test_who_falls_silent_is_an_alert_and_who_never_sent_is_not(
+    monitored: Monitored, prometheus: PrometheusServer
+) -> None:
+    def silent() -> set[str]:
+        return {labels["endpoint"] for labels in prometheus.firing("EndpointSilent")}
+
+    assert silent() == set()
+    monitored.traffic.paused |= {case for case, flow in FLOWS.items() if flow.source == "arm_board"}
+    wait_until(lambda: bool(silent()), "the alert")
+    assert silent() == {"arm_board"}
