@@ -36,7 +36,7 @@ ip link set lo up
 # Of what this computer starts at boot, nothing.
 rm -rf etc/systemd/system etc/systemd/journald.conf.d etc/machine-id
 mkdir -p etc/systemd/system etc/systemd/journald.conf.d
-printf '[Journal]\nStorage=volatile\nReadKMsg=no\nAudit=no\nForwardToSyslog=no\n' > etc/systemd/journald.conf.d/test.conf
+printf '[Journal]\nStorage=volatile\nReadKMsg=no\nAudit=no\n' > etc/systemd/journald.conf.d/test.conf
 cd etc/systemd/system
 ln -s /lib/systemd/system/basic.target default.target
 for unit in systemd-udevd systemd-udev-trigger systemd-tmpfiles-setup systemd-tmpfiles-setup-dev systemd-sysctl \
@@ -122,7 +122,7 @@ def machine(base: Path) -> Iterator[Machine]:
     own.mkdir()
     script = f'echo $$ > {own}/cgroup.procs; exec unshare -mpnuiC --fork --kill-child bash -c "$1" boot "$2"'
     booting = subprocess.Popen(
-        ["bash", "-c", script, "enter", BOOT, str(base)],
+        ["/bin/bash", "-c", script, "enter", BOOT, str(base)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

@@ -1,0 +1,212 @@
+"""Restarts under load of a router whose sockets belong to the service manager: what arrives meanwhile is not lost."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import pytest
+
+from tests.acceptance.payloads import WIRE, sample
+from tests.acceptance.service_manager import ServiceManager
+from tests.acceptance.site import ROOT, udp, wait_until
+from tests.ports import free_port
+
+RATE = 2000
+"""Datagrams per second and listener."""
+
+BATCH = 20
+RESTARTS = 3
+
+HOSTS = ("127.0.0.5", "127.0.0.6")
+
+TABLE = """\
+version: 1
+envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+listen: {{{listeners}}}
+endpoints:
+  driving_board: {{address: "127.0.0.222:{board}", kind: board}}
+  basestation: {{address: "127.0.0.10:{basestation}", kind: basestation}}
+routes:
+  ph_info: {{source: any, destinations: [basestation]}}
+  manual_drive:
+    source: basestation
+    destinations: [driving_board]
+    ttl: 200ms
+    deadman: {{timeout: 5s, send: {{manual_brake: {{brake: true}}}}, to: [driving_board], repeat: 1s}}
+"""
+
+
+def envelope(case: str, **values: object) -> bytes:
+    return sample(case, WIRE.envelope.cases[case].message_class(**values)).datagram
+
+
+class Stream:
+    """Numbers from a board to one listener, all the time. `sent` are all that it has sent."""
+
+    def __init__(self, to: tuple[str, int], first: int) -> None:
+        self._to = to
+        self._first = first
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self.sent: list[int] = []
+
+    def _run(self) -> None:
+        begin = monotonic()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
+            while not self._ended.is_set():
+                for _ in range(BATCH):
+                    number = self._first + len(self.sent)
+                    board.sendto(envelope("ph_info", ph_value=number), self._to)
+                    self.sent.append(number)
+                sleep(max(0.0, begin + len(self.sent) / RATE - monotonic()))
+
+    def __enter__(self) -> Stream:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+class Basestation:
+    """Takes the numbers as they come."""
+
+    def __init__(self) -> None:
+        self.socket = udp("127.0.0.10")
+        self.socket.settimeout(0.1)
+        self.received: list[int] = []
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            try:
+                message: Any = WIRE.decode(self.socket.recv(1000)).message
+            except TimeoutError:
+                continue
+            self.received.append(int(message.ph_value))
+
+    def __enter__(self) -> Basestation:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.socket.close()
+
+
+@contextmanager
+def rover(folder: Path, listeners: int, basestation: int, board: int) -> Iterator[ServiceManager]:
+    addresses = [(host, free_port(host)) for host in HOSTS[:listeners]]
+    names = (f"number_{n}: {{address: '{host}:{port}'}}" for n, (host, port) in enumerate(addresses))
+    table = folder / "table.yaml"
+    table.write_text(TABLE.format(root=ROOT, listeners=", ".join(names), basestation=basestation, board=board))
+    with closing(ServiceManager(folder, table, *addresses)) as manager:
+        yield manager
+
+
+@contextmanager
+def under_load(folder: Path, listeners: int) -> Iterator[tuple[ServiceManager, Basestation, list[Stream]]]:
+    """A router that has routed half a second of traffic, which goes on."""
+    with Basestation() as station, rover(folder, listeners, station.socket.getsockname()[1], free_port()) as manager:
+        manager.start()
+        manager.hear("READY=1")
+        streams = [Stream(held.getsockname(), 1_000_000 * n) for n, held in enumerate(manager.sockets)]
+        with streams[0]:
+            if listeners == 2:
+                with streams[1]:
+                    wait_until(lambda: len(station.received) > RATE / 2, "half a second of traffic")
+                    yield manager, station, streams
+            else:
+                wait_until(lambda: len(station.received) > RATE / 2, "half a second of traffic")
+                yield manager, station, streams
+        last = [stream.sent[-1] for stream in streams]
+        wait_until(lambda: set(last) <= set(station.received[-5000:]), "the last datagram")
+        assert manager.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.parametrize("listeners", [1, 2])
+def test_an_orderly_restart_loses_nothing(tmp_path: Path, listeners: int) -> None:
+    with under_load(tmp_path, listeners) as (manager, station, streams):
+        for _ in range(RESTARTS):
+            assert manager.end(signal.SIGTERM) == 0
+            manager.start()
+            manager.hear("READY=1")
+            sleep(0.3)
+    for n, stream in enumerate(streams):
+        received = [number for number in station.received if number // 1_000_000 == n]
+        assert received == stream.sent
+    assert manager.told.count("STOPPING=1") >= RESTARTS
+
+
+@pytest.mark.parametrize("listeners", [1, 2])
+def test_a_kill_loses_at_most_the_datagram_in_hand(tmp_path: Path, listeners: int) -> None:
+    with under_load(tmp_path, listeners) as (manager, station, streams):
+        for _ in range(RESTARTS):
+            assert manager.end(signal.SIGKILL) == -signal.SIGKILL
+            manager.start()
+            manager.hear("READY=1")
+            sleep(0.3)
+    for n, stream in enumerate(streams):
+        received = [number for number in station.received if number // 1_000_000 == n]
+        assert received == sorted(set(received))
+        assert len(set(stream.sent) - set(received)) <= RESTARTS
+
+
+@contextmanager
+def board_and_operator(folder: Path) -> Iterator[tuple[ServiceManager, socket.socket, socket.socket]]:
+    with udp("127.0.0.222") as board, udp("127.0.0.10") as operator:
+        ports = operator.getsockname()[1], board.getsockname()[1]
+        with rover(folder, 1, *ports) as manager:
+            yield manager, board, operator
+
+
+def test_the_deadman_has_the_last_word_before_a_restart(tmp_path: Path) -> None:
+    drive, brake = envelope("manual_drive", forward_backward=50), envelope("manual_brake", brake=True)
+    with board_and_operator(tmp_path) as (manager, board, operator):
+        for _ in range(2):
+            manager.start()
+            manager.hear("READY=1")
+            operator.sendto(drive, manager.sockets[0].getsockname())
+            assert board.recv(1000) == drive
+            assert manager.end(signal.SIGTERM) == 0
+            assert board.recv(1000) == brake
+
+
+def test_a_command_that_waited_for_the_router_to_start_is_stale(tmp_path: Path) -> None:
+    """Before its first start as well, when no router has asked for the time of arrival yet."""
+    drive = envelope("manual_drive", forward_backward=50)
+    with board_and_operator(tmp_path) as (manager, board, operator):
+        for _ in range(2):
+            operator.sendto(drive, manager.sockets[0].getsockname())
+            sleep(0.3)
+            manager.start()
+            manager.hear("READY=1")
+            fresh = envelope("manual_drive", turn=1)
+            operator.sendto(fresh, manager.sockets[0].getsockname())
+            assert board.recv(1000) == fresh
+            assert manager.end(signal.SIGTERM) == 0
+            assert board.recv(1000) == envelope("manual_brake", brake=True)
+        board.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            board.recv(1000)
+
+
+def test_a_socket_that_the_table_does_not_want_is_told(tmp_path: Path) -> None:
+    with board_and_operator(tmp_path) as (manager, _, _):
+        with udp("127.0.0.5") as other:
+            manager.sockets.append(other)
+            manager.start()
+            manager.hear("READY=1")
+            assert f"127.0.0.5:{other.getsockname()[1]}" in manager.text()
+            assert manager.end(signal.SIGTERM) == 0
+        manager.sockets.pop()
