@@ -84,7 +84,7 @@ class LastValues:
             "at": seen.at / 1e9,
             "source": by_address.get(seen.peer) or by_host.get(host) or f"{host}:{port}",
             "bytes": len(seen.data),
-            "fields": _shortened(fields),
+            "fields": shortened(fields),
         }
 
     def _end_when_idle(self) -> None:
@@ -100,13 +100,13 @@ class LastValues:
             self._detach = None
 
 
-def _shortened(value: Any) -> Any:
+def shortened(value: Any) -> Any:
     """Without what nobody reads on a page: the rest of long lists and of long texts."""
     if isinstance(value, dict):
-        return {key: _shortened(inner) for key, inner in value.items()}
+        return {key: shortened(inner) for key, inner in value.items()}
     if isinstance(value, list):
         left_out = len(value) - MOST_ELEMENTS
-        return [*map(_shortened, value[:MOST_ELEMENTS]), *([f"and {left_out} more"] if left_out > 0 else [])]
+        return [*map(shortened, value[:MOST_ELEMENTS]), *([f"and {left_out} more"] if left_out > 0 else [])]
     if isinstance(value, str) and len(value) > MOST_CHARACTERS:
         return f"{value[:MOST_CHARACTERS]}… ({len(value)} characters)"
     return value

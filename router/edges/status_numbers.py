@@ -28,7 +28,7 @@ def numbers(samples: Iterable[Sample]) -> Numbers:
     """
     found: Numbers = {"routes": {}, "endpoints": {}, "listeners": {}, "unhandled": {}, "reload": {}}
     for name, labels, value in samples:
-        if take := _TAKERS.get(name.removeprefix(PREFIX)):
+        if take := TAKERS.get(name.removeprefix(PREFIX)):
             take(found, labels, value)
     return found
 
@@ -120,7 +120,7 @@ def _reload(key: str) -> Taker:
     return take
 
 
-_TAKERS: dict[str, Taker] = {
+TAKERS: dict[str, Taker] = {
     "messages_received_total": _received,
     **{metric: _delivered(label) for metric, label in DELIVERED.items()},
     "messages_dropped_total": _dropped,
