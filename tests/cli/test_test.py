@@ -1,0 +1,175 @@
+"""`router test` on the rover's own tables, as a person and as CI would run it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from router.assets import asset
+from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+from router.cli.test import FAILED
+from router.compiler.definitions import Definitions
+from router.table import shape
+from router.tools.table_tests import prove
+from router.tools.table_tests_reading import read_test_file
+from router.tools.table_tests_shape import SCHEMA
+
+REPOSITORY = Path(__file__).parents[2]
+TESTS = REPOSITORY / "routes" / "rover.test.yaml"
+DEFINITIONS = Definitions()
+
+
+@pytest.fixture
+def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the rover's table with its tests, to be changed."""
+    folder = tmp_path / "routes"
+    folder.mkdir()
+    for name in ("rover.yaml", "rover.test.yaml"):
+        shutil.copy(REPOSITORY / "routes" / name, folder)
+    (tmp_path / "protos").symlink_to(asset("protos"))
+    monkeypatch.chdir(tmp_path)
+    return folder / "rover.yaml"
+
+
+def change(table: Path, old: str, new: str) -> None:
+    text = table.read_text(encoding="utf-8")
+    assert old in text
+    table.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def test_the_tests_of_the_rover_pass_and_cover_its_table_completely(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(REPOSITORY)
+    assert main(["test", "routes", "--coverage"]) == OK
+    out = capsys.readouterr().out
+    covered = re.search(r"rover\.yaml: covered (\d+) of (\d+) routes, (\d+) of (\d+) targets, (\d+) of (\d+) exp", out)
+    assert covered is not None
+    assert covered[1] == covered[2]
+    assert covered[3] == covered[4]
+    assert covered[5] == covered[6]
+    assert out.endswith(" tests passed, in 1 file\n")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("radians(gyro_y)", "radians(gyro_x)"),
+        ("mag_z / 1e6", "mag_z / 1e3"),
+        ("'imu_link'", "'imu'"),
+        ("x: speed * sin(radians(heading))", "x: speed * cos(radians(heading))"),
+        ("16 * vdop * vdop", "16 * hdop * vdop"),
+        ("hdop > 0 and vdop > 0", "hdop > 0 or vdop > 0"),
+        ("NavSatStatus.STATUS_SBAS_FIX if", "NavSatStatus.STATUS_FIX if"),
+        ("pressure_kpa * 1000", "pressure_kpa * 100"),
+        ("str(sensor_index)", "str(sensor_index + 1)"),
+        ("gps_sensor: gps_sensor_1", "state: state"),
+        ("    source: sensor_board\n    destinations: [basestation]\n", "    source: sensor_board\n"),
+        ("    topics: [{topic: drive_progress", "    destinations: [basestation]\n    topics: [{topic: drive_progress"),
+        ("ttl: 200ms", "ttl: 300ms"),
+        ("timeout: 500ms", "timeout: 400ms"),
+        ("timeout: 500ms", "timeout: 600ms"),
+        ("repeat: 100ms", "repeat: 200ms"),
+        ("{brake: true}", "{brake: false}"),
+        ("hands_over_to: [manual_drive]", "hands_over_to: [manual_brake]"),
+        ("hands_over_to: [drive_motor]", "hands_over_to: [manual_brake]"),
+        ("hands_over_to: [arm_ctrl, arm_target]", "hands_over_to: [arm_ctrl]"),
+        ("total_count: count", "total_count: index"),
+        ("index: index", "index: count"),
+    ],
+)
+def test_whatever_is_changed_in_the_table_some_test_notices(rover: Path, old: str, new: str) -> None:
+    change(rover, old, new)
+    file = read_test_file(rover.with_name("rover.test.yaml"), DEFINITIONS)
+    assert not all(result.passed for result in prove(file))
+
+
+def test_failure_shows_both_files(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(rover, "radians(gyro_y)", "radians(gyro_x)")
+    assert main(["test"]) == FAILED
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith(": failed: the IMU reaches the operator as it is, and ROS in SI units")
+    assert re.fullmatch(
+        r"routes/rover\.test\.yaml:\d+:\d+: imu/data_raw: angular_velocity\.y is 1\.57\d*, not ~-3\.142", lines[1]
+    )
+    assert lines[2].endswith("angular_velocity: {x: ~1.571, y: ~-3.142, z: ~0.785}")
+    assert lines[3].strip(" |") == "^" * len("~-3.142")
+    assert lines[4].startswith("routes/rover.yaml:")
+    assert lines[4].endswith(": what fills angular_velocity.y")
+    assert lines[6].strip(" |") == "^" * len("radians(gyro_x)")
+    assert re.fullmatch(r"1 of \d+ tests failed, in 1 file", lines[-1])
+
+
+def test_what_no_test_touches_is_listed_and_fails(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tests = rover.with_name("rover.test.yaml")
+    change(tests, "fix_quality: PPS_FIX", "fix_quality: GPS_FIX")
+    assert main(["test", "--coverage"]) == FAILED
+    out = capsys.readouterr().out
+    assert "not covered: this branch was never taken in a compared message of gps_info\n" in out
+    assert "NavSatStatus.STATUS_FIX if fix_quality == GPSFixQuality.PPS_FIX" in out
+
+
+def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(rover, "pressure_kpa * 1000", "pressure_kpa * 100")
+    assert main(["test", "--coverage", "--format", "json"]) == FAILED
+    data = json.loads(capsys.readouterr().out)
+    (failed,) = [test for test in data["tests"] if not test["passed"]]
+    (failure,) = failed["failures"]
+    assert failure["message"] == "pressure/data: fluid_pressure is 10125.0, not 101250.0"
+    assert failure["file"] == "routes/rover.test.yaml"
+    assert failure["table"]["file"] == "routes/rover.yaml"
+    (coverage,) = data["coverage"]
+    assert coverage["table"] == "routes/rover.yaml"
+    assert coverage["routes"]["touched"] == coverage["routes"]["all"] > 20
+    assert coverage["gaps"] == []
+
+
+def test_github_shows_failures_beside_the_lines(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(rover, "pressure_kpa * 1000", "pressure_kpa * 100")
+    assert main(["test", "--format", "github"]) == FAILED
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("::error file=routes/rover.test.yaml,line=")
+    assert "title=pressure reaches the operator and ROS%2C in pascal" in line
+
+
+def test_only_runs_the_tests_that_are_named_so(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["test", "--only", "the operator"]) == OK
+    some = int(capsys.readouterr().out.split()[0])
+    assert main(["test"]) == OK
+    assert 1 < some < int(capsys.readouterr().out.split()[0])
+    assert main(["test", "--only", "the operator", "--coverage"]) == BAD_USAGE
+
+
+def test_what_is_wrong_with_a_test_file_is_exit_code_78(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tests = rover.with_name("rover.test.yaml")
+    change(tests, "from: sensor_board", "from: sensor_bord")
+    assert main(["test"]) == BAD_TABLE
+    heard = capsys.readouterr()
+    assert "error[unknown-endpoint]" in heard.err
+    assert "did you mean 'sensor_board'?" in heard.err
+    assert heard.out == ""
+
+
+def test_route_that_is_gone_from_the_table_is_noticed(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change(rover, "topic: imu/mag", "topic: imu/magnetic_field")
+    assert main(["test"]) == BAD_TABLE
+    assert "rover.yaml has no route that publishes on 'imu/mag'" in capsys.readouterr().err
+
+
+def test_folder_without_tests_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["test", str(tmp_path)]) == BAD_USAGE
+    assert "no tests (*.test.yaml)" in capsys.readouterr().err
+
+
+def test_schema_is_one_and_describes_every_key() -> None:
+    schema = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))
+    jsonschema.Draft7Validator.check_schema(schema)
+    for definition in schema["definitions"].values():
+        for name, key in definition.get("properties", {}).items():
+            assert "$ref" in key or key.get("description"), name
+    assert shape.table_schema()["$schema"] == schema["$schema"]
