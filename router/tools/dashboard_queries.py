@@ -32,8 +32,8 @@ class Series:
         return f"sum{f' by ({by})' if by else ''} (rate({self.of(metric, **labels)}[{INTERVAL}]))"
 
     def seconds_since(self, metric: str, **labels: str) -> str:
-        """Of times; what never happened gives no series."""
-        return f"time() - ({self.of(metric, **labels)} > 0)"
+        """Of times, up to the scrape, so that it does not grow in between; what never happened gives no series."""
+        return f"timestamp({self.of(metric, **labels)}) - ({self.of(metric, **labels)} > 0)"
 
     def buckets(self, metric: str, **labels: str) -> str:
         """Of histograms: how many fell under each bound within a step of the panel."""
