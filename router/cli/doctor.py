@@ -1,0 +1,58 @@
+"""`router doctor [TABLE]`: what keeps a router from working on this computer, and what to do about it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections import Counter
+from pathlib import Path
+
+from router.cli import DEFAULT_TABLE, OK, VERBS
+from router.cli.findings import is_coloured, plural
+from router.tools.doctor_report import Finding, Grade
+
+SICK = 1
+
+_DESCRIPTION = f"""Look at the table, ROS, ports, buffers, clock, endpoints and the running router, if there is one.
+Exit code: {OK} nothing keeps it from working, {SICK} something does. What works less well is a warning only."""
+
+_STYLES = {Grade.FINE: "\x1b[32m", Grade.WARNING: "\x1b[33m", Grade.PROBLEM: "\x1b[31m"}
+_RESET = "\x1b[0m"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser("doctor", help=VERBS["doctor"], description=_DESCRIPTION)
+    parser.add_argument("table", type=Path, nargs="?", default=DEFAULT_TABLE, metavar="TABLE")
+    parser.add_argument(
+        "--pre-start", action="store_true", help="only what would make a start fail, and nothing if all is well"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    from router.tools.doctor import before_start, examine
+
+    grades: Counter[Grade] = Counter()
+    for finding in (before_start if args.pre_start else examine)(args.table, os.environ):
+        grades[finding.grade] += 1
+        if finding.grade is Grade.PROBLEM or not args.pre_start:
+            print(shown(finding, coloured=is_coloured(sys.stdout)), flush=True)
+    if not args.pre_start:
+        print(_summary(grades))
+    return SICK if grades[Grade.PROBLEM] else OK
+
+
+def shown(finding: Finding, *, coloured: bool) -> str:
+    """A line, and another one with what to do."""
+    grade = f"{finding.grade.value:8}"
+    if coloured:
+        grade = f"{_STYLES[finding.grade]}{grade}{_RESET}"
+    text = f"{grade} {finding.about:10} {finding.text}"
+    return f"{text}\n{'':20}-> {finding.remedy}" if finding.remedy else text
+
+
+def _summary(grades: Counter[Grade]) -> str:
+    if not grades[Grade.PROBLEM] and not grades[Grade.WARNING]:
+        return "nothing keeps the router from working here"
+    counts = [plural(grades[grade], grade.value) for grade in (Grade.PROBLEM, Grade.WARNING) if grades[grade]]
+    return ", ".join(counts)

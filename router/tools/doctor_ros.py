@@ -1,0 +1,35 @@
+"""What the doctor sees of ROS 2: whether it is there, and has every message type as the table was compiled for it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+from router.compiler.program import Program
+from router.errors import StartError
+from router.tools.doctor_report import Finding, fine, problem
+
+_INSTALL = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
+
+
+def ros(program: Program) -> Iterator[Finding]:
+    plans = (*program.publishers, *program.subscriptions)
+    if not plans and not program.gateways:
+        return
+    try:
+        from router.edges.ros_installation import middleware, usable_class
+    except ImportError as error:
+        yield problem("ROS", f"the table has topics, and ROS 2 cannot be loaded: {error}", _INSTALL)
+        return
+    wrong = set()
+    for plan in plans:
+        try:
+            usable_class(plan.type_name, plan.definitions)
+        except StartError as error:
+            if str(error) not in wrong:
+                wrong.add(str(error))
+                yield problem("ROS", str(error), _INSTALL)
+    if not wrong:
+        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+        types = len({plan.type_name for plan in plans})
+        yield fine("ROS", f"{middleware()} in domain {domain}, and the {types} message types of the table")

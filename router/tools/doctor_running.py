@@ -1,0 +1,116 @@
+"""What the doctor hears from a running router: who is silent, what is lost, whom QoS keeps away."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from time import time
+
+from prometheus_client.parser import text_string_to_metric_families
+
+from router.compiler.program import Program
+from router.errors import TransportError
+from router.table.model import RouteTable
+from router.tools.doctor_report import Finding, fine, problem, warning
+from router.tools.live import Snapshot, parse_metrics, scrape
+
+_SHOWN = 3
+"""Targets that are named for each reason of losses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The metrics of a router that may run another version of `table` by now. `now` in seconds since the epoch."""
+
+    table: RouteTable
+    snapshot: Snapshot
+    sha256: str
+    now: float
+
+    def findings(self) -> Iterator[Finding]:
+        found = [*self._table(), *self._silent(), *self._lost(), *self._kept_away(), *self._deadmen()]
+        yield from found or [fine("router", "it runs, hears every endpoint that sends, and loses nothing")]
+
+    def _table(self) -> Iterator[Finding]:
+        if self.snapshot.counts("config_last_reload_successful").get(()) == 0:
+            yield problem(
+                "router", "its last reload changed nothing, for the table had errors", "router validate, router reload"
+            )
+        elif self.sha256 != self.table.sha256:
+            yield warning("router", "it runs another table than this file", "router reload, or systemctl restart")
+
+    def _silent(self) -> Iterator[Finding]:
+        sources = {source.value for route in self.table.routes for source in route.sources}
+        for (name,), seen in self.snapshot.counts("endpoint_last_seen_timestamp_seconds").items():
+            endpoint = self.table.endpoints.get(name)
+            if endpoint is None or endpoint.stale_after is None or name not in sources:
+                continue
+            limit = endpoint.stale_after / 1e9
+            if self.now - seen > limit:
+                silence = f"silent for {self.now - seen:.0f} s" if seen else "never heard"
+                listening = ", ".join(str(each.address.value) for each in self.table.listeners.values())
+                yield problem(
+                    "endpoints",
+                    f"{name} is stale: {silence}, and more than {limit:g} s is too long",
+                    f"is it on, and does it send to this computer, where the router listens ({listening})? "
+                    f"`tcpdump -n udp and host {endpoint.address.value.host}` shows whether anything comes",
+                )
+
+    def _lost(self) -> Iterator[Finding]:
+        for (listener,), count in self.snapshot.counts("kernel_drops").items():
+            if count:
+                yield warning(
+                    "router",
+                    f"the kernel has dropped {count:.0f} datagrams of listener '{listener}'",
+                    "a larger `receive_buffer`, or less load on this computer; `router top` shows whether it goes on",
+                )
+        lost: dict[str, list[tuple[float, str]]] = defaultdict(list)
+        for (route, target, reason), count in self.snapshot.counts("messages_dropped").items():
+            if count and reason != "rate_limited":
+                lost[reason].append((count, f"{count:.0f} of {route} for {target}"))
+        for reason, each in lost.items():
+            worst = [text for _, text in sorted(each, reverse=True)[:_SHOWN]]
+            others = f" and {len(each) - _SHOWN} more targets" if len(each) > _SHOWN else ""
+            yield warning(
+                "router",
+                f"messages lost as {reason}: {', '.join(worst)}{others}",
+                "docs/metrics.md says what the reason means, the log what happened: journalctl -u rover-router",
+            )
+
+    def _kept_away(self) -> Iterator[Finding]:
+        for (route, topic, policy), peers in self.snapshot.counts("qos_incompatible").items():
+            if peers:
+                yield problem(
+                    "ROS",
+                    f"{peers:.0f} peers get nothing of topic {topic}, or are not heard there, for their {policy}",
+                    f"`ros2 topic info -v {topic}` shows their QoS, `router explain {route}` ours",
+                )
+
+    def _deadmen(self) -> Iterator[Finding]:
+        for (route,), active in self.snapshot.counts("deadman_active").items():
+            if active:
+                yield warning(
+                    "router",
+                    f"{route}: commands stopped coming, and the deadman sends in their place",
+                    "does whoever commands still send, often enough, and with a clock that agrees with this one?",
+                )
+
+
+def health(program: Program) -> Health | None:
+    """None where no router answers, and where the table does not say at which address."""
+    table = program.table
+    if table.metrics is None:
+        return None
+    try:
+        text = scrape(table.metrics.value)
+    except TransportError:
+        return None
+    snapshot = parse_metrics(text, time())
+    return Health(table, snapshot, _running_table(text), snapshot.at) if snapshot.values else None
+
+
+def _running_table(text: str) -> str:
+    """Its checksum; none where the router does not tell."""
+    samples = (sample for family in text_string_to_metric_families(text) for sample in family.samples)
+    return next((sample.labels["table_sha256"] for sample in samples if sample.name == "router_build_info"), "")
