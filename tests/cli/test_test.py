@@ -166,6 +166,39 @@ def test_folder_without_tests_is_wrong_usage(tmp_path: Path, capsys: pytest.Capt
     assert "no tests (*.test.yaml)" in capsys.readouterr().err
 
 
+LISTED = """
+version: 1
+envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
+listen: {rover: {address: 127.0.0.1:5000}}
+endpoints:
+  sensor_board: {address: 192.168.0.30:8, kind: board}
+  basestation: {address: 192.168.0.10:9000, kind: basestation}
+routes:
+  gps_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 10 Hz}]}
+  detected_object:
+    source: basestation
+    collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
+    topics:
+      - topic: objects_of_others
+        type: comms/msg/DetectedObjectArray
+        fields: {frame_id: frame_id, detections: items}
+"""
+
+
+def test_examples_of_the_documentation_pass(tmp_path: Path, rover: Path) -> None:
+    text = (REPOSITORY / "docs" / "testing-tables.md").read_text(encoding="utf-8")
+    examples = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    listed = tmp_path / "listed.yaml"
+    listed.write_text(LISTED.replace("PROTOS", str(asset("protos"))))
+    for number, example in enumerate(examples):
+        table = listed if "max_rate" in example or "incomplete" in example else rover
+        path = tmp_path / f"example-{number}.test.yaml"
+        path.write_text(f"table: {table}\n{example}")
+        results = prove(read_test_file(path, DEFINITIONS))
+        assert [result.failures for result in results if not result.passed] == []
+    assert len(examples) == 3
+
+
 def test_schema_is_one_and_describes_every_key() -> None:
     schema = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))
     jsonschema.Draft7Validator.check_schema(schema)
