@@ -1,0 +1,44 @@
+"""`router doctor`: what it prints, and its exit code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.cli import main
+from router.cli.doctor import shown
+from router.tools.doctor_report import Grade, fine, problem, warning
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    path = tmp_path / "table.yaml"
+    path.write_text(f"extends: {ROOT}/routes/sim.yaml\n")
+    return path
+
+
+def test_before_a_start_that_will_work_it_is_silent(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--pre-start", str(table)]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_a_bad_table_is_a_problem(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table.write_text(table.read_text() + "routs: {}\n")
+    assert main(["doctor", str(table)]) == 1
+    out = capsys.readouterr().out
+    assert "problem  table" in out
+    assert "did you mean 'routes'?" in out
+    assert out.splitlines()[-1].startswith("1 problem")
+
+
+def test_a_finding_is_a_line_and_its_remedy_another() -> None:
+    assert shown(fine("clock", "synchronised"), coloured=False) == "ok       clock      synchronised"
+    assert shown(problem("ports", "taken", "stop it"), coloured=False).splitlines() == [
+        "problem  ports      taken",
+        "                    -> stop it",
+    ]
+    assert shown(warning("clock", "late", "set it"), coloured=True).startswith("\x1b[33mwarning \x1b[0m clock")
+    assert {grade.value for grade in Grade} == {"ok", "warning", "problem"}

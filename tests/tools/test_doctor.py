@@ -1,0 +1,251 @@
+"""The doctor on real sockets and real metrics: what it finds, how grave that is, and what to do about it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from time import time
+
+import pytest
+
+from router.compiler import check_table
+from router.compiler.program import Program
+from router.tools import doctor_host, doctor_network
+from router.tools.doctor import before_start, examine
+from router.tools.doctor_host import clock, receive_buffers, shared_memory
+from router.tools.doctor_network import endpoints, ports
+from router.tools.doctor_report import Finding, Grade
+from router.tools.doctor_running import health
+from tests.ports import free_port
+
+ROOT = Path(__file__).parent.parent.parent
+
+TABLE = """\
+version: 1
+envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+metrics: {{address: 127.0.0.1:{metrics}}}
+listen: {{rover: {{address: "127.0.0.1:{listen}", receive_buffer: {buffer}}}}}
+endpoints:
+  sensor_board: {{address: "127.0.0.30:8", kind: board, stale_after: 5s}}
+  arm_board: {{address: "127.0.0.40:8", kind: board, stale_after: never}}
+  basestation: {{address: "127.0.0.10:9000", kind: basestation}}
+routes:
+  ph_info: {{source: sensor_board, destinations: [basestation]}}
+  arm_diag: {{source: arm_board, destinations: [basestation]}}
+"""
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    path = tmp_path / "table.yaml"
+    metrics, listen = free_port(kind=socket.SOCK_STREAM), free_port()
+    path.write_text(TABLE.format(root=ROOT, metrics=metrics, listen=listen, buffer="64KiB"))
+    return path
+
+
+def compiled(table: Path) -> Program:
+    program = check_table(table).program
+    assert program is not None
+    return program
+
+
+def texts(found: list[Finding], grade: Grade) -> list[str]:
+    return [finding.text for finding in found if finding.grade is grade]
+
+
+def test_a_sound_place_has_no_problem(table: Path) -> None:
+    found = list(examine(table, {}))
+    assert texts(found, Grade.PROBLEM) == []
+    assert {finding.about for finding in found} >= {"table", "ports", "buffers", "clock", "endpoints", "router"}
+
+
+def test_each_problem_and_warning_says_what_to_do(table: Path) -> None:
+    table.write_text(table.read_text().replace("127.0.0.30:8", "127.255.255.255:8"))
+    assert all(finding.remedy for finding in examine(table, {}) if finding.grade is not Grade.FINE)
+
+
+@pytest.mark.parametrize("look", [examine, before_start])
+def test_what_is_wrong_with_the_table_is_told_with_its_place(table: Path, look: type) -> None:
+    table.write_text(table.read_text().replace("[basestation]", "[nobody]"))
+    [first, *_] = found = list(look(table, {}))
+    assert (first.grade, first.about) == (Grade.PROBLEM, "table")
+    assert first.text.startswith(f"{table}:10:")
+    assert all(finding.about == "table" for finding in found)
+
+
+def test_a_port_that_somebody_has_is_told_with_his_name(table: Path) -> None:
+    program = compiled(table)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(program.listeners[0].address)
+        [found] = ports(program, running=False)
+        assert found.grade is Grade.PROBLEM
+        assert f"(pid {os.getpid()}) has udp port {program.listeners[0].address.port}" in found.text
+        assert [each.grade for each in ports(program, running=False, with_listeners=False)] == [Grade.FINE]
+    assert [each.grade for each in ports(program, running=False)] == [Grade.FINE]
+
+
+def test_a_port_that_systemd_keeps_is_the_services(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = compiled(table)
+    monkeypatch.setattr(doctor_network, "port_holder", lambda *_: "systemd (pid 1)")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(program.listeners[0].address)
+        [found] = ports(program, running=False)
+    assert found.grade is Grade.FINE
+    assert "systemctl start rover-router" in found.text
+
+
+def test_an_address_that_no_interface_has_is_told(table: Path) -> None:
+    table.write_text(table.read_text().replace('address: "127.0.0.1:', 'address: "192.0.2.1:'))
+    [found] = ports(compiled(table), running=False)
+    assert (found.grade, "no interface of this computer has 192.0.2.1" in found.text) == (Grade.PROBLEM, True)
+
+
+def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rmem_max").write_text("65535\n")
+    monkeypatch.setattr(doctor_host, "RMEM_MAX", tmp_path / "rmem_max")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    [found] = receive_buffers(compiled(table))
+    assert found.grade is Grade.WARNING
+    assert "sysctl -w net.core.rmem_max=65536" in found.remedy
+
+
+@pytest.mark.parametrize(
+    ("now", "status", "grade"),
+    [
+        (datetime(1970, 1, 1, tzinfo=timezone.utc), 0, Grade.PROBLEM),
+        (datetime(2026, 6, 1, tzinfo=timezone.utc), 0x40, Grade.WARNING),
+        (datetime(2026, 6, 1, tzinfo=timezone.utc), 0x2001, Grade.FINE),
+    ],
+)
+def test_the_clock(now: datetime, status: int, grade: Grade) -> None:
+    assert [found.grade for found in clock(now, status)] == [grade]
+
+
+def test_the_kernel_tells_of_the_clock() -> None:
+    [found] = clock(datetime(2026, 6, 1, tzinfo=timezone.utc))
+    assert "does not say" not in found.text
+
+
+def test_nodes_of_two_users_that_share_memory_are_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "fastrtps_port7000").touch()
+    assert list(shared_memory({}, tmp_path)) == []
+    other = tmp_path / "fastrtps_port7411"
+    other.touch()
+    if os.geteuid() != 0:
+        pytest.skip("only root can make a file of somebody else's")
+    os.chown(other, 12345, 12345)
+    [found] = shared_memory({}, tmp_path)
+    assert (found.grade, "user 12345" in found.text) == (Grade.WARNING, True)
+
+
+def test_a_network_that_is_not_there_is_a_problem(table: Path) -> None:
+    """As the broadcast address, to which this kind of socket finds no way either."""
+    table.write_text(table.read_text().replace("127.0.0.30:8", "127.255.255.255:8"))
+    [first, *others] = endpoints(compiled(table))
+    assert first.grade is Grade.PROBLEM
+    assert first.text.startswith("sensor_board: no network leads to 127.255.255.255")
+    assert "sensor_board" not in " ".join(finding.text for finding in others)
+
+
+def test_who_answers_a_ping() -> None:
+    try:
+        assert doctor_network.answering({"127.0.0.30", "127.0.0.40"}) == {"127.0.0.30", "127.0.0.40"}
+    except PermissionError:
+        pytest.skip("this user may not ping")
+
+
+# -- a running router ----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def answering(table: Path, *samples: str) -> Iterator[Program]:
+    """A router that serves these metrics."""
+    program = compiled(table)
+    assert program.table.metrics is not None
+    text = "\n".join([f'router_build_info{{table_sha256="{program.table.sha256}"}} 1', *samples, ""])
+
+    class Metrics(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(text.encode())
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer(program.table.metrics.value, Metrics) as server:
+        serving = threading.Thread(target=server.serve_forever, args=(0.01,))
+        serving.start()
+        try:
+            yield program
+        finally:
+            server.shutdown()
+            serving.join()
+
+
+def seen(endpoint: str, ago: float) -> str:
+    return f'router_endpoint_last_seen_timestamp_seconds{{endpoint="{endpoint}"}} {time() - ago}'
+
+
+def diagnosis(table: Path, *samples: str) -> list[Finding]:
+    with answering(table, *samples) as program:
+        running = health(program)
+    assert running is not None
+    return list(running.findings())
+
+
+def test_a_healthy_router_is_fine(table: Path) -> None:
+    assert texts(diagnosis(table, seen("sensor_board", 1)), Grade.FINE)
+
+
+def test_only_what_sends_and_may_be_stale_is_stale(table: Path) -> None:
+    silent = [seen("sensor_board", 9), seen("arm_board", 9), seen("basestation", 9)]
+    [found] = diagnosis(table, *silent)
+    assert (found.grade, found.about) == (Grade.PROBLEM, "endpoints")
+    assert found.text == "sensor_board is stale: silent for 9 s, and more than 5 s is too long"
+
+
+@pytest.mark.parametrize(
+    ("sample", "grade", "text"),
+    [
+        ('router_kernel_drops_total{listener="rover"} 3', Grade.WARNING, "the kernel has dropped 3 datagrams"),
+        (
+            'router_messages_dropped_total{reason="stale",route="ph_info",target="basestation"} 2',
+            Grade.WARNING,
+            "messages lost as stale: 2 of ph_info for basestation",
+        ),
+        (
+            'router_qos_incompatible{policy="reliability",route="ph_info",topic="ph"} 1',
+            Grade.PROBLEM,
+            "1 peers get nothing of topic ph",
+        ),
+        ('router_deadman_active{route="ph_info"} 1', Grade.WARNING, "the deadman sends"),
+        ("router_config_last_reload_successful 0", Grade.PROBLEM, "its last reload changed nothing"),
+    ],
+)
+def test_what_a_running_router_tells(table: Path, sample: str, grade: Grade, text: str) -> None:
+    [found] = diagnosis(table, seen("sensor_board", 1), sample)
+    assert (found.grade, text in found.text) == (grade, True), found.text
+
+
+def test_a_router_that_runs_another_table_is_told(table: Path) -> None:
+    with answering(table, seen("sensor_board", 1)):
+        table.write_text(table.read_text() + "# changed\n")
+        running = health(compiled(table))
+    assert running is not None
+    assert texts(list(running.findings()), Grade.WARNING) == ["it runs another table than this file"]
+
+
+def test_the_ports_of_a_running_router_are_not_a_problem(table: Path) -> None:
+    with answering(table, seen("sensor_board", 1)):
+        found = list(examine(table, {}))
+    assert texts(found, Grade.PROBLEM) == []
+    assert "the running router has them" in texts(found, Grade.FINE)
