@@ -1,4 +1,5 @@
-"""`router explain`: a route or a gateway as the router understands it, down to the code that serves it.
+"""`router explain`: a route or a gateway as the router understands it, down to the code that serves it; two tables
+compared.
 
 Prints what the compiler found out; finds out nothing itself.
 """
@@ -11,8 +12,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
+from router.cli.explain_differences import print_differences
 from router.cli.explain_gateway import explained_gateway, ignored_gateway, known_topics, seen_topics
-from router.cli.explain_words import duration, quality
+from router.cli.explain_words import quality
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import positive
 from router.compiler import Checked, check_table
@@ -22,6 +24,7 @@ from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.link import compile_handlers
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
+from router.compiler.settings_text import duration
 from router.errors import did_you_mean
 from router.table.model import ANY, ROS, Destination, Route, RouteTable, Topic
 from router.types.sizes import framed_size
@@ -29,7 +32,8 @@ from router.types.sizes import framed_size
 _WIDEST_CELL = 48
 _DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides,
 largest sizes, and the code that the router runs. Of a gateway, show what it sends how often, and what it lets in: with
-a ~ in front each topic that its patterns match, of those that the table names, or with --live of all that there are."""
+a ~ in front each topic that its patterns match, of those that the table names, or with --live of all that there are.
+With --diff, say what one table does otherwise than another, and nothing else."""
 _LIVE = 2.0
 """Seconds that ROS takes at most, as a rule, until a new node knows the others."""
 
@@ -39,12 +43,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     everything = "payload cases and gateways; all of the table when none is named"
     parser.add_argument("names", nargs="*", metavar="NAME", help=everything)
     parser.add_argument("--table", type=Path, default=DEFAULT_TABLE, help="route table (default: %(default)s)")
+    parser.add_argument(
+        "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two tables: what NEW does otherwise than OLD"
+    )
     parser.add_argument("--no-code", action="store_true", help="leave the generated code out")
     live = f"look for topics in the ROS network as well, for so long (default: {_LIVE:g})"
     parser.add_argument("--live", nargs="?", type=positive, const=_LIVE, metavar="SECONDS", help=live)
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.diff is not None:
+        return print_differences(*args.diff)
     checked = check_table(args.table)
     print_findings(checked.diagnostics, sys.stderr)
     if checked.has_errors or checked.table is None:

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from time import sleep
 
-from router.cli.explain_words import duration, quality
+from router.cli.explain_words import quality
 from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.selection import TopicSelector
+from router.compiler.settings_text import duration
 from router.compiler.topics import resolved
 from router.errors import StartError
 from router.gateway.following import by_frequency

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from router.compiler.implementations import NS_PER_SECOND
 from router.compiler.topics import qos_of
 from router.table.model import Topic
-
-
-def duration(ns: int) -> str:
-    return f"{ns / 1e9:g} s" if ns >= NS_PER_SECOND else f"{ns / 1e6:g} ms"
 
 
 def quality(topic: Topic) -> str:

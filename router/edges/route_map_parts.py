@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from router.compiler.books import CLIENTS
+from router.compiler.settings_text import duration
 from router.compiler.topics import resolved
 from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, RouteTable, Topic
 
@@ -57,7 +58,7 @@ class Tie:
 def map_parts(table: RouteTable) -> tuple[list[Part], list[Tie]]:
     """Everything that the table names in a route or a gateway, each once in a column, in the order of the table."""
     parts: dict[str, Part] = {}
-    ties = []
+    ties: list[Tie] = []
     for route in table.routes:
         for part in (_case(route), *_sources(route, table), *_targets(route, table)):
             parts.setdefault(part.key, part)
@@ -67,10 +68,6 @@ def map_parts(table: RouteTable) -> tuple[list[Part], list[Tie]]:
             parts.setdefault(part.key, part)
         ties += _gateway_ties(gateway, table)
     return list(parts.values()), ties
-
-
-def duration(ns: int) -> str:
-    return f"{ns / 1e9:g} s" if ns >= 1_000_000_000 else f"{ns / 1e6:g} ms"
 
 
 def _case(route: Route) -> Part:
