@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 
 from hypothesis import settings
 
 # Before anything imports rclpy. Domains above 101 would use ports that the kernel gives to others.
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+# The rover's table records what came before a deadman trips.
+_recordings = tempfile.TemporaryDirectory(prefix="recordings-")
+os.environ["RECORDINGS"] = _recordings.name
 
 # A shell lets what it starts in the background ignore Ctrl-C, and children inherit that; tests send it to them.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
