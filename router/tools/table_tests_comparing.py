@@ -10,11 +10,11 @@ from router.compiler import reference_cdr
 from router.errors import DecodeError, SourceSpan
 from router.table.model import Located, RouteTable
 from router.tools.rehearsal_events import Dropped, Event, Filtered, Published, Received, Rejected, Sent
-from router.tools.table_tests_matching import Difference, Moments, shown
+from router.tools.table_tests_matching import Difference
 from router.tools.table_tests_model import Counted, Expected, Item, Message, Payload, Step, Unchanged
 from router.tools.table_tests_places import Place, Places
+from router.tools.table_tests_words import Happened, Words
 from router.tools.wire import Wire
-from router.types.model import MessageType
 
 _SHOWN = 3
 """So many of what came are told where their number is not what was expected."""
@@ -29,30 +29,11 @@ class Failure:
     table: Place | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Happened:
-    """What a step came to: `early` before its time, `events` in it; `given` is when what came in."""
-
-    step: Step
-    start: int
-    early: Sequence[Event]
-    events: Sequence[Event]
-    given: Sequence[tuple[int, bytes]]
-
-    def moments(self, at: int) -> Moments:
-        """`now` is when the message came in that was the last one at `at`."""
-        times = [time for time, _ in self.given if time <= at]
-        return Moments(self.start, times[-1] if times else at)
-
-    def time(self, event: Event) -> str:
-        """`at 500 ms `, nothing at the beginning of the test."""
-        return f"at {(event.at - self.start) / 1e6:g} ms " if event.at != self.start else ""
-
-
 class Comparison:
     def __init__(self, wire: Wire, places: Places, table: RouteTable) -> None:
         self._wire = wire
         self._places = places
+        self._words = Words(wire, places)
         self._table = table
 
     def failures(self, step: Step, happened: Happened) -> Iterator[Failure]:
@@ -74,10 +55,10 @@ class Comparison:
         by_place: dict[Place | None, list[Event]] = {}
         for event in happened.early:
             if isinstance(event, (Sent, Published, Dropped)):
-                by_place.setdefault(self._place(event), []).append(event)
+                by_place.setdefault(self._words.place(event), []).append(event)
         for place, events in by_place.items():
             more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
-            message = f"before this step, {self._told(events[0], happened)}{more}; no step expects it"
+            message = f"before this step, {self._words.told(events[0], happened)}{more}; no step expects it"
             yield Failure(expected.span, message, place)
 
     # what is delivered
@@ -97,10 +78,10 @@ class Comparison:
             elif not items:
                 yield from self._unexpected(events, happened)
             elif len(items) != len(events):
-                listed = "; ".join(self._told(event, happened) for event in events[:_SHOWN])
+                listed = "; ".join(self._words.told(event, happened) for event in events[:_SHOWN])
                 more = f"; and {len(events) - _SHOWN} more" if len(events) > _SHOWN else ""
                 message = f"{len(events)} for {target}, not {len(items)}: {listed}{more}"
-                yield Failure(items[0].span, message, self._place(events[-1]))
+                yield Failure(items[0].span, message, self._words.place(events[-1]))
             else:
                 for item, event in zip(items, events, strict=True):
                     yield from self._differences(item, event, happened)
@@ -110,7 +91,7 @@ class Comparison:
         for event in happened.events:
             if isinstance(event, Dropped) and event.target == target:
                 why = f"it was dropped as {event.reason}" + (f" ({event.detail})" if event.detail else "")
-                return Failure(items[0].span, f"nothing for {target}: {why}", self._place(event))
+                return Failure(items[0].span, f"nothing for {target}: {why}", self._words.place(event))
             if isinstance(event, Filtered) and event.target == target:
                 place = self._places.condition(event.route, target)
                 return Failure(items[0].span, f"nothing for {target}: it was withheld", place)
@@ -119,8 +100,8 @@ class Comparison:
     def _unexpected(self, events: Sequence[Sent | Published], happened: Happened) -> Iterator[Failure]:
         first, count = events[0], len(events)
         times = f", {count} times" if count > 1 else ""
-        message = f"{self._told(first, happened)}{times}; it is not expected"
-        yield Failure(happened.step.expected.span, message, self._place(first))
+        message = f"{self._words.told(first, happened)}{times}; it is not expected"
+        yield Failure(happened.step.expected.span, message, self._words.place(first))
 
     def _differences(self, item: Item, event: Sent | Published, happened: Happened) -> Iterator[Failure]:
         content, moments = item.content, happened.moments(event.at)
@@ -128,11 +109,13 @@ class Comparison:
             case Unchanged(), Sent():
                 trims = self._table.endpoints[event.endpoint].trim_trailing_zeros
                 if event.data not in {data.rstrip(b"\0") if trims else data for _, data in happened.given}:
-                    yield Failure(item.span, f"{self._told(event, happened)}, not what was given", self._place(event))
+                    yield Failure(
+                        item.span, f"{self._words.told(event, happened)}, not what was given", self._words.place(event)
+                    )
             case bytes(), Sent():
                 if event.data != content:
                     message = f"{event.endpoint} gets the bytes {event.data.hex(' ')}, not {content.hex(' ')}"
-                    yield Failure(item.span, message, self._place(event))
+                    yield Failure(item.span, message, self._words.place(event))
             case Payload(), Sent():
                 yield from self._payload(content, item.span, event, happened)
             case Message(), Published():
@@ -144,11 +127,11 @@ class Comparison:
         try:
             decoded = self._wire.decode(event.data)
         except DecodeError as error:
-            yield Failure(span, f"{event.endpoint} gets no envelope: {error}", self._place(event))
+            yield Failure(span, f"{event.endpoint} gets no envelope: {error}", self._words.place(event))
             return
         if decoded.case.name != expected.case.name:
-            message = f"{self._told(event, happened)}, not {expected.case.name}"
-            yield Failure(span, message, self._place(event))
+            message = f"{self._words.told(event, happened)}, not {expected.case.name}"
+            yield Failure(span, message, self._words.place(event))
         elif expected.fields is not None:
             kind, moments = expected.case.type, happened.moments(event.at)
             for difference in expected.fields.differences((), kind, decoded.message, moments):
@@ -158,7 +141,7 @@ class Comparison:
         is_mapped = not (isinstance(event, Sent) and event.by_deadman)
         field = self._places.field(event.route, target, difference.path) if is_mapped else None
         when = happened.time(event)
-        return Failure(difference.span, f"{when}{target}: {difference}", field or self._place(event))
+        return Failure(difference.span, f"{when}{target}: {difference}", field or self._words.place(event))
 
     # what is not delivered
 
@@ -190,7 +173,7 @@ class Comparison:
                 details = {event.detail: None for event in came.get(target, ()) if event.detail}
                 detail = f" ({next(iter(details))})" if details else ""
                 message = f"dropped for {target}: {_counts(counts)}, not {_counts(wanted.value)}{detail}"
-                place = self._place(came[target][0]) if target in came else self._places.of_name(target)
+                place = self._words.place(came[target][0]) if target in came else self._places.of_name(target)
                 yield Failure(wanted.span, message, place)
 
     def _filtered(self, expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
@@ -198,44 +181,6 @@ class Comparison:
         if expected.filtered is not None and came != Counter(expected.filtered.value):
             message = f"withheld from: {_counts(came)}, not {_counts(expected.filtered.value)}"
             yield Failure(expected.filtered.span, message)
-
-    # words
-
-    def _told(self, event: Event, happened: Happened) -> str:
-        when = happened.time(event)
-        match event:
-            case Sent():
-                by = f" by the deadman of {event.route}" if event.by_deadman else ""
-                return f"{when}{self._datagram(event.data)} is sent to {event.endpoint}{by}"
-            case Published():
-                kind = self._type(event)
-                inside = shown(kind, reference_cdr.parse(kind, event.cdr)) if kind else "a message"
-                return f"{when}{inside} is published on {event.topic}"
-            case Dropped():
-                return f"{when}{event.target} misses one as {event.reason}"
-        return when
-
-    def _datagram(self, data: bytes) -> str:
-        try:
-            decoded = self._wire.decode(data)
-        except DecodeError:
-            return data.hex(" ")
-        return f"{decoded.case.name} {shown(decoded.case.type, decoded.message)}"
-
-    def _type(self, event: Published) -> MessageType | None:
-        return self._places.type(event.route, event.topic)
-
-    def _place(self, event: Event) -> Place | None:
-        match event:
-            case Sent(by_deadman=True):
-                return self._places.deadman(event.route)
-            case Sent():
-                return self._places.target(event.route, event.endpoint)
-            case Published():
-                return self._places.target(event.route, event.topic)
-            case Dropped() | Filtered():
-                return self._places.target(event.route, event.target)
-        return None
 
 
 def _by_target(events: Iterable[Sent | Published]) -> Mapping[str, list[Sent | Published]]:

@@ -13,9 +13,9 @@ from router.compiler.checked import CheckedRoute
 from router.compiler.program import Program
 from router.errors import SourceSpan
 from router.tools.rehearsal_events import Published, Received, Sent
-from router.tools.table_tests_comparing import Happened
 from router.tools.table_tests_model import Item, Payload, TableTestFile, Whatever
 from router.tools.table_tests_probes import Part, Probes, with_probes
+from router.tools.table_tests_words import Happened
 
 Route = str
 Target = str

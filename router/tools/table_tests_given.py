@@ -10,9 +10,10 @@ from router.table.reading import UnsoundError
 from router.table.units import parse_duration
 from router.tools import UsageError
 from router.tools.table_tests_matching import MessageMatch, Moments
+from router.tools.table_tests_messages import fill, values
 from router.tools.table_tests_model import Given, GivenDatagram, GivenMessage, Repetition
 from router.tools.table_tests_names import Names, unsound
-from router.tools.table_tests_values import FieldReader, fill, values
+from router.tools.table_tests_values import FieldReader
 from router.tools.wire import Wire, as_old_boards_send
 from router.types.protobuf import PayloadCase
 

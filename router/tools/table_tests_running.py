@@ -10,11 +10,12 @@ from router.errors import Diagnostic
 from router.table.reading import UnsoundError
 from router.tools.rehearsal import START, Rehearsal
 from router.tools.rehearsal_events import Event
-from router.tools.table_tests_comparing import Comparison, Failure, Happened
+from router.tools.table_tests_comparing import Comparison, Failure
 from router.tools.table_tests_given import datagram, message
 from router.tools.table_tests_matching import Moments
 from router.tools.table_tests_model import GivenDatagram, Step, TableTest, TableTestFile
 from router.tools.table_tests_places import Places
+from router.tools.table_tests_words import Happened
 from router.tools.wire import Wire
 
 

@@ -1,4 +1,4 @@
-"""Fields of a test file as what is expected of a message, and as messages that are given to a table.
+"""Fields of a test file as what a message is expected, or given, to hold.
 
 Knows nodes and types. What does not fit is raised as UnsoundError, with its place.
 """
@@ -6,28 +6,16 @@ Knows nodes and types. What does not fit is raised as UnsoundError, with its pla
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator
 
-from router.compiler.implementations import NS_PER_SECOND
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import UnsoundError
 from router.table.units import parse_duration
 from router.tools import UsageError
 from router.tools.fields import parse
-from router.tools.table_tests_matching import (
-    TIMES,
-    AnyValue,
-    Exactly,
-    ListMatch,
-    Match,
-    MessageMatch,
-    Moment,
-    Moments,
-    Near,
-    default_of,
-)
+from router.tools.table_tests_matching import AnyValue, Exactly, ListMatch, Match, MessageMatch, Moment, Near
+from router.tools.table_tests_shown import TIMES
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, Type
 
 RECEIVED_AT = "received_at"
@@ -164,59 +152,3 @@ def _is_word(node: Node, word: str) -> bool:
 
 def _unsound(span: SourceSpan, code: Code, message: str, hint: str = "") -> UnsoundError:
     return UnsoundError(Diagnostic(span, code, message, hint))
-
-
-# messages to give to a table
-
-
-def fill(message: Any, kind: MessageType, given: MessageMatch, moments: Moments) -> None:
-    """Sets the fields of a protobuf message."""
-    for name, match in given.members.items():
-        field = kind.field(name)
-        assert field is not None  # noqa: S101 - it was read with this type
-        member = getattr(message, name)
-        match match:
-            case MessageMatch():
-                member.SetInParent()
-                assert isinstance(field.type, MessageType)  # noqa: S101
-                fill(member, field.type, match, moments)
-            case Moment():
-                member.seconds, member.nanos = divmod(match.time(moments), NS_PER_SECOND)
-            case ListMatch():
-                assert isinstance(field.type, List)  # noqa: S101
-                _extend(member, field.type.element, match, moments)
-            case Exactly():
-                setattr(message, name, match.value)
-
-
-def _extend(values: Any, element: Type, given: ListMatch, moments: Moments) -> None:
-    for item in given.items:
-        if isinstance(item, MessageMatch) and isinstance(element, MessageType):
-            fill(values.add(), element, item, moments)
-        elif isinstance(item, Exactly):
-            values.append(item.value)
-
-
-def values(kind: MessageType, given: MessageMatch, moments: Moments) -> Mapping[str, Any]:
-    """A ROS message as its values by name, those that were not given at their default."""
-    made = default_of(kind)
-    for name, match in given.members.items():
-        field = kind.field(name)
-        assert field is not None  # noqa: S101 - it was read with this type
-        made[name] = _plain(field.type, match, moments)
-    found: Mapping[str, Any] = made
-    return found
-
-
-def _plain(kind: Type, match: Match, moments: Moments) -> Any:
-    match match:
-        case MessageMatch() if isinstance(kind, MessageType):
-            return values(kind, match, moments)
-        case Moment():
-            seconds, nanoseconds = divmod(match.time(moments), NS_PER_SECOND)
-            return {"sec": seconds, "nanosec": nanoseconds}
-        case ListMatch() if isinstance(kind, List):
-            return [_plain(kind.element, item, moments) for item in match.items]
-        case Exactly():
-            return match.value
-    raise AssertionError(f"{match} cannot be given")
