@@ -55,8 +55,8 @@ class Recording:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.about: dict[str, str] = {}
-        self.is_whole = False
-        """Once all was read: the recording was ended in good order. Otherwise up to half a second is missing."""
+        self.is_whole = self.ends_early = False
+        """Once all was read: the writer ended it in good order, or was killed, or the file is damaged."""
         self._senders: dict[int, Callable[[bytes], tuple[str, Peer, str, bytes] | None]] = {}
         try:
             self._file: BinaryIO = path.open("rb")
@@ -80,7 +80,8 @@ class Recording:
                 yield from self._in_record(opcode, body)
                 self.is_whole = opcode == Opcode.FOOTER
         except _DAMAGED:
-            return
+            pass
+        self.ends_early = not self.is_whole
 
     def _in_record(self, opcode: int, body: bytes) -> Iterator[Recorded]:
         if opcode == Opcode.CHUNK:

@@ -169,7 +169,7 @@ def test_mcap_of_somebody_else_is_refused(tmp_path: Path) -> None:
     with (tmp_path / "it.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start()
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # of mcap
     with pytest.raises(UsageError, match="was not recorded by a router"):
         Recording(tmp_path / "it.mcap")
 

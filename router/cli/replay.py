@@ -1,0 +1,148 @@
+"""`router replay FILE`: sends a recording again, or `--against NEW` runs it through two tables and compares."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from router.cli import DEFAULT_TABLE, OK, VERBS
+from router.cli.tool_options import explained
+from router.errors import TableError
+from router.tools import UsageError
+
+if TYPE_CHECKING:
+    from router.compiler import Checked
+    from router.compiler.definitions import Definitions
+    from router.tools.recording import Recording
+    from router.tools.replaying import Resent
+
+DIFFERENT = 1
+
+EPILOG = """\
+examples:
+  router replay rover_20260412T101500Z.mcap --table routes/sim.yaml
+  router replay it.mcap --rate max --to 127.0.0.1:5000 --from 127.0.0.30
+  router replay it.mcap --against routes/new.yaml
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser(
+        "replay",
+        help=VERBS["replay"],
+        description="Send the datagrams of a recording again, with the times between them, to the listeners of the "
+        "table, from the addresses that it has for their senders. With --against, send nothing, but run them through "
+        "the table and another one, and print what would be delivered differently; exit code 1 where anything would.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="what 'record' has written")
+    parser.add_argument("--rate", metavar="RATE", help="2x is twice as fast, max without waiting (default: 1x)")
+    parser.add_argument("--to", metavar="PLACE", help="HOST:PORT, or a name of the table (default: its listeners)")
+    parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table")
+    parser.add_argument("--table", type=Path, metavar="TABLE", help=f"default: {DEFAULT_TABLE}, if there")
+    parser.add_argument("--against", type=Path, metavar="NEW", help="compare TABLE with this table instead")
+
+
+@explained
+def run(args: argparse.Namespace) -> int:
+    from router.tools.recording import Recording
+
+    if args.against is not None and (args.rate or args.to or args.origin):
+        raise UsageError("--against sends nothing: --rate, --to and --from have no part in it")
+    with closing(Recording(args.file)) as recording:
+        code = _compare(args, recording) if args.against is not None else _send(args, recording)
+        if recording.ends_early:
+            print(f"{args.file} was not finished: what is missing is behind its last whole chunk", file=sys.stderr)
+    return code
+
+
+def _send(args: argparse.Namespace, recording: Recording) -> int:
+    from router.tools import places
+    from router.tools.replaying import Replayer, on_time, parse_rate
+    from router.tools.wire import read_table
+
+    rate = parse_rate(args.rate or "1x")
+    path = args.table or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
+    table = read_table(path) if path is not None else None
+    to = places.destination(args.to, table) if args.to else None
+    origin = places.origin(args.origin, table) if args.origin else None
+    replayer = Replayer(table, to, origin)
+    try:
+        with closing(replayer), _progress(recording, "sending") as tell:
+            for found in on_time(recording, rate):
+                replayer.send(found)
+                tell()
+    except KeyboardInterrupt:
+        pass
+    print(f"sent {replayer.resent.datagrams} datagrams")
+    return _advise(replayer.resent)
+
+
+def _advise(resent: Resent) -> int:
+    """Say on stderr why nothing may have come of it. The exit code: 1 when the other side refused."""
+    if resent.elsewhere:
+        listed = ", ".join(f"{name} ({host})" for name, host in sorted(resent.elsewhere.items())[:5])
+        more = f" and {len(resent.elsewhere) - 5} more" if len(resent.elsewhere) > 5 else ""
+        print(
+            f"router replay: this computer lacks the addresses of {listed}{more}: sent from its own, which a table "
+            "takes for strangers; --table TABLE has other addresses for them, or --from PLACE",
+            file=sys.stderr,
+        )
+    if resent.refused:
+        print("router replay: nobody listened for some of them", file=sys.stderr)
+    return 1 if resent.refused else OK
+
+
+def _compare(args: argparse.Namespace, recording: Recording) -> int:
+    from router.compiler.definitions import Definitions
+    from router.tools.replaying_against import Against
+    from router.tools.replaying_report import Report
+
+    definitions = Definitions()
+    old, new = (_checked(path, definitions) for path in (args.table or DEFAULT_TABLE, args.against))
+    assert old.program is not None and new.program is not None  # noqa: S101, PT018 - they have no errors
+    against = Against(old.program, new.program)
+    with _progress(recording, "comparing") as tell:
+        for found in recording.datagrams():
+            against.take(found)
+            tell()
+    for line in Report(old, new).lines(against):
+        print(line)
+    return DIFFERENT if against.differs else OK
+
+
+def _checked(path: Path, definitions: Definitions) -> Checked:
+    """Raises TableError."""
+    from router.compiler import check_table
+
+    checked = check_table(path, definitions=definitions)
+    if checked.program is None:
+        raise TableError(checked.diagnostics)
+    return checked
+
+
+@contextmanager
+def _progress(recording: Recording, doing: str) -> Iterator[Callable[[], None]]:
+    """A bar, where somebody looks; a chunk, which is half a second, is one step of it."""
+    if not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn(doing), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), refresh_per_second=4, transient=True) as progress:
+        task, shown = progress.add_task("", total=recording.size), 0
+
+        def tell() -> None:
+            nonlocal shown
+            if recording.position != shown:
+                shown = recording.position
+                progress.update(task, completed=shown)
+
+        yield tell

@@ -1,0 +1,77 @@
+"""A recording that another process than the router makes, of what its tap shows. Knows no HTTP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from time import monotonic_ns, time_ns
+
+from router.edges.mirror import Seen
+from router.edges.recorder_channels import Channels
+from router.edges.recorder_encoding import Encoder
+from router.edges.recorder_file import RecordingFile
+from router.edges.tap_stream import Lost
+from router.table.model import RouteTable
+from router.tools import UsageError
+from router.types.protobuf import Envelope
+
+PERIOD = 500_000_000
+"""ns from chunk to chunk: what a kill costs at most."""
+
+
+class TapRecording:
+    """One file, complete once it is closed. `datagrams` and `missed` count; raises UsageError where it cannot write."""
+
+    def __init__(self, path: Path, envelope: Envelope, table: RouteTable) -> None:
+        self.path = path
+        self.datagrams = self.missed = 0
+        channels = Channels()
+        self._encoder = Encoder(channels)
+        self._encoder.know(envelope, table.endpoints)
+        self._written_at = monotonic_ns()
+        try:
+            self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})
+        except FileExistsError:
+            raise UsageError(f"{path} exists; choose another name") from None
+        except OSError as error:
+            raise UsageError(f"cannot write {path}: {error.strerror}") from error
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far."""
+        return self._file.size
+
+    def take(self, batch: Iterable[Seen | Lost]) -> None:
+        """Batches have to come once a second, be they empty, so that what came before is written."""
+        seen: list[Seen] = []
+        for each in batch:
+            if isinstance(each, Lost):
+                self.missed += each.number
+            else:
+                seen.append(each)
+        self._add(seen)
+        if monotonic_ns() - self._written_at >= PERIOD:
+            self._write()
+
+    def close(self) -> None:
+        """Writes what is left, and what readers seek by."""
+        self._write()
+        try:
+            self._file.close()
+        except OSError as error:
+            raise UsageError(f"{self.path} could not be finished: {error.strerror}") from error
+
+    def _add(self, seen: Sequence[Seen]) -> None:
+        self.datagrams += len(seen)
+        self._encoder.add(seen, time_ns(), monotonic_ns())
+
+    def _write(self) -> None:
+        self._written_at = monotonic_ns()
+        chunk = self._encoder.take()
+        if chunk is None:
+            return
+        try:
+            self._file.write(chunk)
+            self._file.sync()
+        except OSError as error:
+            raise UsageError(f"cannot go on writing {self.path}: {error.strerror}") from error
