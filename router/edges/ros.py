@@ -135,7 +135,10 @@ class RosEdge:
             receive[topic](cdr, sent_at)
 
     def finish(self, change: RosChange) -> None:
-        """Closes what is not used any more: nobody may publish there when this is called."""
+        """Closes what is not used any more: nobody may publish there when this is called.
+
+        `incompatible` is told of all peers again, for those who have named the topics since.
+        """
         if change.left or change.opened:
             self._events.stop()
             for opened in change.left:
@@ -143,6 +146,7 @@ class RosEdge:
             self._peers.forget_all_but(self._publications)
             self._events = self._event_thread()
             self._events.start()
+        self._peers.tell()
 
     def _use(self, change: RosChange) -> None:
         self._publications, self._subscriptions = change.publications, change.subscriptions

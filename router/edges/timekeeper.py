@@ -6,7 +6,7 @@ import os
 import select
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from router.engine.machine import Machine, P, R
 
@@ -100,11 +100,21 @@ class Timekeeper:
             self._thread.join()
         with self._lock:
             for machine in reversed(self._machines):
-                try:
-                    machine.end(self._clock_ns())
-                except Exception as error:  # noqa: BLE001 nor may it keep another deadman from its last word
-                    self._failed(error)
+                self._end(machine)
         self._alarm.close()
+
+    def release(self, machines: Sequence[object]) -> None:
+        """Ends those of its machines that are among these, in the same order, and serves them no more."""
+        with self._lock:
+            for machine in [each for each in reversed(self._machines) if any(each is one for one in machines)]:
+                self._machines.remove(machine)
+                self._end(machine)
+
+    def _end(self, machine: Machine) -> None:
+        try:
+            machine.end(self._clock_ns())
+        except Exception as error:  # noqa: BLE001 nor may it keep another deadman from its last word
+            self._failed(error)
 
     def _run(self) -> None:
         while True:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import FunctionType
 from typing import Any
 
 from router.compiler.books import Books
@@ -59,7 +60,7 @@ class Outlets:
     state: State = field(default_factory=State)
 
 
-def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness) -> Handle:
+def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness) -> FunctionType:
     namespace: dict[str, Any] = {
         **handler.constants,
         "counts": outlets.counts,
@@ -72,8 +73,13 @@ def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness)
     for target in handler.targets:
         namespace |= _bound(target, handler, books, outlets)
     exec(handler.code, namespace)  # noqa: S102 - code that our compiler made of a checked table
-    handle: Handle = namespace[handler.function]
+    handle: FunctionType = namespace[handler.function]
     return handle
+
+
+def unbind(handle: FunctionType) -> None:
+    """Nobody calls it any more. It is in a ring with its globals, which keeps both until this cuts it."""
+    handle.__globals__.clear()
 
 
 def _bound(target: TargetPlan, handler: Handler, books: Books, outlets: Outlets) -> dict[str, Any]:

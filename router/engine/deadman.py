@@ -14,6 +14,10 @@ Feed = Callable[[int], None]
 """Hears of a command that is about to be sent, at a time of the monotonic clock in ns."""
 
 
+FeedMaker = Callable[[str, Sequence[str]], Feed]
+"""Makes of a route's name, and of the names in TargetPlan.deadmen, the call that tells all these deadmen at once."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Destination:
     """One datagram that is ready to be sent, and the slots in which it is counted."""
@@ -77,7 +81,7 @@ class Deadman:
         self._release()
 
     def inherit(self, earlier: Deadman) -> None:
-        """Takes the place of `earlier`, the same route's in another table: armed by the same command, tripped if it was.
+        """Takes the place of `earlier`, the same route's in another table: armed by its command, tripped if it was.
 
         `earlier` keeps the destinations that are not ours, for its last word.
         """
@@ -113,10 +117,6 @@ class Deadman:
             self.next_due = None
             self._send()
 
-    @property
-    def route(self) -> str:
-        return self._plan.route
-
     def _release(self) -> None:
         if self._tripped:
             self._tripped = False
@@ -134,11 +134,10 @@ class Deadman:
                 self._counts[destination.sent] += 1
 
 
-def feeder(deadmen: Mapping[str, Deadman], guard: Guard) -> Callable[[str, Sequence[str]], Feed]:
-    """Makes of a route's name, and of the names in TargetPlan.deadmen, the call that tells all these deadmen at once.
+def feeder(deadmen: Mapping[str, Deadman], guard: Guard) -> FeedMaker:
+    """`deadmen` are by route. `guard` makes the call safe: it has one lock for all of them.
 
-    `deadmen` are by route. `guard` makes the call safe: it has one lock for all of them. Each is served from when its
-    own route's call was made.
+    Each is served from when its own route's call was made.
     """
 
     def feed(route: str, told: Sequence[str]) -> Feed:

@@ -13,7 +13,7 @@ from router.compiler import STRANGER, source_label
 from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, REJECT_REASONS
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
-from router.engine.binding import Handle, Outlets, bind
+from router.engine.binding import Handle, Outlets, bind, unbind
 from router.engine.framing import LEN
 from router.engine.freshness import Freshness
 from router.engine.outcome import Report
@@ -64,6 +64,11 @@ class Engine:
             for handlers in program.inbound.values()
             for handler in handlers
         }
+
+    def forget(self) -> None:
+        """Nobody calls the handlers any more."""
+        for handle in self._handles.values():
+            unbind(handle)
 
     def _cases(self, listener: str) -> dict[int, _Case]:
         """What a listener's datagrams are given to, by field number."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FunctionType
 
 from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS
 from router.compiler.program import Handler, Program
-from router.engine.binding import Handle, Outlets, bind
+from router.engine.binding import Handle, Outlets, bind, unbind
 from router.engine.freshness import Freshness
 
 Take = Callable[[bytes, int], None]
@@ -28,7 +29,13 @@ class OutboundEngine:
     def __init__(self, program: Program, outlets: Outlets) -> None:
         self._program = program
         self._outlets = outlets
+        self._handles: list[FunctionType] = []
         self._freshness = outlets.state.keep("freshness of ROS messages", Freshness)
+
+    def forget(self) -> None:
+        """Nobody calls the handlers any more."""
+        for handle in self._handles:
+            unbind(handle)
 
     def taker(self, topic: str) -> Take:
         """The function that takes one topic's messages: CDR bytes, and when the middleware got them (wall clock, ns).
@@ -56,8 +63,9 @@ class OutboundEngine:
 
     def _route(self, handler: Handler) -> _Route:
         books = self._program.books
+        self._handles.append(handle := bind(handler, books, self._outlets, self._freshness))
         return _Route(
-            handle=bind(handler, books, self._outlets, self._freshness),
+            handle=handle,
             is_aged=handler.ttl is not None,
             last_message=books.slot("route_last_message_timestamp_seconds", handler.route),
             seconds=books.slot("route_seconds", handler.route),

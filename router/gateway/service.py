@@ -45,8 +45,9 @@ class GatewayService:
         transport: Callable[[GatewayService], Transport],
     ) -> None:
         settings = plan.settings
+        self.plan = plan
+        self.is_closed = False
         self.name = settings.name
-        self._plan = plan
         self._around = around
         self._ledger = ledger
         self._inlet = inlet
@@ -75,7 +76,10 @@ class GatewayService:
             self._tasks.each(_TELL_S, self._tell_topics)
 
     async def close(self) -> None:
-        """Nothing is sent or received any more."""
+        """Nothing is sent or received any more; closing again changes nothing."""
+        if self.is_closed:
+            return
+        self.is_closed = True
         async with AsyncExitStack() as closing:  # in the opposite order: who comes or sends something begins tasks
             closing.callback(self.audience.close)
             closing.push_async_callback(self._tasks.close)
@@ -153,7 +157,7 @@ class GatewayService:
             return []
         rows = [
             InboundRow(inbound.topic, inbound.type.name, schema_text(inbound.type), example(inbound.type))
-            for inbound in self._plan.inbound.values()
+            for inbound in self.plan.inbound.values()
         ]
         return [self._document("inbound", inbound_document(rows))]
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from router.compiler.books import Books
 from router.compiler.program import GatewayPlan, Program
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.daemon_thread import DaemonThread
@@ -17,7 +19,7 @@ from router.edges.gateway_transport import Ears, Transport
 from router.edges.gateway_udp import UdpTransport
 from router.edges.gateway_websocket import WebsocketTransport
 from router.engine import Report
-from router.engine.deadman import Feed
+from router.engine.deadman import FeedMaker
 from router.errors import StartError
 from router.gateway.encoding import ENCODINGS
 from router.gateway.hub import Hub
@@ -28,6 +30,7 @@ from router.gateway.subscriber import Subscriber
 from router.gateway.surroundings import Surroundings
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as Way
+from router.table.sameness import are_same
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -41,56 +44,129 @@ MOST_ASKED = 4096
 PAGE = Path(__file__).with_name("page.html")
 
 
-class GatewayThread:
-    """Opens the gateways of a program when it is made, and serves them from `start` on. Raises StartError.
+@dataclass(frozen=True, slots=True)
+class GatewayChange:
+    """`services` are those of the program that comes, by gateway; `opened` are new, nobody wants those of `left`."""
 
-    `counts` belong to its thread, in which all that it is given is called. `feed` makes what tells deadmen.
+    services: dict[str, GatewayService]
+    opened: list[GatewayService]
+    left: list[GatewayService]
+
+
+class GatewayThread:
+    """Serves the gateways of one program, or then of another.
+
+    `prepare` opens what is new, `retire` closes what is not wanted any more, `finish` has the new ones serve. Or
+    `abandon` undoes it. `counts` belong to its thread, in which all that it is given is called.
     `kernel_drops` has what tells that number, for any thread, by gateway that receives datagrams.
     """
 
     def __init__(
         self,
-        program: Program,
         ros: RosEdge,
         counts: list[int],
-        feed: Callable[[str, Sequence[str]], Feed],
         report: Callable[[Report], None],
         failed: Callable[[Exception], None],
     ) -> None:
         self.kernel_drops: dict[str, Callable[[], int]] = {}
         self._failed = failed
-        self._books = program.books
         self._counts = counts
-        self._outlets = _outlets(program, ros, feed, report)
+        self._ros = ros
+        self._report = report
         self._converting = DaemonThread("gateway bulk")
         self._reading = DaemonThread("gateway reading")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
-        self._services: list[GatewayService] = []
+        self._services: dict[str, GatewayService] = {}
+        self._makers: dict[GatewayService, Callable[[], GatewayService]] = {}  # of another one that is the same
         self._hub = Hub(ros.topics, ros_interfaces(), self._loop)
         self._around = Surroundings(self._hub, self._converting, self._reading, failed, monotonic_ns, wall_ns)
         self._thread.start()
+
+    def prepare(self, program: Program, feed: FeedMaker) -> GatewayChange:
+        """Opens what `program` wants and what is not open. Raises StartError, and then all is as it was.
+
+        `feed` makes what tells deadmen. A gateway that is the same as before keeps its clients. One that has changed
+        loses them here: its socket has to be closed before the new one can be opened.
+        """
+        return self._call(self._prepare(program, _outlets(program, self._ros, feed, self._report)))
+
+    async def _prepare(self, program: Program, outlets: InletOutlets) -> GatewayChange:
+        kept = {
+            plan.settings.name: service
+            for plan in program.gateways
+            if (service := self._services.get(plan.settings.name)) and are_same(service.plan, plan)
+        }
+        change = GatewayChange(kept, [], [each for each in self._services.values() if each.name not in kept])
         try:
             for plan in program.gateways:
-                self._call(self._open(plan))
+                if plan.settings.name not in kept:
+                    for rival in [each for each in change.left if _meet(each.plan.settings, plan.settings)]:
+                        await rival.close()
+                    service = await self._open(plan, program.books, outlets)
+                    change.opened.append(service)
+                    change.services[service.name] = service
         except BaseException:
-            self.stop()
+            await self._abandon(change)
             raise
+        return change
 
-    async def _open(self, plan: GatewayPlan) -> None:
+    def abandon(self, change: GatewayChange) -> None:
+        """Closes what `prepare` opened, and opens what had to make room for it."""
+        self._call(self._abandon(change))
+
+    async def _abandon(self, change: GatewayChange) -> None:
+        for service in change.opened:
+            await service.close()
+            del self._makers[service]
+        for service in change.left:
+            if service.is_closed:
+                self._makers[again := self._makers[service]()] = self._makers.pop(service)
+                self._services[service.name] = again
+                await again.open()
+                again.start()
+
+    def retire(self, change: GatewayChange) -> None:
+        """Closes what nobody wants any more; `abandon` would still open it again."""
+        self._call(self._retire(change))
+
+    async def _retire(self, change: GatewayChange) -> None:
+        async with AsyncExitStack() as closing:  # all of them, whatever one raises
+            for service in change.left:
+                closing.push_async_callback(service.close)
+
+    def finish(self, change: GatewayChange) -> None:
+        """From now on these serve, and no others."""
+        self._services = change.services
+        for service in change.left:
+            del self._makers[service]
+            if service.name not in change.services:
+                self.kernel_drops.pop(service.name, None)
+        self._call(self._start(change))
+
+    async def _start(self, change: GatewayChange) -> None:
+        for service in change.opened:
+            service.start()
+
+    async def _open(self, plan: GatewayPlan, books: Books, outlets: InletOutlets) -> GatewayService:
         settings = plan.settings
         style = ENCODINGS[settings.format].style
-        ledger = Ledger(settings, self._books, self._counts, self._outlets.report, wall_ns)
-        inlet = Inlet(plan, style, self._books, self._counts, self._outlets)
-        service = GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))
+
+        def made() -> GatewayService:
+            ledger = Ledger(settings, books, self._counts, outlets.report, wall_ns)
+            inlet = Inlet(plan, style, books, self._counts, outlets)
+            return GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))
+
+        service = made()
+        self._makers[service] = made
         try:
             await service.open()
         except StartError as error:
             raise StartError(
                 f"{settings.transport.span}: gateway '{settings.name}' cannot be opened: {error}"
             ) from error
-        self._services.append(service)
+        return service
 
     def _transport(self, settings: Gateway, ears: Ears) -> Transport:
         transport = _transport(settings, ears)
@@ -98,16 +174,9 @@ class GatewayThread:
             self.kernel_drops[settings.name] = transport.kernel_drops
         return transport
 
-    def start(self) -> None:
-        self._call(self._start())
-
-    async def _start(self) -> None:
-        for service in self._services:
-            service.start()
-
     def clients(self, value: Callable[[Subscriber], float]) -> Iterator[tuple[tuple[str, str], float]]:
         """Gateway and number of each client, and what `value` makes of it. For any thread."""
-        for service in self._services:
+        for service in list(self._services.values()):
             for each in list(service.audience.subscribers.values()):
                 yield (service.name, str(each.number)), value(each)
 
@@ -125,7 +194,7 @@ class GatewayThread:
     async def _close(self) -> None:
         async with AsyncExitStack() as closing:  # all of them, whatever one raises
             closing.callback(self._hub.close)
-            for service in self._services:
+            for service in self._services.values():
                 closing.push_async_callback(service.close)
 
     def _call(self, work: Coroutine[Any, Any, T]) -> T:
@@ -137,9 +206,13 @@ class GatewayThread:
         self._failed(error if isinstance(error, Exception) else RuntimeError(context["message"]))
 
 
-def _outlets(
-    program: Program, ros: RosEdge, feed: Callable[[str, Sequence[str]], Feed], report: Callable[[Report], None]
-) -> InletOutlets:
+def _meet(one: Gateway, other: Gateway) -> bool:
+    """Whether both can be open at a time is not known here, so only those are kept apart that could not."""
+    wanted = {where.value for where in (other.address, other.receive) if where}
+    return one.name == other.name or any(where.value in wanted for where in (one.address, one.receive) if where)
+
+
+def _outlets(program: Program, ros: RosEdge, feed: FeedMaker, report: Callable[[Report], None]) -> InletOutlets:
     inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
     guarded = [each.deadman.route for each in inbound if each.deadman]
     return InletOutlets(

@@ -130,7 +130,8 @@ def test_what_is_called_can_be_replaced_between_two_datagrams(several: list[List
     peer.sendto(b"old", several[0].address)
     assert receiving.got.get(timeout=5)[1] == b"old"
     new: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    receiving.thread.give_to({listener.name: lambda data, _: new.put(data) for listener in several})
+    functions = {listener.name: lambda data, _: new.put(data) for listener in several}
+    receiving.thread.between(lambda: receiving.thread.give_to(functions))
     peer.sendto(b"new", several[0].address)
     assert new.get(timeout=5) == b"new"
     receiving.thread.stop()

@@ -22,7 +22,13 @@ from tests.ports import free_port
 
 def opened(made: Program) -> GatewayThread:
     ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
-    return GatewayThread(made, ros, made.books.fresh_counts(), lambda *_: lambda _: None, print, print)
+    thread = GatewayThread(ros, made.books.fresh_counts(), print, print)
+    try:
+        thread.finish(thread.prepare(made, lambda *_: lambda _: None))
+    except BaseException:
+        thread.stop()
+        raise
+    return thread
 
 
 def threads() -> set[str]:

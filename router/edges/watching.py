@@ -1,0 +1,64 @@
+"""Looks whether files have changed, and tells when they have come to rest. Knows nothing of what is in them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from router.compiler.program import Program
+from router.edges.log import logger
+
+PERIOD = 0.5
+"""Seconds between two looks. A change is told when the second look finds it the same: editors write in pieces."""
+
+_Look = dict[Path, tuple[int, int, int]]
+
+
+class Watcher:
+    """Calls `changed` in a thread of its own when `files` are not what they were. Close it, but not from there."""
+
+    def __init__(self, files: Callable[[], Iterable[Path]], changed: Callable[[], object]) -> None:
+        self._files = files
+        self._changed = changed
+        self._seen = _look(files())
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stopped.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        before = self._seen
+        while not self._stopped.wait(PERIOD):
+            now = _look(self._files())
+            if now == before and now != self._seen:
+                logger.info("files of the table have changed: it is read again")
+                self._changed()
+                self._seen = now
+                after = _look(self._files())  # perhaps of other files: those are new, and have not changed
+                if now.items() & after.items() == {each for each in after.items() if each[0] in now}:
+                    self._seen = after
+                before = after
+            else:
+                before = now
+
+
+def watched_files(program: Program) -> list[Path]:
+    """The table, what it extends, and everything beside its protos, files that are new there among them."""
+    return [*program.table.files, *program.table.envelope.protos.value.rglob("*")]
+
+
+def _look(files: Iterable[Path]) -> _Look:
+    """What can be seen of them without reading; what is not there is not in it."""
+    found = {}
+    for path in files:
+        try:
+            seen = path.stat()
+        except OSError:
+            continue
+        found[path] = seen.st_mtime_ns, seen.st_size, seen.st_ino
+    return found

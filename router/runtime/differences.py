@@ -1,0 +1,60 @@
+"""What another table changes, in a line, and what of it a running router cannot take over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from router.compiler.program import Program
+from router.errors import Code, Diagnostic, SourceSpan
+from router.table.model import RouteTable
+from router.table.sameness import are_same
+
+_MOST_NAMED = 12
+
+
+def unchangeable(now: RouteTable, then: RouteTable) -> list[Diagnostic]:
+    """A finding for each setting of `then` that only a start can take over."""
+    top = SourceSpan(str(then.path))
+    settings = {
+        "node": (now.node, then.node, top),
+        "metrics": (now.metrics, then.metrics, then.metrics.span if then.metrics else top),
+        "record": (now.record, then.record, then.record.span if then.record else top),
+        "foxglove": (now.foxglove, then.foxglove, then.foxglove.span if then.foxglove else top),
+    }
+    return [
+        Diagnostic(
+            span, Code.BAD_VALUE, f"'{key}' cannot change while the router runs", "restart it, or change it back"
+        )
+        for key, (before, after, span) in settings.items()
+        if not are_same(before, after)
+    ]
+
+
+def changes(before: Program, after: Program) -> str:
+    """`route imu_info changed, endpoint arm_board added`; of many the first."""
+    now, then = before.table, after.table
+    found = [
+        *_differing("listener", now.listeners, then.listeners),
+        *_differing("endpoint", now.endpoints, then.endpoints),
+        *_differing("route", _routes(now), _routes(then)),
+        *_differing("gateway", now.gateways, then.gateways),
+        *(["protos changed"] if before.protos_sha256 != after.protos_sha256 else []),
+    ]
+    if not found:
+        return "nothing changed"
+    named, others = found[:_MOST_NAMED], len(found) - _MOST_NAMED
+    return ", ".join([*named, *([f"and {others} more"] if others > 0 else [])])
+
+
+def _routes(table: RouteTable) -> Mapping[str, object]:
+    return {route.name: route for route in table.routes}
+
+
+def _differing(kind: str, now: Mapping[str, object], then: Mapping[str, object]) -> Iterator[str]:
+    for name in [*now, *(then.keys() - now.keys())]:
+        if name not in now:
+            yield f"{kind} {name} added"
+        elif name not in then:
+            yield f"{kind} {name} removed"
+        elif not are_same(now[name], then[name]):
+            yield f"{kind} {name} changed"

@@ -1,0 +1,103 @@
+"""A reload: the table is read and compiled again beside the running program, which ends when all is ready for another.
+
+Knows what came of it; how a program takes over, `edges` knows.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+from collections.abc import Callable, Mapping, Sequence
+
+from router.compiler import check_table
+from router.compiler.definitions import Definitions
+from router.compiler.program import Program
+from router.edges.background import background_threads
+from router.edges.clock import monotonic_ns, wall_ns
+from router.edges.log import logger
+from router.edges.parking import StuckError
+from router.edges.running import ReloadResult
+from router.edges.supervision import reloading
+from router.errors import Diagnostic, Severity, StartError
+from router.runtime.accounts import Accounts
+from router.runtime.differences import changes, unchangeable
+from router.runtime.edges import Edges
+from router.runtime.interpreter import beside_traffic
+
+
+class Reloader:
+    """One reload at a time. `environ` has the values of the table's variables; None means the process environment.
+
+    `settled` is called when another program runs, and nothing is left of the one before.
+    """
+
+    def __init__(
+        self, edges: Edges, accounts: Accounts, environ: Mapping[str, str] | None, settled: Callable[[], None]
+    ) -> None:
+        self._edges = edges
+        self._accounts = accounts
+        self._environ = environ
+        self._settled = settled
+        self._is_open = False
+        self._one_at_a_time = threading.Lock()
+
+    def open(self) -> None:
+        """The router runs. What it has now counts as loaded."""
+        self._is_open = True
+        self._remember(is_good=True)
+
+    def close(self) -> None:
+        """Waits for a reload that is going on; none begins any more."""
+        with self._one_at_a_time:
+            self._is_open = False
+
+    def reload(self) -> ReloadResult:
+        """Raises nothing for a bad table, nor for what cannot be opened: then nothing changes."""
+        with self._one_at_a_time, background_threads(), beside_traffic(), reloading():
+            if not self._is_open or self._edges.wiring is None:
+                return ReloadResult(False, (), "the router is not running")
+            began = monotonic_ns()
+            kind, result = self._reload(self._edges.wiring.program)
+            self._count(kind)
+            self._remember(is_good=result.ok)
+            seconds = round((monotonic_ns() - began) / 1e9, 3)
+        log = logger.info if result.ok else logger.error
+        event = "table reloaded" if result.ok else "the table was not taken over, and nothing has changed"
+        log(event, result=result.text, findings=[str(finding) for finding in result.findings], seconds=seconds)
+        return result
+
+    def _reload(self, now: Program) -> tuple[str, ReloadResult]:
+        checked = check_table(now.table.path, self._environ, Definitions(now.protos))
+        findings = checked.diagnostics
+        then = checked.program_in(now.books.continued())
+        if then is None:
+            return "invalid", _refused(findings)
+        if refused := unchangeable(now.table, then.table):
+            return "invalid", _refused([*findings, *refused])
+        try:
+            change = self._edges.prepare(then)
+            self._edges.take_over(change)
+        except (StartError, StuckError) as error:
+            return "failed", ReloadResult(False, tuple(findings), str(error))
+        except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, must not end who asked
+            logger.critical("a fault in the router itself kept it from reloading; please report it", exc_info=error)
+            return "failed", ReloadResult(False, tuple(findings), f"a fault in the router itself: {error!r}")
+        text = changes(now, then)
+        del now, then, checked, change
+        self._settled()
+        gc.collect()
+        return "ok", ReloadResult(True, tuple(findings), text)
+
+    def _count(self, kind: str) -> None:
+        self._accounts.own[self._accounts.books.slot("config_reloads", kind)] += 1
+
+    def _remember(self, *, is_good: bool) -> None:
+        books, own = self._accounts.books, self._accounts.own
+        own[books.slot("config_last_reload_successful")] = int(is_good)
+        if is_good:
+            own[books.slot("config_last_reload_timestamp_seconds")] = wall_ns()
+
+
+def _refused(findings: Sequence[Diagnostic]) -> ReloadResult:
+    errors = sum(finding.severity is Severity.ERROR for finding in findings)
+    return ReloadResult(False, tuple(findings), f"the table has {errors} error{'s' * (errors != 1)}")

@@ -1,0 +1,168 @@
+"""Binds a program to what is open: the functions that the threads call, and what these remember."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from router.compiler.program import DeadmanPlan, Program
+from router.edges.clock import monotonic_ns, wall_ns
+from router.edges.receiver import Receive
+from router.edges.reports import Reporter
+from router.edges.timekeeper import Timekeeper
+from router.engine import Engine, OutboundEngine
+from router.engine.binding import Guarded, Outlets
+from router.engine.deadman import Deadman, FeedMaker, feeder
+from router.engine.outbound import Take
+from router.engine.pacing import Pacer
+from router.engine.state import State
+from router.runtime.accounts import Accounts
+from router.runtime.sockets import SocketChange
+
+if TYPE_CHECKING:
+    from router.edges.ros import RosEdge
+    from router.edges.ros_change import RosChange
+
+Send = Callable[[bytes], int]
+
+
+class Keepers:
+    """One for deadmen, which never wait for other machines, one for what waits to be sent, one for open frames."""
+
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        self.deadman, self.pacing, self.collecting = (
+            Timekeeper(name, monotonic_ns, failed) for name in ("deadman", "pacing", "collect")
+        )
+
+    def start(self) -> None:
+        for keeper in (self.deadman, self.pacing, self.collecting):
+            keeper.start()
+
+    def release(self, machines: Sequence[object]) -> None:
+        """Ends those that are machines: frames first, then what waits to be sent; a deadman has the last word."""
+        for keeper in (self.collecting, self.pacing, self.deadman):
+            keeper.release(machines)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What wiring needs of the router, whatever its program is. `deadman_changed` hears a route and whether it acts."""
+
+    accounts: Accounts
+    keepers: Keepers
+    reporter: Reporter
+    deadman_changed: Callable[[str, bool], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """A program's functions: `receive` by listener, `take` by topic. `feed` makes what tells deadmen of a command."""
+
+    program: Program
+    receive: Mapping[str, Receive]
+    take: Mapping[str, Take]
+    feed: FeedMaker
+    state: State
+    deadmen: Mapping[str, Deadman]
+    cuts: Sequence[Callable[[], None]]
+
+    def forget(self) -> None:
+        """Nobody calls the functions any more. Each is in a ring with its globals; cut, they are gone at once."""
+        for cut in self.cuts:
+            cut()
+
+    def inherit(self, earlier: Wiring, keeper: Timekeeper) -> None:
+        """Each deadman with other settings than before takes its predecessor's place. Nobody else calls either."""
+        for route, deadman in self.deadmen.items():
+            before = earlier.deadmen.get(route)
+            if before is not None and before is not deadman:
+                keeper.guard(deadman, deadman.inherit)(before)
+
+
+def wire(
+    program: Program,
+    around: Surroundings,
+    sockets: SocketChange,
+    ros: RosEdge | None,
+    topics: RosChange | None,
+    state: State,
+) -> Wiring:
+    """For the sockets and topics that `program` is to have."""
+    accounts, keepers = around.accounts, around.keepers
+    send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
+    deadmen = _deadmen(program, around, send, ros, state)
+    feed = feeder(deadmen, keepers.deadman.guard)
+    outlets = Outlets(
+        counts=accounts.receive,
+        send=send,
+        publish={topic: each.publish for topic, each in topics.publications.items()} if topics else {},
+        wanted={topic: each.wanted for topic, each in topics.publications.items()} if topics else {},
+        report=around.reporter.report,
+        clock_ns=monotonic_ns,
+        wall_ns=wall_ns,
+        pacing=Guarded(accounts.pacing, keepers.pacing.guard),
+        collecting=Guarded(accounts.collecting, keepers.collecting.guard),
+        feed=feed,
+        publish_errors=ros.publish_errors if ros else (),
+        pacers=_pacers(program, keepers.pacing, send, state),
+        state=state,
+    )
+    inbound = Engine(program, outlets, {name: each.arrived_at for name, each in sockets.listeners.items()})
+    outbound = OutboundEngine(program, replace(outlets, counts=accounts.ros))
+    return Wiring(
+        program=program,
+        receive={name: inbound.receiver(name) for name in sockets.listeners},
+        take={plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions},
+        feed=feed,
+        state=state,
+        deadmen=deadmen,
+        cuts=(inbound.forget, outbound.forget),
+    )
+
+
+def _deadmen(
+    program: Program, around: Surroundings, send: Mapping[str, Send], ros: RosEdge | None, state: State
+) -> dict[str, Deadman]:
+    """By route; those of what gateways let in send to topics."""
+    inbound = [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
+    outlets = dict(send)
+    if ros is not None:
+        for topic in {topic for plan in inbound for topic, _ in plan.datagrams}:
+            outlets[topic] = state.keep(("sender to topic", topic), partial(_sender_to, ros, topic))
+
+    def deadman(plan: DeadmanPlan) -> Deadman:
+        counts = around.accounts.deadman
+        return Deadman(plan, program.books, counts, outlets, around.reporter.report, around.deadman_changed)
+
+    return {
+        plan.route: state.keep(
+            ("deadman", plan, tuple(outlets[name] for name, _ in plan.datagrams)), partial(deadman, plan)
+        )
+        for plan in (*program.deadmen, *inbound)
+    }
+
+
+def _pacers(program: Program, keeper: Timekeeper, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
+    pacers = {}
+    for plan in program.senders:
+        if plan.budget:
+            sending, budget = send[plan.endpoint], plan.budget
+            pacer = state.keep(("pacer", plan.endpoint, budget, sending), partial(Pacer, budget, sending))
+            keeper.add(pacer)  # before what hands on to it, so that it is ended after that
+            pacers[plan.endpoint] = pacer
+    return pacers
+
+
+def _sender_to(ros: RosEdge, topic: str) -> Send:
+    """Publishes as a socket sends: a deadman knows no topics."""
+
+    def send(message: bytes) -> int:
+        try:
+            ros.publish[topic](message)
+        except ros.publish_errors as error:
+            raise OSError(f"it cannot be published: {error}") from error
+        return len(message)
+
+    return send
