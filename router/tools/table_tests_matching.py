@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Union
 
 from router.errors import SourceSpan
-from router.tools.table_tests_shown import is_unset, same_value, shown, time_of
+from router.tools.table_tests_shown import elements, is_unset, same_value, shown, time_of
 from router.types.model import List, MessageType, Type
 
 Path = tuple[Union[str, int], ...]
@@ -121,7 +121,7 @@ class ListMatch:
             found = f"{len(actual)} elements {shown(kind, actual)}" if len(actual) else "empty"
             yield Difference(path, f"{len(self.items)} elements", found, self.span)
             return
-        for index, (item, value) in enumerate(zip(self.items, actual, strict=True)):
+        for index, (item, value) in enumerate(zip(self.items, elements(kind, actual), strict=True)):
             yield from item.differences((*path, index), kind.element, value, moments)
 
 

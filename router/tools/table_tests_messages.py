@@ -33,10 +33,25 @@ def fill(message: Any, kind: MessageType, given: MessageMatch, moments: Moments)
 
 def _extend(values: Any, element: Type, given: ListMatch, moments: Moments) -> None:
     for item in given.items:
-        if isinstance(item, MessageMatch) and isinstance(element, MessageType):
+        if isinstance(item, MessageMatch) and isinstance(element, MessageType) and element.is_map_entry:
+            _put(values, item, element, moments)
+        elif isinstance(item, MessageMatch) and isinstance(element, MessageType):
             fill(values.add(), element, item, moments)
         elif isinstance(item, Exactly):
             values.append(item.value)
+
+
+def _put(holder: Any, given: MessageMatch, entry: MessageType, moments: Moments) -> None:
+    """One entry of a map."""
+    key, value = given.members.get("key"), given.members.get("value")
+    place = key.value if isinstance(key, Exactly) else default_of(entry.fields[0].type)
+    kind = entry.fields[1].type
+    if isinstance(kind, MessageType):
+        holder[place].SetInParent()
+        if isinstance(value, MessageMatch):
+            fill(holder[place], kind, value, moments)
+    else:
+        holder[place] = value.value if isinstance(value, Exactly) else default_of(kind)
 
 
 def values(kind: MessageType, given: MessageMatch, moments: Moments) -> Mapping[str, Any]:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from google.protobuf.message import Message
 
-from router.compiler.implementations import NS_PER_SECOND
+from router.compiler.implementations import NS_PER_SECOND, entries
 from router.tools.rehearsal import START
 from router.tools.show import float_text
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
@@ -29,7 +29,7 @@ def shown(kind: Type, value: Any) -> str:
             inner = ", ".join(words(kind, value))
             return f"{{{inner}}}"
         case List():
-            return f"[{', '.join(shown(kind.element, item) for item in value)}]"
+            return f"[{', '.join(shown(kind.element, item) for item in elements(kind, value))}]"
         case Enum():
             return next((name for name, number in kind.values if number == value), str(value))
         case Float():
@@ -42,6 +42,12 @@ def shown(kind: Type, value: Any) -> str:
             return repr(value)
         case _:
             return str(value)
+
+
+def elements(kind: List, value: Any) -> Sequence[Any]:
+    """Of a list; of a protobuf map its entries, by key."""
+    element = kind.element
+    return entries(value) if isinstance(element, MessageType) and element.is_map_entry else value
 
 
 def words(kind: MessageType, value: Any) -> Iterator[str]:
@@ -83,7 +89,7 @@ def _is_default(kind: Type, value: Any, default: Any) -> bool:
     if isinstance(kind, MessageType):
         return all(_is_default(field.type, getattr(value, field.name), default[field.name]) for field in kind.fields)
     if isinstance(kind, List):
-        same = zip(value, default, strict=False)
+        same = zip(elements(kind, value), default, strict=False)
         return len(value) == len(default) and all(_is_default(kind.element, one, other) for one, other in same)
     return same_value(kind, default, value)
 

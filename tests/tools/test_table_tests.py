@@ -256,6 +256,79 @@ def test_variables_of_the_table_come_from_the_test_alone(tmp_path: Path, monkeyp
     assert not failures(tmp_path, routes, tests)
 
 
+PROTO = """
+syntax = "proto3";
+import "google/protobuf/timestamp.proto";
+enum Mode { MODE_OFF = 0; MODE_ON = 1; MODE_HALF = -2; }
+message Point { int32 x = 1; int32 y = 2; }
+message EveryKind {
+  enum State { IDLE = 0; BUSY = 1; }
+  bool flag = 1;
+  sint64 number = 2;
+  float single = 3;
+  double real = 4;
+  string text = 5;
+  bytes blob = 6;
+  Mode mode = 7;
+  State state = 8;
+  Point point = 9;
+  repeated float numbers = 10;
+  repeated Point points = 11;
+  repeated Mode modes = 12;
+  optional int32 maybe = 13;
+  map<string, int32> counts = 14;
+  map<int32, Point> places = 15;
+  oneof either { int32 left = 16; string right = 17; }
+  google.protobuf.Timestamp time = 18;
+}
+message PBEnvelope { oneof payload { EveryKind every_kind = 1; } }
+"""
+EVERY_KIND = """{
+    flag: true, number: -3, single: 0.1, real: 0.1, text: "any", blob: "0a ff", mode: MODE_HALF, state: State.BUSY,
+    point: {x: 1}, point.y: 2, numbers: [1, 2.5, nan], points: [{}, {y: 3}], modes: [MODE_ON, 0], maybe: 0,
+    counts: [{key: a, value: 1}, {key: b, value: 2}], places: [{key: 5, value: {x: 6}}], right: "", time: 250ms}"""
+
+
+def every_kind(folder: Path, expected: str) -> list[str]:
+    (folder / "kinds.proto").write_text(PROTO)
+    head = HEAD.replace("PROTOS", str(folder))
+    tests = f"""
+        a:
+          given: {{case: every_kind, from: left_tool, listener: exact, fields: {" ".join(EVERY_KIND.split())}}}
+          expect: {{sent: {{right_tool: {{every_kind: {" ".join(expected.split())}}}}}}}
+        """
+    return messages(folder, "every_kind: {source: left_tool, destinations: [right_tool]}", tests, head)
+
+
+def test_every_kind_of_field_can_be_given_and_expected(tmp_path: Path) -> None:
+    assert every_kind(tmp_path, EVERY_KIND) == []
+    assert every_kind(tmp_path, "unchanged") == []
+
+
+def test_every_kind_of_field_is_told_where_it_is_not_expected(tmp_path: Path) -> None:
+    assert [
+        said.removeprefix("right_tool: ").replace(", not at its default", "") for said in every_kind(tmp_path, "{}")
+    ] == [
+        "flag is true",
+        "number is -3",
+        "single is 0.1",
+        "real is 0.1",
+        "text is 'any'",
+        "blob is 0aff",
+        "mode is MODE_HALF",
+        "state is BUSY",
+        "point is {x: 1, y: 2}",
+        "numbers is [1, 2.5, nan]",
+        "points is [{}, {y: 3}]",
+        "modes is [MODE_ON, MODE_OFF]",
+        "maybe is 0",
+        "counts is [{key: 'a', value: 1}, {key: 'b', value: 2}]",
+        "places is [{key: 5, value: {x: 6}}]",
+        "right is ''",
+        "time is 250 ms",
+    ]
+
+
 # what fails
 
 
