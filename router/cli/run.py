@@ -9,7 +9,7 @@ import argparse
 import os
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,10 +20,12 @@ from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table
 from router.edges.log import LEVELS as LOG_LEVELS
 from router.edges.log import configure_log
+from router.edges.supervision import supervised
 from router.errors import StartError
 from router.runtime import Router, tune_interpreter
 
-_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM.
+_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router reload').
+SIGUSR1: save the last datagrams, where the table keeps them ('record').
 Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table has errors or what it names cannot be opened."""
 
 _EPILOG = """\
@@ -60,20 +62,35 @@ def run(args: argparse.Namespace) -> int:
         print(f"router run: TABLE is {args.table}, {_ROUTES_PATH} is {named}; name one table", file=sys.stderr)
         return BAD_USAGE
     table = args.table or Path(named or DEFAULT_TABLE)
-    checked = check_table(table, {**os.environ, **table_variables(parameters)})
+    environ = {**os.environ, **table_variables(parameters)}
+    checked = check_table(table, environ)
     print_findings(checked.diagnostics, sys.stderr)
     if checked.program is None:
         return BAD_TABLE
     # Blocked in all threads, the signals wait for sigwait: no handler runs, no system call is interrupted.
     ending = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, ending)
-    with Router(checked.program, ["--ros-args", *args.ros_args]):
+    signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
+    with Router(checked.program, ["--ros-args", *args.ros_args], environ) as router:
         tune_interpreter()
-        signal.sigwait(ending)
+        del checked  # a reload is to free what it replaces
+        with supervised(router.progress):
+            _serve_signals(router, ending)
         for number in ending:
             signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)
     return OK
+
+
+def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:
+    """Until one of `ending` comes. What comes while another one is served waits."""
+    while True:
+        match signal.sigwait({*ending, signal.SIGHUP, signal.SIGUSR1}):
+            case signal.SIGHUP:
+                router.reload()
+            case signal.SIGUSR1:
+                router.save_recording("signal")
+            case _:
+                return
 
 
 def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:

@@ -1,0 +1,60 @@
+"""`router reload [TABLE]`: a running router reads its table again, and takes it over if it is good."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
+from router.cli.tool_options import explained
+from router.tools import UsageError
+
+PATIENCE = 60.0
+"""Seconds; a large table takes one to compile where there is much traffic."""
+
+_DESCRIPTION = f"""Have a running router read its table again, with all files that the table names, and
+take it over between two datagrams: nothing is lost, and what has not changed goes on as it is. A table with errors
+changes nothing; its findings are printed. SIGHUP does the same, and tells in the log.
+Exit code: {OK} it was taken over, {BAD_USAGE} wrong usage, {BAD_TABLE} it was not, 1 no router answers."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser(
+        "reload", help=VERBS["reload"], description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "table",
+        nargs="?",
+        type=Path,
+        default=DEFAULT_TABLE,
+        metavar="TABLE",
+        help=f"only tells where the router answers, by its metrics.address (default: {DEFAULT_TABLE})",
+    )
+    parser.add_argument("--url", metavar="URL", help="of the running router, instead")
+
+
+@explained
+def run(args: argparse.Namespace) -> int:
+    from router.tools.running_router import post
+
+    answer = post(args.url or _url(args.table), "/-/reload", PATIENCE)
+    for finding in answer.said.get("findings", ()):
+        print(finding, file=sys.stderr)
+    text = answer.said.get("text", "")
+    if not answer.ok:
+        print(f"router reload: nothing has changed: {text}", file=sys.stderr)
+        return BAD_TABLE
+    print(text)
+    return OK
+
+
+def _url(path: Path) -> str:
+    """By what is sound of the table: it may have errors, which the router will tell."""
+    from router.table import load_table
+    from router.tools.running_router import url_of
+
+    table, _ = load_table(path)
+    if table is None:
+        raise UsageError(f"{path} does not tell where the router answers: give --url")
+    return url_of(table)
