@@ -1,0 +1,151 @@
+"""`router replay FILE` as it is typed: what is sent, from where, in which order, and what is said when it cannot be."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from router.assets import asset
+from router.cli import main
+from router.tools import UsageError
+from router.tools.recording import Recording
+from router.tools.replaying import on_time, parse_rate
+from tests.edges.recorder_rig import MILLISECOND, START, imu, recorded, seen
+from tests.ports import free_port
+
+BOARD, STRANGER = ("127.0.6.30", 40001), ("127.0.6.99", 40002)
+ELSEWHERE = ("198.51.100.7", 5000)
+BATCHES = (
+    seen(imu(1), b"no envelope", imu(2).rstrip(b"\0") + bytes(7), peer=BOARD),
+    seen(imu(3), b"", imu(4), at=START + 50 * MILLISECOND, peer=STRANGER),
+)
+SENT = [each.data for batch in BATCHES for each in batch]
+
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+  {listener}: {{address: 0.0.0.0:{port}}}
+endpoints:
+  sensor_board: {{address: 127.0.6.31:8, kind: board}}
+routes: {{}}
+"""
+
+
+@pytest.fixture
+def receiver() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.6.5", 0))
+        opened.settimeout(5)
+        yield opened
+
+
+def place(receiver: socket.socket) -> str:
+    host, port = receiver.getsockname()
+    return f"{host}:{port}"
+
+
+def received(receiver: socket.socket, count: int) -> list[tuple[bytes, str]]:
+    return [(data, host) for data, (host, _) in (receiver.recvfrom(65536) for _ in range(count))]
+
+
+def table(folder: Path, port: int, listener: str = "rover") -> str:
+    path = folder / "table.yaml"
+    path.write_text(TABLE.format(protos=asset("protos"), port=port, listener=listener))
+    return str(path)
+
+
+@pytest.fixture
+def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)  # where there is no table
+    return recorded(tmp_path / "it.mcap", *BATCHES)
+
+
+def test_every_datagram_is_sent_again_from_where_it_came(
+    path: Path, receiver: socket.socket, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(path), "--to", place(receiver), "--rate", "max"]) == 0
+    assert received(receiver, 6) == [(data, BOARD[0]) for data in SENT[:3]] + [(data, STRANGER[0]) for data in SENT[3:]]
+    captured = capsys.readouterr()
+    assert captured.out == "sent 6 datagrams\n"
+    assert captured.err == ""
+
+
+def test_a_table_says_where_to_and_where_its_endpoints_are(
+    tmp_path: Path, receiver: socket.socket, capsys: pytest.CaptureFixture[str]
+) -> None:
+    receiver.close()
+    path = recorded(tmp_path / "it.mcap", seen(imu(), b"bad"), seen(imu(), peer=STRANGER))  # the rig's sensor_board
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(5)
+        words = ["--table", table(tmp_path, listener.getsockname()[1]), "--rate", "max"]
+        assert main(["replay", str(path), *words]) == 0
+        assert [host for _, host in received(listener, 3)] == ["127.0.6.31", "127.0.6.31", STRANGER[0]]
+
+
+def test_one_address_for_all_senders(path: Path, receiver: socket.socket) -> None:
+    assert main(["replay", str(path), "--to", place(receiver), "--rate", "max", "--from", "127.0.6.77"]) == 0
+    assert {host for _, host in received(receiver, 6)} == {"127.0.6.77"}
+
+
+def test_an_address_that_this_computer_lacks_is_told(
+    tmp_path: Path, receiver: socket.socket, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = recorded(tmp_path / "it.mcap", seen(imu(), peer=ELSEWHERE))
+    assert main(["replay", str(path), "--to", place(receiver), "--rate", "max"]) == 0
+    assert [data for data, _ in received(receiver, 1)] == [imu()]
+    assert "lacks the addresses of 198.51.100.7:5000 (198.51.100.7)" in capsys.readouterr().err
+
+
+def test_nobody_who_listens_is_an_error(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(path), "--to", f"127.0.6.5:{free_port('127.0.6.5')}", "--rate", "max"]) == 1
+    assert "nobody listened" in capsys.readouterr().err
+
+
+def test_a_listener_that_the_table_lacks_is_told(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(path), "--table", table(tmp_path, 5000, "rovers")]) == 2
+    assert "no listener 'rover' as the recording has; did you mean 'rovers'?" in capsys.readouterr().err
+    assert main(["replay", str(path)]) == 2
+    assert "give --to" in capsys.readouterr().err
+
+
+def test_a_recording_that_was_cut_is_sent_as_far_as_it_goes(
+    path: Path, receiver: socket.socket, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = recorded(path.parent / "cut.mcap", *BATCHES, finish=False)
+    assert main(["replay", str(cut), "--to", place(receiver), "--rate", "max"]) == 0
+    assert len(received(receiver, 6)) == 6
+    assert "was not finished" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rate", [1.0, 10.0, None])
+def test_datagrams_are_due_when_they_came(path: Path, rate: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+
+    monkeypatch.setattr(time, "sleep", sleep)
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    sent = [now[0] - 1000 for _ in on_time(Recording(path), rate)]
+    steps = [0, 0.001, 0.002, 0.05, 0.051, 0.052]
+    assert sent == pytest.approx([step / rate if rate else 0 for step in steps])
+
+
+@pytest.mark.parametrize(("text", "rate"), [("2x", 2), ("2", 2), ("0.5x", 0.5), (".5x", 0.5), ("max", None)])
+def test_rates(text: str, rate: float | None) -> None:
+    assert parse_rate(text) == rate
+
+
+@pytest.mark.parametrize("text", ["", "x", "0x", "-1x", "fast", "1e9", "nan", "2xx"])
+def test_what_is_no_rate_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="is no rate"):
+        parse_rate(text)
