@@ -27,7 +27,8 @@ MONITORED = (
     + """
 gateways:
   dashboard: {{transport: {{websocket: 127.0.0.1:@}}}}
-record: {{directory: recordings}}
+record: {{directory: recordings, continuous: true}}
+foxglove: {{address: 127.0.0.1:0}}
 """
 )
 """The rover, with all that has metrics, and its own times for what is silent and for its deadmen."""
