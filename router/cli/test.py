@@ -45,9 +45,9 @@ def run(args: argparse.Namespace) -> int:
         return BAD_USAGE
     coverages: dict[Path, Coverage] | None = {} if args.coverage else None
     results, findings = _proven(files, args.only or "", coverages)
-    if findings:
-        print_findings(findings, sys.stderr, "github" if args.format == "github" else "text")
-    print_results(results, coverages or {}, sys.stdout, args.format)
+    if findings and args.format != "json":
+        print_findings(findings, sys.stderr, args.format)
+    print_results(results, findings, coverages or {}, sys.stdout, args.format)
     if args.format == "text" and (results or not findings):
         print(summary(results, len(files)))
     if findings:

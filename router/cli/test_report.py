@@ -10,8 +10,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
+from router.cli.findings import as_data as finding_data
 from router.cli.findings import excerpt, github_escaped, is_coloured, plural, visible
-from router.errors import SourceSpan, shown_path
+from router.errors import Diagnostic, SourceSpan, shown_path
 from router.tools.table_tests_comparing import Failure
 from router.tools.table_tests_coverage import Coverage
 from router.tools.table_tests_running import Result
@@ -21,10 +22,13 @@ _RESET, _BOLD, _RED, _GREEN, _CYAN, _YELLOW = "\x1b[0m", "\x1b[1m", "\x1b[31m", 
 Coverages = Mapping[Path, Coverage]
 
 
-def print_results(results: Sequence[Result], coverages: Coverages, out: TextIO, style: str) -> None:
-    """In one of findings.FORMATS."""
+def print_results(
+    results: Sequence[Result], findings: Sequence[Diagnostic], coverages: Coverages, out: TextIO, style: str
+) -> None:
+    """In one of findings.FORMATS. Only JSON has the `findings`, which are what is wrong with test files and tables."""
     if style == "json":
-        json.dump(as_data(results, coverages), out, indent=2)
+        wrong = {"findings": [finding_data(finding, strict=False) for finding in findings]}
+        json.dump(as_data(results, coverages) | wrong, out, indent=2)
         out.write("\n")
     elif style == "github":
         out.writelines(line + "\n" for line in _github(results, coverages))

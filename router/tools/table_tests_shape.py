@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,8 +44,6 @@ def _findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
             yield from _unknown_keys(misfit, node_at(root, misfit.path))
         elif not misfit.path and misfit.path not in misspelt:
             yield Diagnostic(whole, Code.MISSING_KEY, "a test file has its tests under the key 'tests'")
-        elif misfit.keyword == "anyOf":
-            yield replace(finding(misfit, root), code=Code.BAD_VALUE)
         elif misfit.keyword == "required" and misfit.path in misspelt:
             continue  # the key that is missing may be the one that is misspelt
         elif misfit.keyword == "required":

@@ -127,6 +127,11 @@ def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixtur
     assert coverage["table"] == "routes/rover.yaml"
     assert coverage["routes"]["touched"] == coverage["routes"]["all"] > 20
     assert coverage["gaps"] == []
+    assert data["findings"] == []
+    change(rover.with_name("rover.test.yaml"), "from: sensor_board", "from: sensor_bord")
+    assert main(["test", "--format", "json"]) == BAD_TABLE
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert finding["code"] == "unknown-endpoint"
 
 
 def test_github_shows_failures_beside_the_lines(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
