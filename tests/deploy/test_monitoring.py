@@ -26,9 +26,9 @@ MONITORED = (
     ROVER.replace("tests/acceptance/patient.yaml", "routes/rover.yaml")
     + """
 gateways:
-  dashboard: {{transport: {{websocket: 127.0.0.1:@}}}}
+  dashboard: {{transport: {{websocket: 127.0.0.1:@gateway}}}}
 record: {{directory: recordings, continuous: true}}
-foxglove: {{address: 127.0.0.1:0}}
+foxglove: {{address: 127.0.0.1:@foxglove}}
 """
 )
 """The rover, with all that has metrics, and its own times for what is silent and for its deadmen."""
@@ -72,10 +72,12 @@ class Monitored:
 @pytest.fixture(scope="module")
 def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
     """A router with traffic, and a browser at its gateway."""
-    folder, gateway = tmp_path_factory.mktemp("monitored"), free_port(kind=socket.SOCK_STREAM)
+    folder = tmp_path_factory.mktemp("monitored")
+    gateway, foxglove = free_port(kind=socket.SOCK_STREAM), free_port(kind=socket.SOCK_STREAM)
+    text = MONITORED.replace("@gateway", str(gateway)).replace("@foxglove", str(foxglove))
     with (
         site(folder) as place,
-        RouterProcess(folder, place.table(MONITORED.replace("@", str(gateway)))),
+        RouterProcess(folder, place.table(text)),
         connect(f"ws://127.0.0.1:{gateway}", close_timeout=0.1),  # it reads nothing, so that it is behind
         Traffic(place) as traffic,
     ):
