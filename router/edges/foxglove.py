@@ -19,6 +19,7 @@ from google.protobuf.message import DecodeError as ProtobufError
 
 from router.compiler.program import Program
 from router.edges.background import background_threads
+from router.edges.http_tap import first_field
 from router.edges.log import logger
 from router.edges.mirror import Seen
 from router.edges.port_holder import port_holder
@@ -130,20 +131,26 @@ class FoxgloveServer(ServerListener):
         """Called by the mirror's thread. What is no payload for the router is not shown."""
         program, _, channels = self._shown
         assert program is not None  # noqa: S101 - there is one since the start
-        listeners, envelope = program.table.listeners, program.envelope
-        parse, oneof = envelope.message_class.FromString, envelope.oneof
+        wanted = {case.number for case in program.envelope.cases.values() if channels[case.name].has_sinks()}
         for seen in batch:
-            data = seen.data
-            if len(data) > MAX_DATAGRAM:
-                continue
-            if seen.listener in listeners and listeners[seen.listener].framing is Framing.ZERO_TRIMMED:
-                data = restored(data, MAX_DATAGRAM)
-            try:
-                message = parse(data)
-            except ProtobufError:
-                continue
-            if (case := message.WhichOneof(oneof)) and channels[case].has_sinks():
-                channels[case].log(getattr(message, case).SerializeToString(), log_time=seen.at)
+            if first_field(seen.data) in wanted and (found := _payload(seen, program)) is not None:
+                case, payload = found
+                channels[case].log(payload, log_time=seen.at)
+
+
+def _payload(seen: Seen, program: Program) -> tuple[str, bytes] | None:
+    """The payload case and the payload of a datagram, None where the router finds none in it."""
+    listener, data = program.table.listeners.get(seen.listener), seen.data
+    if len(data) > MAX_DATAGRAM:
+        return None
+    if listener is not None and listener.framing is Framing.ZERO_TRIMMED:
+        data = restored(data, MAX_DATAGRAM)
+    try:
+        message = program.envelope.message_class.FromString(data)
+    except ProtobufError:
+        return None
+    case = message.WhichOneof(program.envelope.oneof)
+    return (case, getattr(message, case).SerializeToString()) if case else None
 
 
 def _started(address: Located[Address], name: str, context: Context, listener: ServerListener) -> WebSocketServer:
