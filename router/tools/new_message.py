@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 from router.compiler import Checked
 from router.errors import did_you_mean
 from router.table.model import Endpoint, EndpointKind, RouteTable
+from router.table.scalars import resolve, surprise
 from router.tools import UsageError
 from router.types.lock_file import read_lock
 from router.types.model import Enum, MessageType
@@ -147,6 +148,8 @@ def _field(text: str, comment: str, site: Site) -> NewField:
         raise UsageError(f"'{text}' is no field; write name:type, as in dose_rate:float")
     if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name):
         raise UsageError(f"'{name}' is no name of a field; write it as dose_rate")
+    if surprise(name) or resolve(name) != name:  # in tables and tests names stand without quotation marks
+        raise UsageError(f"'{name}' is no text to readers of YAML; take another name, such as is_{name}")
     if type_ in SCALARS:
         return NewField(name, type_, comment)
     named = (*site.schema.messages, *site.schema.enums)

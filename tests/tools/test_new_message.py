@@ -32,14 +32,19 @@ TEST = """\
       published: {radiation_info: unchanged}
 
 """
+SITE = Path(__file__).parent / "new_message_site"
 Files = dict[str, str]
 
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of everything that a new message touches, in which the router then works."""
-    for folder in ("protos", "routes", "schemas"):
-        shutil.copytree(asset(folder), tmp_path / folder)
+    """A small rover with everything that a new message touches, in which the router then works.
+
+    Not the rover itself: that may have a radiation sensor some day.
+    """
+    shutil.copytree(SITE, tmp_path, dirs_exist_ok=True)
+    for schema in asset("schemas").glob("*.json"):
+        shutil.copy(schema, tmp_path / "schemas")
     monkeypatch.setattr(router.assets, "_PLACES", (tmp_path,))
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -100,7 +105,7 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
     ]
     assert new.pop("routes/rover.yaml") == ROUTE.splitlines()
     assert new.pop("routes/rover.test.yaml") == TEST.splitlines()
-    assert new.pop("routes/legacy.yaml") == ["  radiation_info:       {source: any, destinations: [dst_a, dst_b]}"]
+    assert new.pop("routes/legacy.yaml") == ["  radiation_info: {source: any, destinations: [dst_a, dst_b]}"]
     assert new == {}
 
 
@@ -129,12 +134,12 @@ def test_without_fields_it_has_a_number_and_what_most_messages_of_the_board_have
 
 def test_what_the_basestation_sends_goes_to_ros_alone(site: Path) -> None:
     before = contents(site)
-    assert main(["new", "BasestationHorn", "--number", "29", "--board", "basestation", "--fields", "on:bool"]) == OK
+    assert main(["new", "BasestationHorn", "--number", "29", "--board", "basestation", "--fields", "is_on:bool"]) == OK
     assert added(before, contents(site))["routes/rover.yaml"] == [
+        "",
         "  horn:",
         "    source: basestation",
         "    topics: [{topic: horn, type: comms/msg/BasestationHorn, queue_depth: 10, fields: auto}]",
-        "",
     ]
 
 
@@ -175,7 +180,7 @@ def test_a_table_beside_that_routes_in_its_own_way_is_left_to_a_person(
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("SensorBoardRadiationInfo", "26", "sensor"), "number 26 belongs to 'manual_arm', for ever; 27 is free"),
+        (("SensorBoardRadiationInfo", "26", "sensor"), "number 26 belongs to 'manual_brake', for ever; 27 is free"),
         (("SensorBoardRadiationInfo", "30", "sensor"), "says: Number 30 is promised"),
         (("SensorBoardRadiationInfo", "0", "sensor"), "0 is no field number of protobuf; 27 is free"),
         (("SensorBoardRadiationInfo", "19500", "sensor"), "19500 is no field number of protobuf"),
@@ -183,14 +188,15 @@ def test_a_table_beside_that_routes_in_its_own_way_is_left_to_a_person(
         (("RadiationInfo", "27", "sensor"), "write it as SensorBoardRadiationInfo"),
         (("SensorBoardradiation", "27", "sensor"), "is no name for a message of sensor_board"),
         (("SensorBoardPumpInfo", "27", "sensor"), "there is a message 'SensorBoardPumpInfo' already"),
-        (("SensorBoardManualArm", "27", "sensor"), "has a payload case 'manual_arm' already, number 26"),
-        (("SensorBoardDetectedObjects", "27", "sensor"), "has a topic 'detected_objects' already"),
+        (("SensorBoardManualBrake", "27", "sensor"), "has a payload case 'manual_brake' already, number 26"),
+        (("SensorBoardWantedControlMode", "27", "sensor"), "has a topic 'wanted_control_mode' already"),
         (("SensorBoardImuSensorInfo", "27", "sensor"), "imu_sensor.proto already"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose"), "'dose' is no field; write name:type"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose:flot"), "did you mean 'float'?"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose:string"), "there is no type 'string'"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "Dose:float"), "'Dose' is no name of a field"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "from:float"), "'from' is no name of a field"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "on:bool"), "take another name"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool b:bool # both"), "belongs to one field"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool a:float"), "there are 2 fields 'a'"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", " "), "--fields names no field"),
@@ -209,7 +215,7 @@ def test_what_cannot_be_is_refused_and_nothing_is_written(
 def test_a_number_that_was_given_out_once_stays_taken(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lock = site / "protos/envelope.lock.json"
     text = lock.read_text(encoding="utf-8")
-    was = '"26": "BasestationManualArmMovement manual_arm"'
+    was = '"26": "BasestationManualBrake manual_brake"'
     lock.write_text(text.replace(was, f'{was},\n        "27": "Gone gone_info"'), encoding="utf-8")
     envelope = site / "protos/components/common/envelope.proto"
     declared = envelope.read_text(encoding="utf-8")
@@ -233,7 +239,12 @@ def test_what_turns_out_wrong_is_taken_back(site: Path, capsys: pytest.CaptureFi
 
 def test_a_table_with_errors_is_repaired_first(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = site / "routes/rover.yaml"
-    path.write_text(path.read_text(encoding="utf-8").replace("y: accel_y", "y: accel_q"), encoding="utf-8")
+    path.write_text(
+        path.read_text(encoding="utf-8").replace(
+            "type: comms/msg/SensorBoardPumpInfo", "type: comms/msg/SensorBoardPumpInf"
+        ),
+        encoding="utf-8",
+    )
     before = contents(site)
     assert main(["new", *RADIATION]) == BAD_TABLE
     assert "repair that first" in capsys.readouterr().err
