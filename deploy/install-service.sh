@@ -21,25 +21,17 @@ die() {
 [ -x "$root/.venv/bin/router" ] || die "$root has no .venv yet: run 'make setup' first, as yourself"
 command -v systemctl >/dev/null || die "this computer has no systemd"
 
-if [ ! -e "$settings" ]; then
-  cat >"$settings" <<END
-# What rover-router.service is started with, for its next restart. After another ROUTER_TABLE, or other addresses of its
-# listeners, run deploy/install-service.sh again.
-ROUTER_TABLE=$root/routes/rover.yaml
-ROS_DOMAIN_ID=0
-#BASESTATION=192.168.0.10:9000
-END
-fi
-if [ $# -gt 0 ]; then
-  table=$(realpath -e "$1") || die "there is no table $1"
-  sed -i "s|^ROUTER_TABLE=.*|ROUTER_TABLE=$table|" "$settings"
-fi
+chosen=
+if [ $# -gt 0 ]; then chosen=$(realpath -e "$1") || die "there is no table $1"; fi
 
 # What the units have to know of the table: "socket ADDRESS", "write FOLDER", "read FOLDER"; findings go to stderr.
 facts=$(
   set -a
+  RECORDINGS=/var/lib/$user  # as the unit says, unless the settings say something else
+  ROUTER_TABLE=$root/routes/rover.yaml
   # shellcheck disable=SC1090
-  . "$settings"
+  if [ -e "$settings" ]; then . "$settings"; fi
+  ROUTER_TABLE=${chosen:-$ROUTER_TABLE}
   # shellcheck disable=SC1091
   . "$root/.venv/env.sh"
   "$root/.venv/bin/python" - "$root" <<'END'
@@ -55,16 +47,27 @@ if checked.program is None:
 table = checked.program.table
 for listener in checked.program.listeners:
     print("socket", listener.address)
-if table.record is not None:
-    print("write", table.record.directory.resolve())
+if table.record is not None and (directory := table.record.directory.resolve()) != Path("/var/lib/rover-router"):
+    print("write", directory)
 read = {Path(sys.argv[1]), Path(sys.base_prefix), *(file.resolve().parent for file in table.files)}
 for folder in sorted(read):
     if folder.parts[:2] in (("/", "home"), ("/", "root")):
         print("read", folder)
 END
-) || die "the table that $settings names has errors"
+) || die "nothing was changed: the table has errors, or cannot be read"
 
 id "$user" >/dev/null 2>&1 || useradd --system --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin "$user"
+
+if [ ! -e "$settings" ]; then
+  cat >"$settings" <<END
+# What rover-router.service is started with, for its next restart. After another ROUTER_TABLE, or other addresses of its
+# listeners, run deploy/install-service.sh again.
+ROUTER_TABLE=$root/routes/rover.yaml
+ROS_DOMAIN_ID=0
+#BASESTATION=192.168.0.10:9000
+END
+fi
+if [ -n "$chosen" ]; then sed -i "s|^ROUTER_TABLE=.*|ROUTER_TABLE=$chosen|" "$settings"; fi
 
 for unit in rover-router.service rover-router.socket rover-router-hold.service; do
   sed -e "s|/opt/rover-router|$root|g" "$root/deploy/systemd/$unit" >"$units/$unit.new"
@@ -82,6 +85,7 @@ mkdir -p "$units/rover-router.service.d"
 } >"$units/rover-router.service.d/places.conf"
 printf '%s\n' "$facts" | sed -n 's/^write //p' | while read -r folder; do
   [ -d "$folder" ] || install -d -o "$user" -g "$user" "$folder"
+  runuser -u "$user" -- test -w "$folder" || die "the user $user may not write to $folder: chown -R $user $folder"
 done
 
 same_socket=$(cmp -s "$units/rover-router.socket.new" "$units/rover-router.socket" && echo yes || echo no)

@@ -49,7 +49,7 @@ mkdir -p old
 pivot_root . old
 umount -l /old
 export container=test
-exec /usr/lib/systemd/systemd --system --log-target=null --show-status=0
+exec /usr/lib/systemd/systemd --system --log-target=journal --show-status=0
 """
 
 

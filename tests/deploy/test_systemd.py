@@ -1,0 +1,167 @@
+"""The units under a real systemd, in a small machine of their own: hardened, watched, restarted, and left alone."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from router.compiler import check_table
+from tests.deploy.machine import Machine, machine
+
+ROOT = Path(__file__).parent.parent.parent
+UNITS = ROOT / "deploy" / "systemd"
+NAMES = ("rover-router.service", "rover-router.socket", "rover-router-hold.service")
+MOST_EXPOSED = 2.0
+ROUTER = f"{ROOT}/.venv/bin/router"
+SIM = f"{ROOT}/routes/sim.yaml"
+METRICS = "curl -s 127.0.0.1:29108/metrics"
+SEND = f"{ROUTER} send ph_info ph_value=7 --table {SIM} --to rover --from sensor_board"
+BAD_TABLE = 78
+
+
+def analyze(*arguments: object) -> str:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("needs systemd-analyze")
+    command = ["systemd-analyze", *map(str, arguments)]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, cwd=UNITS)
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    return finished.stdout + finished.stderr
+
+
+def test_the_service_may_do_little() -> None:
+    out = analyze("security", "--offline=true", "--no-pager", "rover-router.service")
+    exposed = re.search(r"Overall exposure level for rover-router.service: ([\d.]+)", out)
+    assert exposed is not None, out
+    assert float(exposed[1]) <= MOST_EXPOSED
+
+
+def test_the_units_are_as_systemd_wants_them() -> None:
+    assert analyze("verify", *(f"./{name}" for name in NAMES)) == ""
+
+
+def test_the_socket_has_the_addresses_of_the_rovers_table() -> None:
+    program = check_table(ROOT / "routes" / "rover.yaml", {}).program
+    assert program is not None
+    text = (UNITS / "rover-router.socket").read_text()
+    assert re.findall("^ListenDatagram=(.*)$", text, re.MULTILINE) == [str(each.address) for each in program.listeners]
+
+
+@pytest.fixture(scope="module")
+def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    """A computer on which `make install-service` was done, for the simulated rover's table."""
+    if not Path(ROUTER).exists():
+        pytest.skip("needs .venv")
+    with machine(tmp_path_factory.mktemp("machine")) as found:
+        found.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
+        yield found
+
+
+@pytest.fixture
+def running(rover: Machine) -> Machine:
+    rover.shell("systemctl reset-failed; systemctl start rover-router")
+    return rover
+
+
+def test_installing_starts_it_at_once_and_at_boot(running: Machine) -> None:
+    assert running.state() == running.state("rover-router.socket") == "active"
+    assert running.run("systemctl", "is-enabled", "rover-router.service", "rover-router.socket").stdout.split() == [
+        "enabled",
+        "enabled",
+    ]
+    assert running.show("User") == "rover-router"
+
+
+def test_installing_again_changes_nothing_and_restarts_it(running: Machine) -> None:
+    before, sockets = running.show("MainPID"), running.show("ActiveEnterTimestamp", "rover-router.socket")
+    running.shell(f"{ROOT}/deploy/install-service.sh")
+    assert running.show("MainPID") != before
+    assert running.show("ActiveEnterTimestamp", "rover-router.socket") == sockets
+
+
+def test_a_table_with_errors_is_not_installed(running: Machine) -> None:
+    running.shell("echo 'version: 7' > /opt/bad.yaml; cp /etc/default/rover-router /opt/settings")
+    finished = running.run(f"{ROOT}/deploy/install-service.sh", "/opt/bad.yaml", check=False)
+    assert finished.returncode == 1
+    assert "bad.yaml:1:1: error[missing-key]" in finished.stderr
+    running.shell("cmp /etc/default/rover-router /opt/settings")
+    assert running.state() == "active"
+
+
+def test_its_listener_is_systemds_socket(running: Machine) -> None:
+    holders = running.shell("ss -lunp 'sport = :25000'")
+    assert "127.0.0.5:25000" in holders
+    assert '"systemd"' in holders
+    assert f"pid={running.show('MainPID')}" in holders
+
+
+def test_it_routes_to_ros_nodes_of_another_user(running: Machine) -> None:
+    """Under all of its restrictions, and past the memory that Fast DDS shares among one user's processes only."""
+    heard = running.shell(
+        f"(for i in $(seq 100); do {SEND}; sleep 0.1; done) >/dev/null 2>&1 & sending=$!\n"
+        f"HOME=/tmp setpriv --reuid=65534 --regid=65534 --clear-groups "
+        f"{ROUTER} tap --topic ph_data --type comms/msg/SensorBoardPHInfo --count 2; kill $sending"
+    )
+    assert heard.count("ph_value=7") == 2
+
+
+def test_who_stops_it_has_it_stopped_and_what_comes_waits(running: Machine) -> None:
+    running.shell("systemctl stop rover-router")
+    running.shell(SEND)
+    running.shell("sleep 1")
+    assert running.state() == "inactive"
+    running.shell("systemctl start rover-router")
+    running.wait_for(f"{METRICS} | grep -q '^router_datagrams_received_total{{listener=\"rover\"}} [1-9]'")
+
+
+def test_a_killed_router_comes_back(running: Machine) -> None:
+    before = running.show("MainPID")
+    running.shell("systemctl kill --signal=KILL --kill-whom=main rover-router")
+    running.wait_for(
+        f"systemctl is-active -q rover-router && [ $(systemctl show -P MainPID rover-router) != {before} ]"
+    )
+
+
+def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_where(running: Machine) -> None:
+    running.shell(
+        "mkdir -p /run/systemd/system/rover-router.service.d\n"
+        "printf '[Service]\\nWatchdogSec=1s\\n' > /run/systemd/system/rover-router.service.d/test.conf\n"
+        "systemctl daemon-reload; systemctl restart rover-router; sleep 2"
+    )
+    before = running.show("MainPID")  # as it is fed, it lives
+    running.shell(f"kill -STOP {before}")
+    running.wait_for(
+        f"systemctl is-active -q rover-router && [ $(systemctl show -P MainPID rover-router) != {before} ]"
+    )
+    running.shell("rm /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload")
+    assert "Watchdog timeout" in running.journal()
+    assert "Fatal Python error: Aborted" in running.journal()
+    assert re.search(r"receiver.py\", line \d+ in ", running.journal())
+
+
+def test_a_reload_takes_a_good_table_and_refuses_a_bad_one(running: Machine) -> None:
+    before = running.show("MainPID")
+    running.shell(f"cp {SIM} /opt/sim.yaml; echo '# changed' >> {SIM}; systemctl reload rover-router")
+    running.shell(f"echo 'routs: {{}}' >> {SIM}")
+    assert running.run("systemctl", "reload", "rover-router", check=False).returncode != 0
+    running.shell(f"cp /opt/sim.yaml {SIM}")
+    assert (running.state(), running.show("MainPID")) == ("active", before)
+    assert "did you mean 'routes'?" in running.journal()
+
+
+def test_a_bad_table_stops_it_for_good_with_what_to_do_and_datagrams_do_not_start_it(running: Machine) -> None:
+    running.shell(f"cp {SIM} /opt/sim.yaml; echo 'routs: {{}}' >> {SIM}")
+    running.run("systemctl", "restart", "rover-router", check=False)
+    running.shell(f"cp /opt/sim.yaml {SIM}; {SEND}; sleep 1")
+    assert running.state() == "failed"
+    assert running.show("ExecMainStatus") == str(BAD_TABLE)
+    assert running.show("NRestarts") == "0"
+    assert running.state("rover-router.socket") == "active"
+    assert "did you mean 'routes'?" in running.journal()
+    assert "-> " in running.journal()
+    running.shell("systemctl reset-failed rover-router; systemctl start rover-router")
+    assert running.state() == "active"
