@@ -27,7 +27,7 @@ class RecordingDirectory:
 
     def __init__(self, path: Path, stem: str, keep: int) -> None:
         path.mkdir(parents=True, exist_ok=True)
-        self.path = path
+        self.path = path.resolve()
         self._stem = stem
         self._keep = keep
         self._ours = re.compile(re.escape(stem) + r"_\d{8}T\d{6}\.\d{6}Z(_[a-z0-9_.-]+)?" + re.escape(SUFFIX))
