@@ -6,9 +6,11 @@ import json
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
-from urllib.request import urlopen
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -65,8 +67,19 @@ class Traffic:
 
 @dataclass
 class Monitored:
+    """`address` is that of its metrics."""
+
     address: str
     traffic: Traffic
+    table: Path
+
+    def reload(self) -> int:
+        """The status with which the router answers."""
+        try:
+            with urlopen(Request(f"http://{self.address}/-/reload", method="POST"), timeout=10) as answer:
+                return int(answer.status)
+        except HTTPError as error:
+            return error.code
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +90,11 @@ def monitored(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Monitored]:
     text = MONITORED.replace("@gateway", str(gateway)).replace("@foxglove", str(foxglove))
     with (
         site(folder) as place,
-        RouterProcess(folder, place.table(text)),
+        RouterProcess(folder, table := place.table(text)),
         connect(f"ws://127.0.0.1:{gateway}", close_timeout=0.1),  # it reads nothing, so that it is behind
         Traffic(place) as traffic,
     ):
-        yield Monitored(f"127.0.0.1:{place.metrics}", traffic)
+        yield Monitored(f"127.0.0.1:{place.metrics}", traffic, table)
 
 
 @pytest.fixture(scope="module")
@@ -160,11 +173,22 @@ def test_a_deadman_that_takes_over_is_an_alert_until_commands_come_again(
     def halted() -> set[str]:
         return {labels["route"] for labels in prometheus.firing("DeadmanActive")}
 
-    assert halted() == set()
+    wait_until(lambda: halted() == set(), "the first commands")
     monitored.traffic.paused.add("manual_drive")
     wait_until(lambda: halted() == {"manual_drive"}, "the alert")
     monitored.traffic.paused.clear()
     wait_until(lambda: halted() == set(), "the end of the alert")
+
+
+def test_a_refused_table_is_an_alert_until_one_is_taken(monitored: Monitored, prometheus: PrometheusServer) -> None:
+    assert not prometheus.firing("ReloadFailed")
+    sound = monitored.table.read_text()
+    monitored.table.write_text(sound + "routes: {imu_info: {source: nobody}}\n")
+    assert monitored.reload() == 422
+    wait_until(lambda: bool(prometheus.firing("ReloadFailed")), "the alert")
+    monitored.table.write_text(sound)
+    assert monitored.reload() == 200
+    wait_until(lambda: not prometheus.firing("ReloadFailed"), "the end of the alert")
 
 
 def test_who_falls_silent_is_an_alert_and_who_never_sent_is_not(
@@ -173,7 +197,6 @@ def test_who_falls_silent_is_an_alert_and_who_never_sent_is_not(
     def silent() -> set[str]:
         return {labels["endpoint"] for labels in prometheus.firing("EndpointSilent")}
 
-    assert silent() == set()
+    wait_until(lambda: silent() == set(), "the first datagrams")
     monitored.traffic.paused |= {case for case, flow in FLOWS.items() if flow.source == "arm_board"}
-    wait_until(lambda: bool(silent()), "the alert")
-    assert silent() == {"arm_board"}
+    wait_until(lambda: silent() == {"arm_board"}, "the alert")
