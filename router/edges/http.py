@@ -18,6 +18,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,8 @@ class _Server(ThreadingHTTPServer):
         """Whatever they are at: taps end, and what is kept alive between two requests."""
         with self._changing:
             for each in self._connections:
-                each.shutdown(socket.SHUT_RDWR)
+                with suppress(OSError):  # its other end has gone already
+                    each.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Called in an except block. Callers come and go as they like; the rest is our own fault."""

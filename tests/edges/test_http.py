@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import socket
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from email.message import Message
@@ -208,6 +209,19 @@ def test_nonsense_ends_its_own_connection_only(server: HttpServer, nonsense: byt
     with socket.create_connection(server.address, 10) as caller:
         caller.sendall(nonsense)
     assert ask(server, "/ready").status == 200
+
+
+def test_closing_minds_nobody_who_has_gone(running: FakeRunning) -> None:
+    """His reset tells the kernel, but the thread that waits for his next question learns of it late."""
+    for _ in range(20):
+        server = HttpServer(LOOPBACK, SPAN, running, None)
+        callers = [socket.create_connection(server.address, 10) for _ in range(5)]
+        for caller in callers:
+            caller.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            caller.sendall(b"GET /tap HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            caller.close()
+        server.close()
+    wait_until(lambda: not running.mirror._consumers, "the end of the taps")
 
 
 def test_closing_ends_what_is_open(running: FakeRunning) -> None:

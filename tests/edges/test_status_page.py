@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 
-from router.edges import status
+from router.edges import http_answers, status
 from router.edges.http import HttpServer
 from router.edges.last_values import LastValues
 from router.errors import SourceSpan
@@ -32,9 +33,14 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @pytest.fixture
-def running(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeRunning]:
-    """All endpoints were heard just now."""
+def running(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeRunning]:
+    """All endpoints were heard just now, and the page asks ten times as often."""
     monkeypatch.setattr(status, "FRESH_SECONDS", 0)
+    page = http_answers.PAGE.read_text(encoding="utf-8")
+    assert "const PERIOD = 1000;" in page
+    hasty = tmp_path / "page.html"
+    hasty.write_text(page.replace("const PERIOD = 1000;", "const PERIOD = 100;"), encoding="utf-8")
+    monkeypatch.setattr(http_answers, "PAGE", hasty)
     opened = FakeRunning(sim_program())
     for endpoint in opened.program.table.endpoints:
         opened.count("endpoint_last_seen_timestamp_seconds", endpoint, to=2**62)
