@@ -5,7 +5,7 @@ Opens what a table asks for. Knows what belongs together, and does no work itsel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
@@ -51,12 +51,18 @@ class Companions:
             self.http_address = server.address
 
     def asked(self) -> Mapping[str, Asked]:
-        """Series that they count themselves."""
+        """Series that nobody counts in the books."""
 
         def recorded(metric: str) -> Asked:
             return lambda: self._recorder.asked()[metric]() if self._recorder else ()
 
-        return {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}
+        own = {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}
+        return {**own, "endpoint_stale_after_seconds": self._patience}
+
+    def _patience(self) -> Iterator[tuple[tuple[str], float]]:
+        for endpoint in self._running.program.table.endpoints.values():
+            if endpoint.stale_after is not None:
+                yield (endpoint.name,), endpoint.stale_after / 1e9
 
     def deadman_tripped(self, route: str) -> None:
         """Called where a deadman acts: what takes time is done elsewhere."""
