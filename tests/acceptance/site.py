@@ -66,6 +66,7 @@ class RouterProcess:
     def __init__(self, folder: Path, *arguments: object, **environment: str) -> None:
         self._log = folder / "router.log"
         folders = (environment.pop("PYTHONPATH", None), str(ROOT), os.environ.get("PYTHONPATH"))
+        environment.setdefault("FOXGLOVE", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")  # the rover's has one
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "router", "run", *map(str, arguments)],
