@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -32,6 +34,7 @@ TEST = """\
       published: {radiation_info: unchanged}
 
 """
+PAGE = Path(__file__).parents[2] / "docs" / "adding-a-message.md"
 SITE = Path(__file__).parent / "new_message_site"
 Files = dict[str, str]
 
@@ -107,6 +110,19 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
     assert new.pop("routes/rover.test.yaml") == TEST.splitlines()
     assert new.pop("routes/legacy.yaml") == ["  radiation_info: {source: any, destinations: [dst_a, dst_b]}"]
     assert new == {}
+
+
+def test_the_page_about_it_shows_what_is_written(site: Path) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    command = re.search(r"^router (new .*?[^\\])\n", page, re.DOTALL | re.MULTILINE)
+    assert command is not None
+    assert main(shlex.split(command[1].replace("\\\n", " "))) == OK
+    written = ["\n".join(map(str.strip, text.splitlines())) for text in contents(site).values()]
+    shown = page.partition("## What it writes")[2].partition("## ")[0]
+    blocks = re.findall(r"^ *```\w*\n(.*?)^ *```", shown, re.DOTALL | re.MULTILINE)
+    assert len(blocks) == 5
+    for block in blocks:
+        assert any("\n".join(map(str.strip, block.splitlines())) in text for text in written), block
 
 
 def test_tables_and_tests_are_clean_afterwards_and_the_lock_has_it_all(site: Path) -> None:
