@@ -5,7 +5,6 @@ Knows when something is to be written; how, is known by the modules that it puts
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -23,11 +22,10 @@ from router.edges.mirror import Seen
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_chunk import Chunk
 from router.edges.recorder_continuous import Continuous
-from router.edges.recorder_directory import RecordingDirectory
+from router.edges.recorder_directory import open_directory
 from router.edges.recorder_encoding import Encoder
 from router.edges.recorder_saving import RecordError, Saving
 from router.edges.running import Running
-from router.errors import StartError
 from router.table.model import RecordSettings
 
 __all__ = ["RecordError", "Recorder"]
@@ -61,7 +59,7 @@ class Recorder:
         self._channels = Channels()
         self._encoder = Encoder(self._channels)
         self._known: object = None
-        directory = _directory(settings, running.program.table.path.stem)
+        directory = open_directory(settings, running.program.table.path.stem)
         self._continuous = Continuous(settings, directory, self._channels, self._about) if settings.continuous else None
         self._saving = (
             Saving(settings.last, settings.max_size, directory, self._channels, self._about)
@@ -83,9 +81,11 @@ class Recorder:
         """Has what is in memory written to a file of its own. Any thread may ask; raises RecordError."""
         if self._saving is None:
             raise RecordError("nothing is kept in memory: the table's `record` has no `last`")
+        if self._closing:
+            raise RecordError("the router is stopping")
         done: Future[Path] = Future()
         self._saves.append((reason, done))
-        self._alarm.ring()
+        self._wake()
         try:
             return done.result(_PATIENCE)
         except NotInTime:
@@ -95,7 +95,7 @@ class Recorder:
         """Has it saved soon; returns at once."""
         if self._saving is not None:
             self._trips.append(route)
-            self._alarm.ring()
+            self._wake()
 
     def asked(self) -> Mapping[str, Asked]:
         """The metrics that are counted here."""
@@ -114,8 +114,13 @@ class Recorder:
         """Writes all that was received, and finishes the file."""
         self._detach()
         self._closing = True
-        self._alarm.ring()
+        self._wake()
         self._thread.join()
+        self._alarm.close()
+
+    def _wake(self) -> None:
+        with suppress(ValueError):  # it has ended
+            self._alarm.ring()
 
     def _take(self, batch: Sequence[Seen]) -> None:
         """Called by the mirror's thread."""
@@ -195,13 +200,3 @@ class Recorder:
         """What a file says of itself."""
         program = self._running.program
         return {"reason": reason, "table": program.table.path.name, "protos_sha256": program.protos_sha256}
-
-
-def _directory(settings: RecordSettings, stem: str) -> RecordingDirectory:
-    try:
-        directory = RecordingDirectory(settings.directory, stem, settings.keep)
-    except OSError as error:
-        raise StartError(f"{settings.span}: cannot record to {settings.directory}: {error.strerror}") from error
-    if not os.access(settings.directory, os.W_OK | os.X_OK):
-        raise StartError(f"{settings.span}: may not write to {settings.directory}; give `record` another directory")
-    return directory

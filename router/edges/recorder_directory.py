@@ -6,6 +6,7 @@ Knows names and sizes, and nothing of what is in a file.
 from __future__ import annotations
 
 import errno
+import os
 import re
 from collections.abc import Mapping
 from datetime import datetime, timezone
@@ -14,6 +15,8 @@ from pathlib import Path
 from router.edges.log import logger
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_file import RecordingFile
+from router.errors import StartError
+from router.table.model import RecordSettings
 
 SUFFIX = ".mcap"
 _TIME = "%Y%m%dT%H%M%S.%fZ"
@@ -55,3 +58,14 @@ class RecordingDirectory:
             path.unlink(missing_ok=True)
             total -= size
             logger.info("removed the oldest recording, to keep within 'keep'", file=str(path), bytes=size)
+
+
+def open_directory(settings: RecordSettings, stem: str) -> RecordingDirectory:
+    """Where a table has recordings written. Raises StartError."""
+    try:
+        directory = RecordingDirectory(settings.directory, stem, settings.keep)
+    except OSError as error:
+        raise StartError(f"{settings.span}: cannot record to {settings.directory}: {error.strerror}") from error
+    if not os.access(settings.directory, os.W_OK | os.X_OK):
+        raise StartError(f"{settings.span}: may not write to {settings.directory}; give `record` another directory")
+    return directory

@@ -53,7 +53,12 @@ class RecordingFile:
         head = MCAP0_MAGIC + _bytes_of(Header("", f"{LIBRARY} {version('rover-router')}"))
         metadata = _bytes_of(Metadata(name=METADATA, metadata=dict(about)))
         self._metadata = MetadataIndex(offset=len(head), length=len(metadata), name=METADATA)
-        self._append(head + metadata)
+        try:
+            self._append(head + metadata)
+        except OSError:
+            os.close(self._descriptor)
+            path.unlink()
+            raise
 
     def write(self, chunk: Chunk) -> None:
         """What could not be written whole is cut off again."""

@@ -31,8 +31,8 @@ from router.tools import UsageError
 Peer = tuple[str, int]
 
 _RECORD = struct.Struct("<BQ")
-_DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError)
-"""What reading raises for what no recorder wrote."""
+_DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
+"""What reading raises for what no recorder wrote; lz4, which `mcap recover` may have used, a RuntimeError."""
 
 
 class Recorded(NamedTuple):
@@ -63,7 +63,11 @@ class Recording:
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from error
         self.size = path.stat().st_size
-        self._begin()
+        try:
+            self._begin()
+        except UsageError:
+            self.close()
+            raise
 
     @property
     def position(self) -> int:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -78,11 +80,14 @@ def write(path: Path, channels: Channels, *chunks: Chunk, finish: bool = True) -
         file.write(chunk)
     if finish:
         file.close()
+    else:
+        os.close(file._descriptor)
     return path
 
 
 def read(path: Path) -> list[Recorded]:
-    return list(Recording(path).datagrams())
+    with closing(Recording(path)) as recording:
+        return list(recording.datagrams())
 
 
 def again(found: Recorded) -> Seen:

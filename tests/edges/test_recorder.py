@@ -204,6 +204,26 @@ def test_a_disk_that_is_full_loses_counts_and_is_tried_again(tmp_path: Path, mon
     assert [again(each) for path in files(tmp_path) for each in read(path)] == first + third
 
 
+def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_continuous, "_RETRY", 1)
+    with recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(os, "write", _full)
+        show(made, mirror, now(imu(1)))
+        show(made, mirror, now(imu(2)))
+        monkeypatch.undo()
+    assert files(tmp_path) == []
+
+
+def test_what_comes_after_the_end_is_refused(tmp_path: Path) -> None:
+    with recorder(tmp_path, last=10**9) as (made, _):
+        pass
+    made.deadman_tripped("drive_motor")
+    with pytest.raises(RecordError, match="stopping"):
+        made.save("http")
+
+
 def _full(descriptor: int, data: bytes) -> int:
     raise OSError(28, "No space left on device")
 
