@@ -16,6 +16,7 @@ from router.tools.rehearsal import Rehearsal
 from router.tools.rehearsal_events import Dropped, Event, Filtered, Published, Rejected, Sent
 
 Delivery = Sent | Published
+Loss = tuple[str, str, str, str]
 
 
 @dataclass(slots=True)
@@ -53,7 +54,7 @@ class Against:
 
     def __init__(self, old: Program, new: Program) -> None:
         self.rows: dict[tuple[str, str], Row] = {}
-        self.losses: tuple[Counter[tuple[str, ...]], Counter[tuple[str, ...]]] = (Counter(), Counter())
+        self.losses: tuple[Counter[Loss], Counter[Loss]] = (Counter(), Counter())
         self.datagrams = 0
         self.span = 0
         """ns from the first datagram to the last."""
@@ -160,7 +161,7 @@ def _key(event: Delivery) -> tuple[str, bytes]:
     return _target(event), blake2b(_content(event), digest_size=12).digest()
 
 
-def _loss(event: Event) -> tuple[str, ...] | None:
+def _loss(event: Event) -> Loss | None:
     match event:
         case Dropped():
             return "dropped", event.route, event.target, event.reason

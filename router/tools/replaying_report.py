@@ -5,6 +5,7 @@ Knows types of payloads and topics; the comparison is done.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -34,11 +35,12 @@ class Report:
         self._wires = tuple(Wire(checked.envelope) for checked in (old, new) if checked.envelope)
 
     def lines(self, found: Against) -> Iterator[str]:
-        """All of it. Nothing but one line where both tables deliver the same."""
+        """All of it. Little where both tables deliver the same."""
         old, new = (checked.path for checked in self._tables)
         yield f"{found.datagrams} datagrams of {found.span / 1e9:.1f} s, through {old} and {new}"
         if not found.differs:
-            yield "both deliver the same"
+            yield f"both deliver the same, {sum(row.old for row in found.rows.values())} datagrams and messages"
+            yield from _same_losses(found)
             return
         yield from self._counts(found)
         yield from self._losses(found)
@@ -105,6 +107,15 @@ class Report:
                 except DecodeError:
                     return _Told("a datagram", {"bytes": event.data.hex()})
                 return _Told(decoded.case.name, fields(decoded.case.type, decoded.message))
+
+
+def _same_losses(found: Against) -> Iterator[str]:
+    """Of a recording that nobody takes, as on another network, the same is nothing."""
+    counts: Counter[str] = Counter()
+    for (done, _, _, reason), count in found.losses[0].items():
+        counts[f"{done} ({reason})"] += count
+    for what, count in sorted(counts.items()):
+        yield f"{what}: {count} with both"
 
 
 def _is_told(row: Row, before: Delivery | None, after: Delivery | None) -> bool:

@@ -70,7 +70,11 @@ def test_the_same_table_delivers_the_same(tmp_path: Path, capsys: pytest.Capture
     found = Compared(tmp_path, FORWARD, FORWARD, capsys)
     assert found.code == 0
     assert found.lines[0].startswith("5 datagrams of 0.5 s, through ")
-    assert found.lines[1:] == ["both deliver the same"]
+    assert found.lines[1:] == [
+        "both deliver the same, 3 datagrams and messages",
+        "rejected (source_mismatch): 1 with both",
+        "rejected (unhandled): 1 with both",
+    ]
 
 
 def test_a_changed_mapping_is_told_field_by_field(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
