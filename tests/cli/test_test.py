@@ -11,7 +11,7 @@ import jsonschema
 import pytest
 
 from router.assets import asset
-from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+from router.cli import BAD_TABLE, BAD_USAGE, OK, findings, main
 from router.cli.test import FAILED
 from router.compiler.definitions import Definitions
 from router.table import shape
@@ -33,6 +33,7 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         shutil.copy(REPOSITORY / "routes" / name, folder)
     (tmp_path / "protos").symlink_to(asset("protos"))
     monkeypatch.chdir(tmp_path)
+    findings._lines.cache_clear()  # which knows other files under these relative names
     return folder / "rover.yaml"
 
 
@@ -130,8 +131,8 @@ def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixtur
     assert data["findings"] == []
     change(rover.with_name("rover.test.yaml"), "from: sensor_board", "from: sensor_bord")
     assert main(["test", "--format", "json"]) == BAD_TABLE
-    (finding,) = json.loads(capsys.readouterr().out)["findings"]
-    assert finding["code"] == "unknown-endpoint"
+    (found,) = json.loads(capsys.readouterr().out)["findings"]
+    assert found["code"] == "unknown-endpoint"
 
 
 def test_github_shows_failures_beside_the_lines(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
