@@ -71,8 +71,11 @@ def _check(table: Path) -> list[Checked]:
     from router.compiler.definitions import Definitions
 
     definitions = Definitions()
+    checked = check_table(table, definitions=definitions)
+    if checked.table is None:  # there may be no folder either
+        return [checked]
     beside = [path for path in find_tables([table.parent]) if path.resolve() != table.resolve()]
-    return [check_table(path, definitions=definitions) for path in (table, *beside)]
+    return [checked, *(check_table(path, definitions=definitions) for path in beside)]
 
 
 def _site(checked: Checked) -> Site:

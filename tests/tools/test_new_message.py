@@ -265,3 +265,12 @@ def test_a_table_with_errors_is_repaired_first(site: Path, capsys: pytest.Captur
     assert main(["new", *RADIATION]) == BAD_TABLE
     assert "repair that first" in capsys.readouterr().err
     assert contents(site) == before
+
+
+def test_where_there_is_no_table_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", *RADIATION]) == BAD_TABLE
+    assert "nothing was written" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
