@@ -117,6 +117,11 @@ def test_colcon_meets_both_packages_and_neither_inside_the_other() -> None:
     assert not (ROOT / "setup.py").exists()  # colcon would take the repository for a package
 
 
+def test_executable_may_be_executed_where_it_is_built_too(installed: Path) -> None:
+    """`colcon build --symlink-install` installs a link to it."""
+    assert os.access(installed.parent / "router", os.X_OK)
+
+
 def test_ament_finds_the_package_and_its_files(installed: Path) -> None:
     assert (installed / "share" / "ament_index" / "resource_index" / "packages" / "rover_router").exists()
     for name in ("launch/rover_router.launch.py", "routes/rover.yaml", "protos/envelope.lock.json"):
