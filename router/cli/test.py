@@ -69,9 +69,9 @@ def _proven(
         except TableError as error:
             findings.update(dict.fromkeys(error.diagnostics))
             continue
-        coverage = None
-        if coverages is not None:
-            coverage = coverages.setdefault(file.checked.path, Coverage.of(file))
+        coverage = None if coverages is None else Coverage.of(file)
         results += prove(file, only, coverage)
+        if coverages is not None and coverage is not None:
+            coverages.setdefault(file.checked.path, coverage).add(coverage)
     findings.update(dict.fromkeys(finding for result in results for finding in result.findings))
     return results, in_order(list(findings))

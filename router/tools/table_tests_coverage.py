@@ -32,7 +32,7 @@ class Gap:
 
 @dataclass(slots=True)
 class Coverage:
-    """The coverage of one table by all files of tests that name it. `program` is the table's, with probes."""
+    """The coverage of one table by a file of tests, and by others that were added. `program` has probes in it."""
 
     program: Program
     routes: tuple[CheckedRoute, ...]
@@ -59,6 +59,13 @@ class Coverage:
             if target is None or part.is_condition or (part.route, target, False) in compared:
                 self._outcomes.add((part, outcome))
 
+    def add(self, other: Coverage) -> None:
+        """What another file of tests has touched of the same table, whatever it fills its variables with."""
+        self.probes.parts |= other.probes.parts
+        self._routes |= other._routes
+        self._targets |= other._targets
+        self._outcomes |= other._outcomes
+
     @property
     def is_complete(self) -> bool:
         return not list(self.gaps())
@@ -80,10 +87,8 @@ class Coverage:
         for key, span in self._all_targets():
             if key not in self._targets:
                 route, target, by_deadman = key
-                what = (
-                    f"what the deadman of {route} sends to {target}" if by_deadman else f"what {route} has for {target}"
-                )
-                yield Gap(span, "target", f"no test compares {what}")
+                source = f"the deadman of {route} sends" if by_deadman else f"{route} has"
+                yield Gap(span, "target", f"no test compares what {source} for {target}")
         for part in self.probes.parts:
             if why := self._missing(part):
                 yield Gap(part.span, "expression", why)
@@ -97,7 +102,9 @@ class Coverage:
             return f"this condition has never {' nor '.join(never)} in a test" if never else ""
         if part.is_branch:
             return "" if outcomes else f"this branch was never taken {where}"
-        return "" if True in outcomes else f"this gave nothing but zero {where}" if outcomes else f"never used {where}"
+        if True in outcomes:
+            return ""
+        return f"this gave nothing but zero {where}" if outcomes else f"this was never used {where}"
 
     def _all_targets(self) -> Iterator[tuple[tuple[Route, Target, bool], SourceSpan]]:
         """Each once, with whether it is a deadman's."""

@@ -14,7 +14,7 @@ from router.compiler import check_table
 from router.compiler.definitions import Definitions
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 from router.table.model import Located
-from router.table.nodes import MappingNode, Node, ScalarNode
+from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import UnsoundError
 from router.table.units import parse_duration
 from router.tools.table_tests_expected import ExpectedReader
@@ -84,7 +84,8 @@ class _Reader:
             message = f"'{others[0]}' stands beside 'steps'"
             hint = "move it into a step"
             self._findings.append(Diagnostic(node.entries[others[0]].key.span, Code.UNKNOWN_KEY, message, hint))
-        return TableTest(name, span, tuple(self._steps(span, getattr(steps, "items", ()))))
+        listed = steps.items if isinstance(steps, SequenceNode) else ()
+        return TableTest(name, span, tuple(self._steps(span, listed)))
 
     def _steps(self, span: SourceSpan, nodes: Iterable[Node]) -> Iterable[Step]:
         latest = 0

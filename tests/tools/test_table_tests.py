@@ -570,3 +570,18 @@ def test_deadman_is_a_target(tmp_path: Path) -> None:
             - {{at: 500ms, expect: {{sent: {{driving_board: {{manual_brake: {{brake: true}}}}}}}}}}
         """
     assert gaps(tmp_path, DRIVE, tests) == []
+
+
+def test_files_of_one_table_cover_it_together(tmp_path: Path) -> None:
+    routes = 'imu_info: {source: sensor_board, destinations: [{endpoint: basestation, when: "accel_x > ${LIMIT:-1}"}]}'
+    first = written(tmp_path, routes, f"a: {{given: {given('{accel_x: 2}')}, expect: {{sent: basestation}}}}\n")
+    path = tmp_path / "more.test.yaml"
+    nothing = f"b: {{given: {given('{accel_x: 2}')}, expect: nothing}}"
+    path.write_text(f"table: table.yaml\nvariables: {{LIMIT: 3}}\ntests:\n  {nothing}\n")
+    second = read_test_file(path, DEFINITIONS)
+    covered = [Coverage.of(file) for file in (first, second)]
+    for file, coverage in zip((first, second), covered, strict=True):
+        assert all(result.passed for result in prove(file, coverage=coverage))
+        assert not coverage.is_complete
+    covered[0].add(covered[1])
+    assert covered[0].is_complete
