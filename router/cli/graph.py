@@ -52,9 +52,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _drawn(table: RouteTable, suffix: str) -> str:
     from router.edges.route_map import route_map
-    from router.edges.route_map_svg import STYLE, svg
+    from router.tools.graph_svg import svg
     from router.tools.graph_text import dot, mermaid
 
     if suffix == ".svg":
-        return svg(route_map(table), table.path.name, STYLE)
+        return svg(route_map(table), table.path.name)
     return dot(table, table.path.name) if suffix == ".dot" else mermaid(table)

@@ -1,7 +1,7 @@
 """Where everything stands on a drawing of a route table: sources left, payload cases middle, where they go right.
 
-A pure function of the table. Knows neither SVG (see `route_map_svg`) nor what flows; links and nodes carry the names
-under which the metrics count it.
+A pure function of the table, for the status page and for `router graph`. Knows neither how it is drawn nor what flows;
+links carry the names under which the metrics count it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A route map as text for other programs to lay out: Mermaid, which code hosts draw in a page, and Graphviz's dot.
 
-Knows the map's parts and ties only; our own drawing is `router.edges.route_map_svg`.
+Knows the map's parts and ties only; our own drawing is `graph_svg`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
@@ -13,13 +12,11 @@ from hypothesis import strategies as st
 from router.assets import asset
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.edges.route_map import NARROW, WIDE, Measures, RouteMap, route_map, shortened, spread
+from router.edges.route_map import NARROW, WIDE, Measures, route_map, shortened, spread
 from router.edges.route_map_parts import PartKind, map_parts
-from router.edges.route_map_svg import STYLE, svg
 from router.table.model import ANY, RouteTable
 
 TABLES = ("rover.yaml", "legacy.yaml", "sim.yaml")
-SVG = "{http://www.w3.org/2000/svg}"
 
 
 def table_of(path: Path) -> RouteTable:
@@ -124,20 +121,3 @@ def test_spread_leaves_what_fits_where_it_wants_to_be() -> None:
 def test_a_long_name_keeps_its_beginning_and_end() -> None:
     assert shortened("sensor_board_diagnostics", 18) == "sensor_bo…gnostics"
     assert shortened("imu_data", 18) == "imu_data"
-
-
-def read(text: str) -> ET.Element:
-    return ET.fromstring(text)  # noqa: S314 - our own
-
-
-def boxes(text: str) -> list[ET.Element]:
-    return [group for group in read(text).iter(f"{SVG}g") if "data-key" in group.attrib]
-
-
-def test_the_picture_is_one_sound_file_that_refers_to_nothing_else(tmp_path: Path) -> None:
-    drawing: RouteMap = route_map(hostile(tmp_path))
-    text = svg(drawing, 'a "title" <&>', STYLE)
-    assert len(boxes(text)) == len(drawing.nodes)
-    assert "when accel_x < 3 and str(state) != '\"<b>&', at most 5 Hz" in "".join(read(text).itertext())
-    for outside in ("http:", "https:", "url(", "@import", "href", "<script"):
-        assert outside not in text.replace("http://www.w3.org/2000/svg", "")

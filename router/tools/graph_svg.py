@@ -1,7 +1,6 @@
-"""A route map as SVG: boxes, and lines between them, that carry what they stand for as `data-` attributes.
+"""A route map as an SVG picture: boxes, and lines between them, with what there is to know of each under the pointer.
 
-Whoever shows it live finds there the labels under which the metrics count, and changes `stroke-width` and classes.
-Knows no numbers, and refers to nothing outside itself.
+Stands alone: it refers to nothing outside itself, and is light or dark where its viewer is.
 """
 
 from __future__ import annotations
@@ -11,13 +10,13 @@ from xml.sax.saxutils import escape, quoteattr
 
 from router.edges.route_map import COLUMNS, Link, Node, RouteMap
 
-STYLE = """
+_STYLE = """
 .route-map { --ground: #fff; --box: #f3f4f6; --text: #000; --faint: #505050; --line: #b4b8bf; --edge: #7d838c;
-  --endpoint: #0047b3; --topic: #00602b; --gateway: #8a1c9c; --bad: #a80000; background: var(--ground);
+  --endpoint: #0047b3; --topic: #00602b; --gateway: #8a1c9c; background: var(--ground);
   font-family: system-ui, "DejaVu Sans", sans-serif; }
 @media (prefers-color-scheme: dark) {
   .route-map { --ground: #101215; --box: #1b1e23; --text: #f2f4f7; --faint: #a3a9b3; --line: #474d57; --edge: #7d838c;
-    --endpoint: #8ab4ff; --topic: #6fdc98; --gateway: #dd9cf0; --bad: #ff8f85; }
+    --endpoint: #8ab4ff; --topic: #6fdc98; --gateway: #dd9cf0; }
 }
 .route-map .head { fill: var(--faint); font-weight: 600; }
 .route-map .node rect { fill: var(--box); stroke: var(--line); }
@@ -29,13 +28,10 @@ STYLE = """
 .route-map .ignored text { fill: var(--faint); }
 .route-map .link { fill: none; stroke: var(--edge); stroke-width: 1.5; }
 .route-map .link:hover { stroke: var(--text); }
-.route-map .link.bad { stroke: var(--bad); }
 """
-"""Light, or dark where the viewer is."""
 
 
-def svg(drawing: RouteMap, title: str, style: str = "") -> str:
-    """The `<svg>` element. With `style`, which a page may have on its own, it is a picture that stands alone."""
+def svg(drawing: RouteMap, title: str) -> str:
     font = drawing.measures.font
     names = {node.part.key: node.part.name for node in drawing.nodes}
     width, height = f"{drawing.width:g}", f"{drawing.height:g}"
@@ -43,7 +39,7 @@ def svg(drawing: RouteMap, title: str, style: str = "") -> str:
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" class="route-map" {size} role="img" aria-label={quoteattr(title)}>',
         f"<title>{escape(title)}</title>",
-        *([f"<style>{style}</style>"] if style else []),
+        f"<style>{_STYLE}</style>",
         *_heads(drawing),
         *(_link(link, names) for link in drawing.links),
         *(_node(node, drawing) for node in drawing.nodes),
@@ -60,10 +56,8 @@ def _heads(drawing: RouteMap) -> Iterator[str]:
 
 def _link(link: Link, names: Mapping[str, str]) -> str:
     tie = link.tie
-    data = f"data-start={quoteattr(tie.start)} data-end={quoteattr(tie.end)}"
-    data += f" data-route={quoteattr(tie.route)} data-label={quoteattr(tie.label)}"
     said = f"{names[tie.start]} to {names[tie.end]}" + (f"\n{tie.about}" if tie.about else "")
-    return f'<path class="link" d="{link.path}" {data}><title>{escape(said)}</title></path>'
+    return f'<path class="link" d="{link.path}"><title>{escape(said)}</title></path>'
 
 
 def _node(node: Node, drawing: RouteMap) -> str:
@@ -71,7 +65,7 @@ def _node(node: Node, drawing: RouteMap) -> str:
     baseline = node.y + node.height / 2 + drawing.measures.font * 0.35
     said = f"{part.name}\n{part.about}" if part.about else part.name
     return (
-        f'<g class="node {part.kind.value}" data-key={quoteattr(part.key)}><title>{escape(said)}</title>'
+        f'<g class="node {part.kind.value}"><title>{escape(said)}</title>'
         f'<rect x="{node.x:g}" y="{node.y:g}" width="{node.width:g}" height="{node.height:g}" rx="4"/>'
         f'<text x="{node.x + pad:g}" y="{baseline:g}">{escape(node.label)}</text></g>'
     )

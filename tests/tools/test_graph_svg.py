@@ -1,0 +1,54 @@
+"""The picture of a table is one sound file with a box and a line for everything, and refers to nothing else."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from router.assets import asset
+from router.compiler import check_table
+from router.edges.route_map import route_map
+from router.table.model import RouteTable
+from router.tools.graph_svg import svg
+
+SVG = "{http://www.w3.org/2000/svg}"
+HOSTILE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen: {{all: {{address: "127.0.0.1:5000"}}}}
+endpoints: {{a: {{address: "127.0.0.1:6000", kind: tool}}}}
+routes:
+  imu_info:
+    source: any
+    destinations: [{{endpoint: a, when: "accel_x < 3 and str(state) != '\\"<b>&'", max_rate: 5 Hz}}]
+  gps_info: {{ignore: 'because "x" < y & so'}}
+"""
+
+
+@pytest.fixture(params=["rover.yaml", "hostile"])
+def table(request: pytest.FixtureRequest, tmp_path: Path) -> RouteTable:
+    path = asset("routes") / request.param
+    if request.param == "hostile":
+        path = tmp_path / "hostile.yaml"
+        path.write_text(HOSTILE.format(protos=asset("protos")))
+    table = check_table(path).table
+    assert table is not None
+    return table
+
+
+def test_the_picture_has_a_box_and_a_line_for_everything(table: RouteTable) -> None:
+    drawing = route_map(table)
+    picture = ET.fromstring(svg(drawing, 'a "title" <&>'))  # noqa: S314 - our own
+    assert len(list(picture.iter(f"{SVG}rect"))) == len(drawing.nodes)
+    assert len(list(picture.iter(f"{SVG}path"))) == len(drawing.links)
+    said = "".join(picture.itertext())
+    assert all(node.part.name in said and node.part.about in said for node in drawing.nodes)
+    assert all(link.tie.about in said for link in drawing.links)
+
+
+def test_it_refers_to_nothing_outside_itself(table: RouteTable) -> None:
+    text = svg(route_map(table), "title").replace("http://www.w3.org/2000/svg", "")
+    for outside in ("http:", "https:", "url(", "@import", "href", "<script"):
+        assert outside not in text
