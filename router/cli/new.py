@@ -15,8 +15,8 @@ from router.cli.tool_options import explained
 if TYPE_CHECKING:
     from router.compiler import Checked
     from router.errors import Diagnostic
-    from router.tools.new_message import NewMessage, Site
     from router.tools.new_message_files import Written
+    from router.tools.new_message_model import NewMessage, Site
 
 _DESCRIPTION = """Add a message that a board sends: its .proto file, its number in the envelope and in the lock, the ROS
 message, a route from the board to ROS and the basestation, and a test of it. Files keep their comments and their
@@ -80,7 +80,7 @@ def _check(table: Path) -> list[Checked]:
 
 def _site(checked: Checked) -> Site:
     from router.assets import asset
-    from router.tools.new_message import site_of
+    from router.tools.new_message_model import site_of
 
     return site_of(checked, asset("schemas") / "comms" / "msg")
 

@@ -9,94 +9,19 @@ from __future__ import annotations
 import keyword
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
 
-from router.compiler import Checked
 from router.errors import did_you_mean
 from router.table.model import Endpoint, EndpointKind, RouteTable
 from router.table.scalars import resolve, surprise
 from router.tools import UsageError
-from router.types.lock_file import read_lock
+from router.tools.new_message_model import SCALARS, NewField, NewMessage, Site, prefix_of
+from router.tools.new_message_number import check_number
 from router.types.model import Enum, MessageType
-from router.types.protobuf import Envelope, ProtoSchema
 
-SCALARS = {
-    "bool": "bool", "float": "float32", "double": "float64", "int32": "int32", "int64": "int64", "uint32": "uint32",
-    "uint64": "uint64",
-}  # fmt: skip
-"""What a field can be beside an enum or a message: protobuf's spelling, and ROS's. Boards take all of these."""
-
-LARGEST_NUMBER = (1 << 29) - 1
-_OF_PROTOBUF = range(19_000, 20_000)
 _MESSAGE_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
 _FIELD_NAME = re.compile(r"[a-z](_?[a-z0-9])*")
 _WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
-
-
-@dataclass(frozen=True, slots=True)
-class NewField:
-    """`type` is one of SCALARS, or the full name of an enum or a message of the protos."""
-
-    name: str
-    type: str
-    comment: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class NewMessage:
-    """`board` is the endpoint that sends it, `case` its payload case, `fields` in the order of their numbers."""
-
-    name: str
-    number: int
-    board: str
-    case: str
-    fields: tuple[NewField, ...]
-
-    @property
-    def prefix(self) -> str:
-        """What the names of the board's messages begin with."""
-        return prefix_of(self.board)
-
-    @property
-    def board_words(self) -> str:
-        return self.board.replace("_", " ")
-
-    @property
-    def title(self) -> str:
-        return f"{self.case.replace('_', ' ').capitalize()} from the {self.board_words}"
-
-    @property
-    def stem(self) -> str:
-        """What its file is called: that a message is information need not be said there."""
-        return self.case.removesuffix("_info")
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """What there is: a table without errors, what it refers to, and the folder of our ROS messages."""
-
-    table: RouteTable
-    schema: ProtoSchema
-    envelope: Envelope
-    messages: Path
-
-    def file(self, name: str) -> str:
-        """The `.proto` file of a message or an enum, relative to the folder of the protos."""
-        return self.schema.sources.file(name)
-
-    def new_file(self, message: NewMessage) -> str:
-        """Where its `.proto` file goes: the folder of its board, beside that of the envelope."""
-        common = PurePosixPath(self.file(self.envelope.name)).parent
-        return (common.parent / message.board / f"{message.stem}.proto").as_posix()
-
-
-def site_of(checked: Checked, messages: Path) -> Site:
-    """`checked` is a table without errors."""
-    if checked.table is None or checked.schema is None or checked.envelope is None:
-        raise ValueError(f"{checked.path} has errors")
-    return Site(checked.table, checked.schema, checked.envelope, messages)
 
 
 def new_message(name: str, number: int, board: str, fields: Sequence[str], site: Site) -> NewMessage:
@@ -104,7 +29,7 @@ def new_message(name: str, number: int, board: str, fields: Sequence[str], site:
     endpoint = _endpoint(board, site.table)
     case = _case(name, endpoint.name)
     _check_names(name, case, site)
-    _check_number(number, case, site)
+    check_number(number, case, site)
     asked = parsed_fields(fields, site) if fields else usual_fields(prefix_of(endpoint.name), site)
     message = NewMessage(name, number, endpoint.name, case, asked)
     for path in (site.schema.root / site.new_file(message), site.messages / f"{name}.msg"):
@@ -172,10 +97,6 @@ def _endpoint(board: str, table: RouteTable) -> Endpoint:
     return found
 
 
-def prefix_of(board: str) -> str:
-    return "".join(word.capitalize() for word in board.split("_"))
-
-
 def _case(name: str, board: str) -> str:
     """`radiation_info` of `SensorBoardRadiationInfo`."""
     prefix = prefix_of(board)
@@ -186,7 +107,7 @@ def _case(name: str, board: str) -> str:
 
 
 def _check_names(name: str, case: str, site: Site) -> None:
-    taken: Iterable[str] = (known.rpartition(".")[2] for known in (*site.schema.messages, *site.schema.enums))
+    taken = {known.rpartition(".")[2] for known in (*site.schema.messages, *site.schema.enums)}
     if name in taken:
         raise UsageError(f"there is a message '{name}' already")
     if case in site.envelope.cases:
@@ -197,36 +118,3 @@ def _check_names(name: str, case: str, site: Site) -> None:
     topics = {topic.topic.value: route.name for route in site.table.routes for topic in route.topics}
     if case in topics:
         raise UsageError(f"the route {topics[case]} has a topic '{case}' already; take another name")
-
-
-def _check_number(number: int, case: str, site: Site) -> None:
-    """It must never have been another's: boards in the field remember."""
-    lock, envelope = read_lock(site.schema.root), site.envelope.name
-    entries = lock.messages[envelope].entries if lock is not None and envelope in lock.messages else frozenset()
-    holders = {entry.number: entry.name for entry in entries}
-    holders |= {field.number: field.name for field in site.schema.messages[envelope].fields}
-    above = range(max(holders, default=0) + 1, LARGEST_NUMBER)
-    free = next(candidate for candidate in above if _is_free(candidate, site))
-    if not 1 <= number <= LARGEST_NUMBER or number in _OF_PROTOBUF:
-        raise UsageError(f"{number} is no field number of protobuf; {free} is free")
-    if number in holders:
-        raise UsageError(f"number {number} belongs to '{holders[number]}', for ever; {free} is free")
-    if any(number in span for span in site.schema.reserved_numbers(envelope)):
-        raise UsageError(f"{envelope} reserves number {number}; {free} is free")
-    if promised := _promise(number, site):
-        raise UsageError(f"{site.file(envelope)} says: {promised} {free} is free")
-    if case in holders.values():
-        was = next(old for old, name in holders.items() if name == case)
-        raise UsageError(f"'{case}' had number {was} once, and cannot come back with another; take another name")
-
-
-def _is_free(number: int, site: Site) -> bool:
-    reserved = any(number in span for span in site.schema.reserved_numbers(site.envelope.name))
-    return not reserved and number not in _OF_PROTOBUF and not _promise(number, site)
-
-
-def _promise(number: int, site: Site) -> str:
-    """The comment of the envelope's file that speaks of the number, such as `Number 30 is promised to ...`."""
-    text = (site.schema.root / site.file(site.envelope.name)).read_text(encoding="utf-8")
-    found = re.search(rf"//\s*(.*\b[Nn]umber {number}\b.*)", text)
-    return found[1] if found else ""

@@ -12,7 +12,7 @@ from pathlib import Path
 from router.errors import shown_path
 from router.table.model import RouteTable
 from router.tools import UsageError
-from router.tools.new_message import NewMessage, Site
+from router.tools.new_message_model import NewMessage, Site
 from router.tools.new_message_proto import proto_texts
 from router.tools.new_message_ros import msg_text
 from router.tools.new_message_tables import board_table_text, forwarding_table_text

@@ -14,8 +14,8 @@ from pathlib import Path
 from router.errors import Severity, SourceSpan, TableError
 from router.table.model import EnvelopeSettings, Located
 from router.tools import UsageError
-from router.tools.new_message import SCALARS, NewMessage, Site
 from router.tools.new_message_layout import aligned
+from router.tools.new_message_model import SCALARS, NewMessage, Site
 from router.types.lock import check_lock, extended_lock
 from router.types.lock_file import LOCK_NAME, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos

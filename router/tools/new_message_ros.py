@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from router.tools import UsageError
-from router.tools.new_message import SCALARS, NewField, NewMessage, Site
 from router.tools.new_message_layout import aligned
+from router.tools.new_message_model import SCALARS, NewField, NewMessage, Site
 
 _LARGEST_CONSTANT = 255
 

@@ -9,8 +9,8 @@ import re
 from collections.abc import Sequence
 
 from router.table.model import ANY, EndpointKind, Route, RouteTable
-from router.tools.new_message import NewMessage
 from router.tools.new_message_layout import WIDEST, Stanza, stanza_at, with_stanza_after
+from router.tools.new_message_model import NewMessage
 
 _ONE_LINE = re.compile(r"(?P<indent> *)[\w]+:(?P<gap> +)(?P<rest>\{.*\}) *$")
 
