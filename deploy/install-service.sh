@@ -92,7 +92,7 @@ for unit in rover-router.service rover-router.socket rover-router-hold.service; 
   mv "$units/$unit.new" "$units/$unit"
 done
 systemctl daemon-reload
-if [ "$same_socket" = no ]; then systemctl stop rover-router.service rover-router.socket rover-router-hold.service; fi
+if [ "$same_socket" = no ]; then systemctl stop rover-router.service rover-router.socket; fi
 systemctl enable --quiet rover-router.socket rover-router.service
 systemctl start rover-router.socket
 systemctl restart rover-router.service || die "it did not start; see: journalctl -u rover-router -e"

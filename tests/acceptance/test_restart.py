@@ -22,7 +22,7 @@ RATE = 2000
 """Datagrams per second and listener."""
 
 BATCH = 20
-RESTARTS = 3
+RESTARTS = 2
 
 HOSTS = ("127.0.0.5", "127.0.0.6")
 

@@ -118,6 +118,15 @@ def test_who_stops_it_has_it_stopped_and_what_comes_waits(running: Machine) -> N
     running.wait_for(f"{METRICS} | grep -q '^router_datagrams_received_total{{listener=\"rover\"}} [1-9]'")
 
 
+def test_a_start_after_the_socket_was_stopped_too_begins_with_nothing(running: Machine) -> None:
+    running.shell(f"systemctl stop rover-router; {SEND}; systemctl stop rover-router.socket")
+    running.shell("systemctl start rover-router")
+    assert running.state("rover-router.socket") == "active"
+    assert '"systemd"' in running.shell("ss -lunp 'sport = :25000'")
+    received = running.shell(f"{METRICS} | grep '^router_datagrams_received_total{{listener=\"rover\"}}'")
+    assert received.split()[-1] == "0.0"
+
+
 def test_a_killed_router_comes_back(running: Machine) -> None:
     before = running.show("MainPID")
     running.shell("systemctl kill --signal=KILL --kill-whom=main rover-router")
