@@ -12,7 +12,7 @@ from pathlib import Path
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.errors import Severity, shown_path
-from router.tools.doctor_host import clock, receive_buffers, shared_memory
+from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
 from router.tools.doctor_network import endpoints, ports
 from router.tools.doctor_report import Finding, fine, problem, warning
 from router.tools.doctor_ros import ros
@@ -33,6 +33,8 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
     yield from ros(program)
     yield from ports(program, running=running is not None)
     yield from receive_buffers(program)
+    if running is None:
+        yield from recordings(program)
     yield from shared_memory(variables)
     yield from clock()
     yield from endpoints(program)
@@ -45,6 +47,7 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
         if isinstance(finding, Program):
             yield from ros(finding)
             yield from ports(finding, running=False, with_listeners=False)
+            yield from recordings(finding)
         else:
             yield finding
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import pwd
+import shutil
 import struct
 from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
@@ -38,6 +39,32 @@ def receive_buffers(program: Program) -> Iterator[Finding]:
         f"sysctl -w net.core.rmem_max={wanted}, and for good in /etc/sysctl.d/60-rover-router.conf; the service of "
         "`make install-service` need not be told",
     )
+
+
+def recordings(program: Program) -> Iterator[Finding]:
+    """Whether there is a place for them, and room for as many as the table keeps."""
+    settings = program.table.record
+    if settings is None:
+        return
+    directory = settings.directory.resolve()
+    there = next(folder for folder in (directory, *directory.parents) if folder.exists())
+    if not os.access(there, os.W_OK | os.X_OK):
+        yield problem(
+            "recordings",
+            f"{_user(os.geteuid())} may not write to {there}",
+            "chown it, or give `record` another directory; for a service, run deploy/install-service.sh again then",
+        )
+        return
+    kept = sum(file.stat().st_size for file in directory.glob("*.mcap"))
+    free = shutil.disk_usage(there).free
+    if settings.continuous and kept + free < settings.keep:
+        yield warning(
+            "recordings",
+            f"the disk with {directory} has room for {(kept + free) >> 20} MiB, `keep` says {settings.keep >> 20}",
+            "a smaller `keep`: the oldest files go before the disk is full",
+        )
+    else:
+        yield fine("recordings", f"{directory}, with {free >> 20} MiB free")
 
 
 def clock(now: datetime | None = None, status: int | None = None) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from router.cli import main
 from router.cli.doctor import shown
 from router.tools.doctor_report import Grade, fine, problem, warning
+from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -16,7 +18,12 @@ ROOT = Path(__file__).parent.parent.parent
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
     path = tmp_path / "table.yaml"
-    path.write_text(f"extends: {ROOT}/routes/sim.yaml\n")
+    metrics = free_port(kind=socket.SOCK_STREAM)
+    path.write_text(
+        f"extends: {ROOT}/tests/acceptance/quiet.yaml\n"
+        f"metrics: {{address: 127.0.0.1:{metrics}}}\n"
+        f"listen: {{rover: {{address: 127.0.0.1:{free_port()}}}}}\n"
+    )
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.tools import doctor_host, doctor_network
 from router.tools.doctor import before_start, examine
-from router.tools.doctor_host import clock, receive_buffers, shared_memory
+from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
 from router.tools.doctor_network import endpoints, ports
 from router.tools.doctor_report import Finding, Grade
 from router.tools.doctor_running import health
@@ -115,6 +116,31 @@ def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
     [found] = receive_buffers(compiled(table))
     assert found.grade is Grade.WARNING
     assert "sysctl -w net.core.rmem_max=65536" in found.remedy
+
+
+def recorded(table: Path, folder: Path, keep: str) -> Program:
+    table.write_text(f"{table.read_text()}record: {{directory: {folder}, keep: {keep}}}\n")
+    return compiled(table)
+
+
+def test_recordings_that_have_a_place_are_fine(table: Path, tmp_path: Path) -> None:
+    assert [each.grade for each in recordings(recorded(table, tmp_path / "later", "256MiB"))] == [Grade.FINE]
+
+
+def test_more_recordings_than_the_disk_holds_are_a_warning(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1 << 30, 1 << 30, 100 << 20))
+    [found] = recordings(recorded(table, tmp_path, "4GiB"))
+    assert (found.grade, "room for 100 MiB, `keep` says 4096" in found.text) == (Grade.WARNING, True)
+
+
+def test_a_folder_that_takes_no_recordings_is_a_problem(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    [found] = recordings(recorded(table, tmp_path, "4GiB"))
+    assert (found.grade, f"may not write to {tmp_path}" in found.text) == (Grade.PROBLEM, True)
 
 
 @pytest.mark.parametrize(
