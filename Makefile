@@ -11,13 +11,16 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Says what must be sourced; nothing at all unless ROS comes from outside .venv.
 ENV := . .venv/env.sh &&
 
-.PHONY: help setup test demo bench validate lint clean
+.PHONY: help setup install-service test demo bench validate lint clean
 
 help:  ## this list
-	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 17
 
 setup:  ## build .venv with the router, ROS 2 Jazzy and the comms interfaces; what is up to date stays
 	@deploy/setup.sh
+
+install-service:  ## run the router as a systemd service from here on; needs root, after make setup
+	@deploy/install-service.sh
 
 test: setup  ## run the tests; TESTS=tests/wire for some of them
 	@$(ENV) .venv/bin/python -m pytest $(TESTS)
@@ -29,8 +32,9 @@ bench: setup  ## measure the router beside the C++ node, about an hour; ARGS="--
 	@$(ENV) .venv/bin/python -m benchmarks.versus $(ARGS)
 	@.venv/bin/python docs/generate.py
 
-validate: setup  ## say what is wrong with the tables in routes/
+validate: setup  ## say what is wrong with the tables in routes/, and prove them
 	@$(ENV) .venv/bin/router validate routes/
+	@$(ENV) .venv/bin/router test --coverage routes/
 
 lint: setup  ## ruff and mypy
 	@.venv/bin/ruff check
