@@ -18,10 +18,12 @@ ROOT = Path(__file__).parent.parent.parent
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
     path = tmp_path / "table.yaml"
-    metrics = free_port(kind=socket.SOCK_STREAM)
+    metrics, foxglove = free_port(kind=socket.SOCK_STREAM), free_port(kind=socket.SOCK_STREAM)
     path.write_text(
         f"extends: {ROOT}/tests/acceptance/quiet.yaml\n"
         f"metrics: {{address: 127.0.0.1:{metrics}}}\n"
+        f"foxglove: {{address: 127.0.0.1:{foxglove}}}\n"
+        f"record: {{directory: {tmp_path}, last: 60s}}\n"
         f"listen: {{rover: {{address: 127.0.0.1:{free_port()}}}}}\n"
     )
     return path
