@@ -1,0 +1,302 @@
+"""Reloads of a whole router in this process, while datagrams come: what is kept, what is counted, what is refused."""
+
+from __future__ import annotations
+
+import gc
+import random
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from router.compiler import check_table
+from router.edges.receiver import ReceiveThread
+from router.runtime import Router
+
+ROOT = Path(__file__).parent.parent
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+{listen}
+endpoints:
+  sensor_board: {{address: 127.0.0.30:8, kind: board}}
+  basestation: {{address: "127.0.0.1:{basestation}", kind: basestation}}
+{more}"""
+PH = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
+TOPIC = """\
+  ph_info:
+    source: sensor_board
+    destinations: [basestation]
+    topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}]
+"""
+DRIVE, BRAKE = bytes.fromhex("c201021005"), bytes.fromhex("ca01020801")
+
+
+def turns(timeout: str) -> str:
+    return f"""\
+  manual_drive:
+    source: sensor_board
+    destinations: [basestation]
+    deadman: {{timeout: {timeout}, send: {{manual_brake: {{brake: true}}}}, to: [basestation], repeat: 10ms}}
+"""
+
+
+def numbered(number: int) -> bytes:
+    """A `ph_info` with a number in it."""
+    return bytes.fromhex("0a050d") + struct.pack("<f", number)
+
+
+def udp(host: str) -> socket.socket:
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    opened.bind((host, 0))
+    opened.settimeout(10)
+    return opened
+
+
+@dataclass
+class Site:
+    """A folder for the table, a board that sends and a basestation that receives."""
+
+    folder: Path
+    board: socket.socket
+    basestation: socket.socket
+    listen: int
+    sent: list[int] = field(default_factory=list)
+
+    def write(self, routes: str, *, listen: str | None = None, endpoints: str = "") -> Path:
+        path = self.folder / "table.yaml"
+        listeners = listen or f'  rover: {{address: "127.0.0.1:{self.listen}"}}'
+        destination = self.basestation.getsockname()[1]
+        path.write_text(
+            TABLE.format(
+                protos=ROOT / "protos", listen=listeners, basestation=destination, more=f"{endpoints}routes:\n{routes}"
+            )
+        )
+        return path
+
+    @contextmanager
+    def router(self, routes: str) -> Iterator[Router]:
+        program = check_table(self.write(routes)).program
+        assert program is not None
+        with Router(program) as router:
+            yield router
+
+    def send(self, *datagrams: bytes, port: int | None = None) -> None:
+        for datagram in datagrams:
+            self.board.sendto(datagram, ("127.0.0.1", port or self.listen))
+
+    @contextmanager
+    def under_load(self) -> Iterator[None]:
+        """Numbered datagrams come all the time, 2,000 per second."""
+        ended = threading.Event()
+
+        def load() -> None:
+            while not ended.wait(0.0005):
+                self.send(numbered(len(self.sent)))
+                self.sent.append(len(self.sent))
+
+        thread = threading.Thread(target=load)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def received(self) -> list[int]:
+        """The numbers of what has arrived at the basestation."""
+        self.basestation.setblocking(False)
+        numbers = []
+        try:
+            while True:
+                numbers.append(int(struct.unpack("<f", self.basestation.recv(1000)[3:])[0]))
+        except BlockingIOError:
+            return numbers
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    with udp("127.0.0.1") as unused:
+        listen = unused.getsockname()[1]
+    with udp("127.0.0.30") as board, udp("127.0.0.1") as basestation:
+        yield Site(tmp_path, board, basestation, listen)
+
+
+def settled(router: Router) -> dict[str, float]:
+    return {
+        f"{name}{sorted(labels.values())}": value
+        for name, labels, value in router.samples()
+        if name.startswith("router_config_")
+    }
+
+
+def test_nothing_is_lost_or_doubled_or_out_of_order_while_tables_change(site: Site) -> None:
+    choice = random.Random(6)
+    rover = f'address: "127.0.0.1:{site.listen}"'
+    tool = '  tool: {address: "127.0.0.1:9", kind: tool}\n'
+    with site.router(PH) as router:
+        first = router.listeners["rover"].socket
+        with site.under_load():
+            for _ in range(25):
+                listen = choice.choice([f"  rover: {{{rover}}}", f"  other: {{{rover}, coalesce: never}}"])
+                routes = choice.choice([PH, TOPIC, PH + turns("1s"), PH.replace("}", ", ttl: 5s}")])
+                site.write(routes, listen=listen, endpoints=choice.choice(["", tool]))
+                assert router.reload().ok
+                assert next(iter(router.listeners.values())).socket is first
+    assert site.received() == site.sent
+    assert router.total("datagrams_received") == len(site.sent)
+    assert router.total("datagrams_sent") == len(site.sent)
+    assert router.total("config_reloads") == 25
+
+
+def test_a_table_with_errors_changes_nothing_and_is_told(site: Site) -> None:
+    with site.router(PH) as router:
+        before = router.program
+        site.write(PH.replace("basestation", "nobody"))
+        result = router.reload()
+        assert (result.ok, result.text) == (False, "the table has 1 error")
+        assert "nobody" in str(result.findings[-1])
+        assert router.program is before
+        told = settled(router)
+        assert told["router_config_last_reload_successful[]"] == 0
+        assert told["router_config_reloads_total['invalid']"] == 1
+        site.send(numbered(3))
+        assert site.basestation.recv(1000) == numbered(3)
+        site.write(PH)
+        assert router.reload().text == "nothing changed"
+        assert settled(router)["router_config_last_reload_successful[]"] == 1
+
+
+def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
+    with site.router(PH) as router, udp("127.0.0.1") as taken:
+        both = (
+            f'  rover: {{address: "127.0.0.1:{site.listen}"}}\n'
+            f'  second: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}'
+        )
+        site.write(PH, listen=both)
+        result = router.reload()
+        assert not result.ok
+        assert "has the port" in result.text
+        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        assert list(router.listeners) == ["rover"]
+
+
+def test_what_only_a_start_can_change_is_refused(site: Site) -> None:
+    with site.router(PH) as router:
+        path = site.write(PH)
+        path.write_text(path.read_text() + "node: {name: another}\n")
+        result = router.reload()
+        assert not result.ok
+        assert "'node' cannot change while the router runs; restart it" in str(result.findings[-1])
+
+
+def test_what_has_arrived_on_a_listener_that_goes_is_routed_before_it_goes(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with udp("127.0.0.1") as unused:
+        second = unused.getsockname()[1]
+    both = f'  rover: {{address: "127.0.0.1:{site.listen}"}}\n  second: {{address: "127.0.0.1:{second}"}}'
+    with site.router(PH) as router:
+        site.write(PH, listen=both)
+        assert router.reload().ok
+        finish = ReceiveThread.finish
+
+        def finish_late(thread: ReceiveThread, listener: object) -> None:
+            site.send(*map(numbered, range(50)), port=second)  # while nobody receives
+            finish(thread, listener)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(ReceiveThread, "finish", finish_late)
+        site.write(PH)
+        assert router.reload().ok
+        assert [site.basestation.recv(1000) for _ in range(50)] == [numbered(number) for number in range(50)]
+        counted = {str(labels): value for name, labels, value in router.samples() if name.endswith("received_total")}
+        assert counted["{'listener': 'second'}"] == 50  # what happened does not vanish with who it happened to
+
+
+def test_a_deadman_stays_armed_when_its_table_is_reloaded(site: Site) -> None:
+    with site.router(turns("300ms")) as router:
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        site.write(turns("300ms") + PH)
+        assert router.reload().ok
+        assert site.basestation.recv(1000) == BRAKE
+
+
+def test_a_deadman_with_another_timeout_inherits_the_last_command(site: Site) -> None:
+    with site.router(turns("1h")) as router:
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        site.write(turns("50ms"))
+        assert router.reload().ok
+        assert site.basestation.recv(1000) == BRAKE
+        site.write(turns("60ms"))  # tripped
+        assert router.reload().ok
+        assert router.total("deadman_active") == 1
+        site.send(DRIVE)
+        while site.basestation.recv(1000) != DRIVE:
+            pass
+        assert site.basestation.recv(1000) == BRAKE
+        assert router.total("deadman_trips") == 2
+
+
+def test_a_deadman_that_goes_has_the_last_word_if_it_was_armed(site: Site) -> None:
+    with site.router(turns("1h") + PH) as router:
+        site.write(PH)
+        assert router.reload().ok  # nothing to say: no command came
+        site.write(turns("1h") + PH)
+        assert router.reload().ok
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        site.write(PH)
+        assert router.reload().ok
+        assert site.basestation.recv(1000) == BRAKE
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)
+    assert router.total("deadman_datagrams_sent") == 1
+
+
+def test_a_rate_is_kept_over_a_reload(site: Site) -> None:
+    slow = "  ph_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 0.001}]}\n"
+    with site.router(slow) as router:
+        site.send(numbered(0))
+        assert site.basestation.recv(1000) == numbered(0)
+        site.write(slow + turns("1s"))
+        assert router.reload().ok
+        site.send(numbered(1))
+        while router.total("datagrams_received") < 2:
+            time.sleep(0.001)
+    assert router.total("messages_dropped") == 1
+
+
+def test_reloads_leave_nothing_behind(site: Site) -> None:
+    sizes = []
+    with site.router(PH) as router, site.under_load():
+        for number in range(12):
+            site.write([TOPIC + turns("1s"), PH][number % 2])
+            assert router.reload().ok
+            if number % 2:
+                gc.collect()
+                sizes.append(len(gc.get_objects()))
+    assert sizes[-1] <= sizes[1] + 50
+    assert site.received() == site.sent
+
+
+def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(site: Site) -> None:
+    path = site.write(PH)
+    path.write_text("reload: {on_change: true}\n" + path.read_text())
+    program = check_table(path).program
+    assert program is not None
+    with Router(program) as router:
+        path.write_text(path.read_text() + turns("1s"))
+        while len(router.program.table.routes) == 1:
+            time.sleep(0.05)
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
