@@ -100,3 +100,32 @@ def test_a_port_in_use_is_told_and_ends_with_78(table: Path) -> None:
     assert process.returncode == 78
     assert f"router run: {table}:4:20: listener 'rover' cannot use" in text
     assert f"(pid {os.getpid()}) has the port" in text
+
+
+def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
+    metrics, listen = free_port(kind=socket.SOCK_STREAM), free_port()
+    table.write_text(f'metrics: {{address: "127.0.0.1:{metrics}"}}\n' + table.read_text())
+    process = start(table, LISTEN_PORT=str(listen))
+    wait_for_start(process)
+    good = table.read_text()
+    asking = [sys.executable, "-m", "router", "reload", str(table)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "LISTEN_PORT": str(listen)}
+
+    table.write_text(good + "  gps_info: {source: any, destinations: [basestation]}\n")
+    answer = subprocess.run(asking, env=environment, capture_output=True, text=True, check=False)
+    assert (answer.returncode, answer.stdout) == (0, "route gps_info added\n")
+
+    table.write_text(good + "  gps_infos: {source: any, destinations: [basestation]}\n")
+    answer = subprocess.run(asking, env=environment, capture_output=True, text=True, check=False)
+    assert answer.returncode == 78
+    assert "unknown-payload-case" in answer.stderr
+    assert "nothing has changed: the table has 1 error" in answer.stderr
+
+    table.write_text(good)
+    process.send_signal(signal.SIGHUP)
+    assert process.stderr
+    told = next(entry for entry in map(json.loads, process.stderr) if entry.get("result") == "route gps_info removed")
+    assert told["event"] == "table reloaded"
+    process.terminate()
+    process.communicate(timeout=10)
+    assert process.returncode == 0
