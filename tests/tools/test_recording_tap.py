@@ -51,7 +51,7 @@ def test_a_file_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="cannot write .*: No such file or directory"):
+    with pytest.raises(UsageError, match=r"cannot write .*: No such file or directory"):
         recording(tmp_path / "nowhere" / "it.mcap")
 
 
