@@ -108,6 +108,9 @@ class RosEdge:
             earlier = self._publications.get(each.plan.topic)
             if earlier is not None and earlier.wanted[0]:
                 each.meet()
+        for subscription in subscribed:
+            if subscription.plan.topic in self._subscriptions:
+                subscription.meet()
         return RosChange(publications, kept, [*published, *subscribed])
 
     def abandon(self, change: RosChange) -> None:

@@ -16,7 +16,7 @@ from router.edges.ros_node import RCL_ERRORS
 from router.edges.ros_qos import PeerEvents, qos_profile
 from router.errors import SourceSpan, StartError
 
-_MEET_S, _LOOK_S = 0.5, 0.005
+_MEET_S, _LOOK_S, _OTHERS_S = 0.5, 0.005, 0.1
 
 
 class Publication:
@@ -64,6 +64,17 @@ class Subscription:
         with _refusing(f"{span}: topic '{plan.topic}' cannot be subscribed to"):
             self.raw = RawSubscription(node, message, plan.topic, qos_profile(plan.qos), peers.of_subscription(plan))
         self.events: Sequence[EventHandler] = self.raw.events
+
+    def meet(self) -> None:
+        """Waits a moment for the publishers, who find this one by and by; an earlier subscription hears them meanwhile.
+
+        They are there when the first of them is heard, or soon after that; who says nothing has time enough.
+        """
+        for _ in range(int(_MEET_S / _LOOK_S)):
+            sleep(_LOOK_S)
+            if self.raw.take():
+                sleep(_OTHERS_S)
+                return
 
     def close(self) -> None:
         """Nobody may take from it any more, and nobody waits for its events."""
