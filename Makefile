@@ -19,8 +19,8 @@ help:  ## this list
 setup:  ## build .venv with the router, ROS 2 Jazzy and the comms interfaces; what is up to date stays
 	@deploy/setup.sh
 
-install-service:  ## run the router as a systemd service from here on; needs root, after make setup
-	@deploy/install-service.sh
+install-service:  ## install the router as a systemd service and start it, with sudo; TABLE=... for another table
+	@deploy/install-service.sh $(TABLE)
 
 test: setup  ## run the tests; TESTS=tests/wire for some of them
 	@$(ENV) .venv/bin/python -m pytest $(TESTS)
