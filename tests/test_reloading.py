@@ -18,6 +18,7 @@ import pytest
 from router.compiler import check_table
 from router.edges.receiver import ReceiveThread
 from router.runtime import Router
+from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent
 TABLE = """\
@@ -300,3 +301,32 @@ def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(site: Site) 
             time.sleep(0.05)
         site.send(DRIVE)
         assert site.basestation.recv(1000) == DRIVE
+
+
+def test_a_gateway_keeps_its_clients_unless_it_changes_itself(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateway = f"  dashboard: {{transport: {{tcp: 127.0.0.1:{port}}}, publish_period: %s}}\n"
+    with site.router(TOPIC) as router:
+        site.write(TOPIC + "gateways:\n" + gateway % "1s")
+        assert router.reload().text == "gateway dashboard added"
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            client.settimeout(10)
+            while not client_count(router):
+                time.sleep(0.01)
+            site.write(PH + "# a line more\ngateways:\n" + gateway % "1s")
+            assert router.reload().text == "route ph_info changed"
+            assert client_count(router) == 1
+            site.write(PH + "gateways:\n" + gateway % "2s")
+            assert router.reload().text == "gateway dashboard changed"
+            while client.recv(4096):
+                pass
+        socket.create_connection(("127.0.0.1", port)).close()
+        site.write(PH)
+        assert router.reload().text == "gateway dashboard removed"
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port))
+
+
+def client_count(router: Router) -> int:
+    return int(sum(value for name, _, value in router.samples() if name == "router_gateway_clients"))
