@@ -59,3 +59,27 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Program
             assert all(Series("messages_dropped", (route, target.target, reason)) in series for reason in DROP_REASONS)
         for name in ("route_seconds", "route_last_message_timestamp_seconds"):
             assert Series(name, (route,)) in series
+
+
+def test_books_that_continue_others_keep_what_was_counted() -> None:
+    first = Books()
+    sent, gone = first.slot("datagrams_received", "rover"), first.slot("datagrams_received", "arm")
+    unused, active = first.slot("datagrams_padded", "arm"), first.slot("deadman_active", "drive")
+    timed = first.slot("route_seconds", "drive")
+    counts = first.fresh_counts()
+    counts[sent], counts[gone], counts[active] = 3, 4, 1
+    then = first.continued()
+    assert then.slot("datagrams_received", "rover") == sent
+    new = then.slot("datagrams_received", "new")
+    then.grow(counts)
+    assert (counts[sent], counts[new]) == (3, 0)
+    then.settle([counts])
+    kept = {series.labels for series, _ in then.series()}
+    assert kept == {("rover",), ("arm",), ("new",)}  # counters that counted stay, gauges and what is at 0 go
+    assert counts[active] == 0
+    last = then.continued()
+    size = len(last.fresh_counts())
+    assert {last.slot("datagrams_padded", "x"), last.slot("datagrams_padded", "y")} == {unused, active}
+    assert last.slot("route_seconds", "x") == timed
+    assert len(last.fresh_counts()) == size
+    assert {series.metric for series, _ in first.series()} >= {"deadman_active", "route_seconds"}  # as they were

@@ -1,0 +1,20 @@
+"""What handlers remember is passed on by key."""
+
+from __future__ import annotations
+
+from router.engine.state import State
+
+
+def test_what_has_the_same_key_is_the_same_object_in_the_next_program() -> None:
+    first = State()
+    limit = first.keep(("limit", 1), object)
+    assert first.keep(("limit", 1), object) is limit
+    gone = first.keep(("limit", 2), object)
+    then = State(first)
+    assert then.keep(("limit", 1), object) is limit
+    new = then.keep(("limit", 3), object)
+    assert list(then.made()) == [new]
+    assert list(then.left()) == [gone]
+    then.settle()
+    assert list(then.left()) == []
+    assert then.keep(("limit", 1), object) is limit
