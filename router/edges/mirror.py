@@ -8,13 +8,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from router.edges.clock import wall_ns
 
 Receive = Callable[[bytes, "tuple[str, int]"], None]
 
-PERIOD = 0.02
+PERIOD = 0.05
 """Seconds for which datagrams gather until they are shown: waking somebody for each would cost more than routing it."""
 
 MOST = 8192
@@ -32,6 +33,9 @@ class Seen(NamedTuple):
     peer: tuple[str, int]
     data: bytes
 
+
+_SEEN = partial(tuple.__new__, Seen)
+"""Makes one of a tuple, without a function of Python's between."""
 
 Consumer = Callable[[Sequence[Seen]], None]
 
@@ -86,11 +90,11 @@ class Mirror:
         """What is to be called in place of `receive` for this listener's datagrams, as long as nobody comes or goes."""
         if not self._consumers:
             return receive
-        waiting, append = self._waiting, self._waiting.append
+        waiting, append, most = self._waiting, self._waiting.append, self._limit + 1
 
         def seen(data: bytes, peer: tuple[str, int]) -> None:
             if len(waiting) < MOST:
-                append((wall_ns(), listener, peer, data))
+                append((wall_ns(), listener, peer, data[:most]))
             else:
                 self.lost += 1
             receive(data, peer)
@@ -115,11 +119,8 @@ class Mirror:
 
     def _show(self) -> None:
         with self._showing:
-            waiting, most = self._waiting, self._limit + 1
-            batch = []
-            for _ in range(len(waiting)):
-                at, listener, peer, data = waiting.popleft()
-                batch.append(Seen(at, listener, peer, data[:most]))
+            pop = self._waiting.popleft
+            batch = list(map(_SEEN, [pop() for _ in range(len(self._waiting))]))
             if not batch:
                 return
             for consumer in self._consumers:

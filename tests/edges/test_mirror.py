@@ -33,7 +33,11 @@ class Source:
 
 
 def into(got: queue.SimpleQueue[Seen]) -> Callable[[Sequence[Seen]], None]:
-    return lambda batch: [got.put(seen) for seen in batch] and None
+    def consume(batch: Sequence[Seen]) -> None:
+        for seen in batch:
+            got.put(seen)
+
+    return consume
 
 
 @pytest.fixture
