@@ -2,44 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import select
-import sys
 import threading
 from collections.abc import Callable, Sequence
 
+from router.edges.alarm import Alarm
 from router.engine.machine import Machine, P, R
 
 _NEVER = 1 << 63
-_LONGEST_WAIT_MS = 3_600_000
 _RETRY = 100_000_000
 """ns from a machine's failure until it is called again, lest a fault that stays keeps a processor busy."""
-
-
-class _Alarm:
-    """What a thread waits for: that another one rings, or that some time has passed.
-
-    As threading.Condition, but the time is monotonic for certain. Python's locks count it by the wall clock where
-    Python was built for a C library older than glibc 2.30, as many portable builds are; with a clock that is set back
-    by an hour, a deadman that waits for one would be silent for an hour.
-    """
-
-    def __init__(self) -> None:
-        self._rung = os.fdopen(os.eventfd(0), "r+b", buffering=0)
-        self._poll = select.poll()
-        self._poll.register(self._rung, select.POLLIN)
-
-    def wait(self, nanoseconds: int) -> None:
-        """Never ends early unless somebody rings, or has rung since the last wait; or after an hour."""
-        if self._poll.poll(min(max(0, nanoseconds) / 1e6, _LONGEST_WAIT_MS)):
-            self._rung.read(8)
-
-    def ring(self) -> None:
-        self._rung.write((1).to_bytes(8, sys.byteorder))
-
-    def close(self) -> None:
-        """Nobody may wait or ring any more; closing again changes nothing."""
-        self._rung.close()
 
 
 class Timekeeper:
@@ -57,7 +28,7 @@ class Timekeeper:
         self._failed = failed
         self._machines: list[Machine] = []
         self._lock = threading.Lock()
-        self._alarm = _Alarm()
+        self._alarm = Alarm()
         self._waits_until = 0  # while nobody waits
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=name)
