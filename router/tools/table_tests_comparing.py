@@ -41,12 +41,14 @@ class Comparison:
         expected = step.expected
         yield from self._early(expected, happened)
         rejected = [event for event in happened.events if isinstance(event, Rejected)]
-        yield from self._rejected(expected, rejected)
+        unexpected = list(self._rejected(expected, rejected))
+        yield from unexpected
         yield from self._routes(expected, happened.events)
+        is_told = bool(rejected and unexpected)
         sent = [event for event in happened.events if isinstance(event, Sent)]
-        yield from self._delivered(expected.sent, _by_target(sent), happened, bool(rejected))
+        yield from self._delivered(expected.sent, _by_target(sent), happened, is_told)
         published = [event for event in happened.events if isinstance(event, Published)]
-        yield from self._delivered(expected.published, _by_target(published), happened, bool(rejected))
+        yield from self._delivered(expected.published, _by_target(published), happened, is_told)
         yield from self._dropped(expected, happened)
         yield from self._filtered(expected, happened.events)
 
@@ -68,12 +70,12 @@ class Comparison:
         expected: Mapping[str, tuple[Item, ...]],
         came: Mapping[str, list[Sent | Published]],
         happened: Happened,
-        is_rejected: bool,
+        is_told: bool,
     ) -> Iterator[Failure]:
         for target in dict.fromkeys((*expected, *came)):
             items, events = expected.get(target, ()), came.get(target, [])
             if items and not events:
-                if not is_rejected:
+                if not is_told:  # as the rejection that it comes from
                     yield self._missing(target, items, happened)
             elif not items:
                 yield from self._unexpected(events, happened)
@@ -165,10 +167,12 @@ class Comparison:
         for event in happened.events:
             if isinstance(event, Dropped):
                 came.setdefault(event.target, []).append(event)
+        got_something = {_target(event) for event in happened.events if isinstance(event, (Sent, Published))}
+        told = {target for target in (*expected.sent, *expected.published) if target not in got_something}
         for target in dict.fromkeys((*expected.dropped, *came)):
             wanted = expected.dropped.get(target, nothing)
             counts = Counter(event.reason for event in came.get(target, ()))
-            is_told = target not in expected.dropped and (target in expected.sent or target in expected.published)
+            is_told = target not in expected.dropped and target in told  # as the reason why it is missing
             if counts != Counter(wanted.value) and not is_told:
                 details = {event.detail: None for event in came.get(target, ()) if event.detail}
                 detail = f" ({next(iter(details))})" if details else ""
@@ -186,8 +190,12 @@ class Comparison:
 def _by_target(events: Iterable[Sent | Published]) -> Mapping[str, list[Sent | Published]]:
     found: dict[str, list[Sent | Published]] = {}
     for event in events:
-        found.setdefault(event.endpoint if isinstance(event, Sent) else event.topic, []).append(event)
+        found.setdefault(_target(event), []).append(event)
     return found
+
+
+def _target(event: Sent | Published) -> str:
+    return event.endpoint if isinstance(event, Sent) else event.topic
 
 
 def _counts(counts: Counted) -> str:

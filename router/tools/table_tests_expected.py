@@ -47,6 +47,7 @@ class ExpectedReader:
     def _sent(self, node: Node | None, given: Node | None) -> Mapping[str, tuple[Item, ...]]:
         if not isinstance(node, MappingNode):
             named = [_name(item) for item in _listed(node)]
+            _each_once(named)
             return {self._names.endpoint(name, span).name: (_unchanged(span, given),) for name, span in named}
         return {
             self._names.endpoint(name, entry.key.span).name: tuple(
@@ -170,6 +171,14 @@ def _count(node: Node) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MOST:
         raise unsound(node.span, Code.BAD_VALUE, f"how often is a whole number from 1 to {_MOST}")
     return value
+
+
+def _each_once(named: Sequence[tuple[str, SourceSpan]]) -> None:
+    names = [name for name, _ in named]
+    for index, (name, span) in enumerate(named):
+        if name in names[:index]:
+            hint = f"where it gets the datagram twice, write {{{name}: {{times: 2}}}}"
+            raise unsound(span, Code.BAD_VALUE, f"'{name}' is named twice", hint)
 
 
 def _name(node: Node) -> tuple[str, SourceSpan]:

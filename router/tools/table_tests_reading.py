@@ -88,16 +88,26 @@ class _Reader:
         return TableTest(name, span, tuple(self._steps(span, listed)))
 
     def _steps(self, span: SourceSpan, nodes: Iterable[Node]) -> Iterable[Step]:
-        latest = 0
+        latest, is_stopped = 0, False
         for node in nodes:
             step = self._step(span, node)
-            for time, key in ((step.at, "at"), (step.until, "until")):
-                if time is not None and time < latest and isinstance(node, MappingNode):
-                    place = node.entries[key].value.span
-                    what = f"this is {time / 1e6:g} ms, before the {latest / 1e6:g} ms of what stands above"
-                    self._findings.append(Diagnostic(place, Code.BAD_VALUE, what, "steps are in the order of time"))
-                latest = max(latest, time or 0)
+            if is_stopped:
+                what, hint = "the router is stopped in the step above", "what comes then is another test"
+                self._findings.append(Diagnostic(step.span, Code.BAD_VALUE, what, hint))
+            latest = self._in_time("at", step.at, latest, node)
+            if step.given is not None:
+                latest += (step.given.repetition.times - 1) * step.given.repetition.every
+            latest = self._in_time("until", step.until, latest, node)
+            is_stopped = step.stop
             yield step
+
+    def _in_time(self, key: str, time: int | None, latest: int, node: Node) -> int:
+        """The time of a key of a step, ns, which is not before the `latest` of what stands above."""
+        if time is not None and time < latest and isinstance(node, MappingNode):
+            what = f"this is {time / 1e6:g} ms, before the {latest / 1e6:g} ms of what stands above"
+            hint = "steps are in the order of time"
+            self._findings.append(Diagnostic(node.entries[key].value.span, Code.BAD_VALUE, what, hint))
+        return max(latest, time or 0)
 
     def _step(self, test: SourceSpan, node: Node) -> Step:
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it

@@ -5,6 +5,7 @@ Knows nodes and types. What does not fit is raised as UnsoundError, with its pla
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator
 
@@ -123,14 +124,26 @@ def _flat(node: MappingNode) -> Iterator[tuple[str, SourceSpan, Node]]:
 def _near(text: str, span: SourceSpan) -> Near | None:
     """`~1.571` is what rounds to that, `1.57 +- 0.01` what is that near."""
     if found := _ROUGHLY.fullmatch(text):
+        value = _finite(found[1], "number to be near", span)
         digits = len(found[2] or "") - int(found[3] or 0)
-        return Near(float(found[1]), 0.5 * 10.0**-digits, text, span)
+        return Near(value, float(f"0.5e{-digits}"), text, span)
     if found := _WITHIN.fullmatch(text):
-        try:
-            return Near(float(found[1]), float(found[2]), text, span)
-        except ValueError:
-            raise _unsound(span, Code.BAD_VALUE, f"'{text}' is not two numbers, as in 1.57 +- 0.01") from None
+        value = _finite(found[1], "number to be near", span)
+        tolerance = _finite(found[2], "tolerance", span)
+        if tolerance < 0:
+            raise _unsound(span, Code.BAD_VALUE, f"'{found[2]}' is no tolerance, which is not negative")
+        return Near(value, tolerance, text, span)
     return None
+
+
+def _finite(text: str, what: str, span: SourceSpan) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise _unsound(span, Code.BAD_VALUE, f"'{text}' is no {what}", "write a number, as in 1.57 +- 0.01")
+    return value
 
 
 def _offset(node: ScalarNode) -> int | None:

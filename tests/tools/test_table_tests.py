@@ -396,6 +396,21 @@ def test_rejection_is_told_once_and_not_as_everything_that_is_missing(tmp_path: 
     assert messages(tmp_path, IMU, tests) == ["rejected: source_mismatch, not nothing (from 10.9.8.7:6: imu_info)"]
 
 
+def test_what_is_expected_beside_a_rejection_is_looked_at(tmp_path: Path) -> None:
+    tests = """
+        a:
+          given: {case: imu_info, from: "10.9.8.7:6", listener: trimmed}
+          expect: {rejected: source_mismatch, sent: basestation}
+        """
+    assert messages(tmp_path, IMU, tests) == ["nothing for basestation"]
+
+
+def test_a_drop_that_is_not_listed_fails_though_the_target_got_others(tmp_path: Path) -> None:
+    routes = "imu_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 10}]}\n"
+    tests = f"a: {{given: {given('{}', ', times: 2')}, expect: {{sent: basestation}}}}\n"
+    assert messages(tmp_path, routes, tests) == ["dropped for basestation: rate_limited, not nothing"]
+
+
 def test_what_happens_between_two_steps_fails(tmp_path: Path) -> None:
     tests = """
         a:
@@ -448,6 +463,18 @@ def test_what_happens_between_two_steps_fails(tmp_path: Path) -> None:
         ("{given: {hex: '00', from: sensor_board, listener: exact}}", Code.MISSING_KEY, "nothing of what is expected"),
         ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1000 ms, before the 2000"),
         ("{steps: [{expect: nothing}], expect: nothing}", Code.UNKNOWN_KEY, "'expect' stands beside 'steps'"),
+        (
+            f"{{steps: [{{given: {given('{}', ', times: 3, every: 1s')}, until: 1999 ms, expect: any}}]}}",
+            Code.BAD_VALUE,
+            "1999 ms, before the 2000 ms",
+        ),
+        ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, before the 1000"),
+        ("{steps: [{stop: true, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "router is stopped"),
+        (f"{{given: {given('{}')}, expect: {{sent: [basestation, basestation]}}}}", Code.BAD_VALUE, "named twice"),
+        ("{expect: {published: {imu_data: {accel_x: 1 +- inf}}}}", Code.BAD_VALUE, "'inf' is no tolerance"),
+        ("{expect: {published: {imu_data: {accel_x: 1 +- -1}}}}", Code.BAD_VALUE, "'-1' is no tolerance"),
+        ("{expect: {published: {imu_data: {accel_x: nan +- 1}}}}", Code.BAD_VALUE, "'nan' is no number to be near"),
+        ("{expect: {published: {imu_data: {accel_x: ~1e400}}}}", Code.BAD_VALUE, "'1e400' is no number to be near"),
         ("{expect: sent}", Code.BAD_VALUE, "'expect' must be 'nothing', 'any', or a mapping"),
     ],
 )
