@@ -32,8 +32,11 @@ class Series:
         return f"sum{f' by ({by})' if by else ''} (rate({self.of(metric, **labels)}[{INTERVAL}]))"
 
     def seconds_since(self, metric: str, **labels: str) -> str:
-        """Of times, up to the scrape, so that it does not grow in between; what never happened gives no series."""
-        return f"timestamp({self.of(metric, **labels)}) - ({self.of(metric, **labels)} > 0)"
+        """Of times, up to the scrape, so that it does not grow in between; what never happened gives no series.
+
+        A scrape has the time at which it began: what happened before the router answered it is 0 s ago.
+        """
+        return f"clamp_min(timestamp({self.of(metric, **labels)}) - ({self.of(metric, **labels)} > 0), 0)"
 
     def buckets(self, metric: str, **labels: str) -> str:
         """Of histograms: how many fell under each bound within a step of the panel."""

@@ -102,7 +102,7 @@ def prometheus(monitored: Monitored, tmp_path_factory: pytest.TempPathFactory) -
     if PROGRAM is None:
         pytest.skip("prometheus is not installed; it is a package of Debian's")
     with PrometheusServer(tmp_path_factory.mktemp("prometheus"), monitored.address) as server:
-        wait_until(lambda: bool(server.query("count_over_time(up[1m]) > 2")), "the third scrape")
+        wait_until(lambda: bool(server.query("sum_over_time(up[1m]) > 2")), "the third scrape")
         yield server
 
 
