@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 
@@ -56,8 +57,8 @@ def play(console: Console, table: RouteTable) -> list[Finding]:
         demo.end()
 
 
-def tell(console: Console, findings: list[Finding], page: Address | None) -> int:
-    """The verdict, and the exit code that belongs to it. `page` is where a browser finds the table's dashboard."""
+def tell(console: Console, findings: list[Finding], pages: Mapping[str, Address | None]) -> int:
+    """The verdict, and the exit code that belongs to it. `pages` are for a browser, by what they show."""
     verdicts = Table.grid(padding=(0, 2))
     for finding in findings:
         mark = Text("ok", style="green") if finding.ok else Text("FAIL", style="red")
@@ -66,8 +67,9 @@ def tell(console: Console, findings: list[Finding], page: Address | None) -> int
     if all(finding.ok for finding in findings):
         console.print(f"\n{SUCCESS}\n", style="bold")
         console.print(NEXT_STEPS, highlight=False)
-        if page is not None:
-            console.print(f"  {f'http://{page}/':<37}  and in a browser, while those two run", highlight=False)
+        for shows, page in pages.items():
+            if page is not None:
+                console.print(f"  {f'http://{page}/':<37}  {shows}, while those two run", highlight=False)
         return 0
     console.print("\nThe demo failed: see the lines above.", style="bold red")
     return 1
@@ -85,7 +87,8 @@ def main() -> int:
     except RouterError as error:
         console.print(f"The demo cannot run: {error}", style="red", highlight=False, markup=False)
         return 1
-    return tell(console, findings, page_of(table))
+    pages = {"what flows where": table.metrics.value if table.metrics else None, "ROS topics": page_of(table)}
+    return tell(console, findings, pages)
 
 
 if __name__ == "__main__":

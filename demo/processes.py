@@ -13,6 +13,7 @@ from demo.children import Child
 from demo.expected import FOUND, LOST, SILENT, page_of, shown_topics
 from demo.page import Shown, look
 from demo.places import free_ros_domain
+from demo.recorded import first_of, recordings
 from demo.screen import open_screen
 from demo.verdict import Finding, judge
 from router.errors import RouterError, TransportError
@@ -65,6 +66,7 @@ class Demo:
         _check_exit(child, expected=0)
 
     def run(self, console: Console) -> list[Finding]:
+        before = recordings(self._table)
         listener = self._start("listener", "demo.ros_listener", str(TABLE))
         self._start("router", "router", "run", str(TABLE))
         self._wait_until_up(listener)
@@ -82,7 +84,8 @@ class Demo:
         time.sleep(DRAINING)
         self._finish(simulator)
         time.sleep(SETTLING)
-        return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()), shown)
+        recorded = first_of(recordings(self._table) - before)
+        return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()), shown, recorded)
 
     def _look_at_page(self) -> Shown | None:
         """None where the table has no page."""

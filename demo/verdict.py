@@ -19,6 +19,7 @@ from demo.expected import (
     shown_topics,
 )
 from demo.page import Shown
+from demo.recorded import Recorded
 from router.table.model import RouteTable
 from router.tools.live import View
 from router.tools.live_view import reasons_text
@@ -40,17 +41,23 @@ class Finding:
 
 
 def judge(
-    table: RouteTable, heard: Said, simulated: Said, view: View | None, shown: Shown | None = None
+    table: RouteTable,
+    heard: Said,
+    simulated: Said,
+    view: View | None,
+    shown: Shown | None = None,
+    recorded: Recorded | None = None,
 ) -> list[Finding]:
     """`heard` and `simulated` are the last words of the ROS listener and the simulator, `view` the last scrape.
 
-    `shown` is what the table's page had to show, None where it has none.
+    `shown` is what the table's page had to show, None where it has none; `recorded` what was saved of the lost link.
     """
     return [
         _topics(table, heard),
         _arrivals(table, simulated),
         *_frames(table, simulated),
         _deadman(table, simulated),
+        *([_recording(recorded)] if table.record and table.record.last else []),
         *([] if shown is None else [_page(table, shown)]),
         _losses(table, view),
     ]
@@ -116,6 +123,13 @@ def _change(simulated: Said, board: str, state: str, start: float, end: float) -
     """When a board first came into a state within these seconds."""
     changes = (c for c in simulated.get("changes", ()) if (c["board"], c["state"]) == (board, state))
     return next((float(change["at"]) for change in changes if start <= change["at"] < end), None)
+
+
+def _recording(recorded: Recorded | None) -> Finding:
+    """Whether there is a file of what came before that."""
+    if recorded is None or not recorded.datagrams:
+        return Finding(False, "what came before the boards were halted was not recorded")
+    return Finding(True, f"the {recorded.datagrams} datagrams before that are in {recorded.path}")
 
 
 def _page(table: RouteTable, shown: Shown) -> Finding:

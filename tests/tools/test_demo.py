@@ -28,6 +28,7 @@ from demo.expected import (
 )
 from demo.page import Shown, look
 from demo.places import free_ros_domain, taken_places
+from demo.recorded import Recorded, first_of
 from demo.verdict import judge
 from router.table.model import Address, Located, RouteTable
 from router.tools.live import RouteRow, TargetRow, View
@@ -61,6 +62,9 @@ def all_arrived(table: RouteTable) -> dict[str, Any]:
     return {"received": received, "undecodable": {}, "changes": changes, "frames": frames}
 
 
+SAVED = Recorded(Path("recordings/sim_deadman-manual_drive.mcap"), 700)
+
+
 def all_shown(table: RouteTable) -> Shown:
     return Shown(True, frozenset(shown_topics(table)) | {"/rosout"})
 
@@ -73,14 +77,14 @@ def sim_table() -> RouteTable:
 def complaints(
     table: RouteTable, heard: dict[str, Any], arrived: dict[str, Any], view: View, shown: Shown | None = None
 ) -> list[str]:
-    return [finding.text for finding in judge(table, heard, arrived, view, shown) if not finding.ok]
+    return [finding.text for finding in judge(table, heard, arrived, view, shown, SAVED) if not finding.ok]
 
 
 def test_all_is_well_when_everything_arrived_and_nothing_was_lost(sim_table: RouteTable) -> None:
     view = seen(dropped={"rate_limited": 5, "stale": 1})
     everything = sim_table, all_heard(sim_table), all_arrived(sim_table), view, all_shown(sim_table)
     assert complaints(*everything) == []
-    *_, losses = judge(*everything)
+    *_, losses = judge(*everything, SAVED)
     assert losses.text.endswith("lost none, withheld 5 rate_limited, 1 stale as the table asks")
 
 
@@ -249,3 +253,16 @@ def test_children_do_not_outlive_a_parent_that_is_killed(lasting: dict[str, str]
         parent.kill()
         parent.wait()
     wait_until(lambda: not is_running(pid))
+
+
+@pytest.mark.parametrize("recorded", [None, Recorded(Path("empty.mcap"), 0)], ids=["no file", "nothing in it"])
+def test_what_came_before_the_boards_were_halted_has_to_be_there(
+    sim_table: RouteTable, recorded: Recorded | None
+) -> None:
+    everything = sim_table, all_heard(sim_table), all_arrived(sim_table), seen(), all_shown(sim_table)
+    [missing] = [finding.text for finding in judge(*everything, recorded) if not finding.ok]
+    assert missing == "what came before the boards were halted was not recorded"
+
+
+def test_without_a_recording_there_is_none() -> None:
+    assert first_of([]) is None
