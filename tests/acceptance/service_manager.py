@@ -15,6 +15,7 @@ from tests.acceptance.ros_peer import PATIENCE
 
 ROOT = Path(__file__).parent.parent.parent
 SO_TIMESTAMPNS = 35
+SO_RCVBUFFORCE = 33
 ABOVE = 20
 """Descriptors from here on are in nobody's way."""
 
@@ -31,6 +32,7 @@ class ServiceManager:
         self._log = folder / "router.log"
         self.sockets = [_held(address) for address in addresses]
         self.told: list[str] = []
+        self.process: subprocess.Popen[bytes] | None = None
         self._hearing = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._hearing.bind(str(folder / "notify"))
         self._hearing.settimeout(PATIENCE)
@@ -71,6 +73,7 @@ class ServiceManager:
             assert monotonic() < deadline, self.text()
 
     def end(self, number: signal.Signals) -> int:
+        assert self.process is not None
         self.process.send_signal(number)
         return self.process.wait(PATIENCE)
 
@@ -78,16 +81,29 @@ class ServiceManager:
         return self._log.read_text()
 
     def close(self) -> None:
-        if self.process.poll() is None:
+        if self.process is not None and self.process.poll() is None:
             self.end(signal.SIGKILL)
         self._hearing.close()
         for held in self.sockets:
             held.close()
 
 
+def make_room(opened: socket.socket) -> None:
+    """For 16 MiB, as systemd does; where this user may not have so much, for what he may."""
+    try:
+        opened.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 16 << 20)
+    except PermissionError:
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16 << 20)
+
+
+def room_of(opened: socket.socket) -> int:
+    """Bytes, as they were asked for; the kernel has twice as many, for its own needs as well."""
+    return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
 def _held(address: tuple[str, int]) -> socket.socket:
     held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    held.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16 << 20)
+    make_room(held)
     held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     held.bind(address)
     return held
