@@ -7,9 +7,8 @@ import random
 import socket
 import struct
 import threading
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import pytest
 from router.compiler import check_table
 from router.edges.receiver import ReceiveThread
 from router.runtime import Router
+from tests.acceptance.site import wait_until
 from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent
@@ -71,6 +71,8 @@ class Site:
     basestation: socket.socket
     listen: int
     sent: list[int] = field(default_factory=list)
+    received: list[int] = field(default_factory=list)
+    """The numbers of what has arrived at the basestation, by `take`."""
 
     def write(self, routes: str, *, listen: str | None = None, endpoints: str = "") -> Path:
         path = self.folder / "table.yaml"
@@ -103,6 +105,7 @@ class Site:
             while not ended.wait(0.0005):
                 self.send(numbered(len(self.sent)))
                 self.sent.append(len(self.sent))
+                self.take()
 
         thread = threading.Thread(target=load)
         thread.start()
@@ -112,23 +115,18 @@ class Site:
             ended.set()
             thread.join()
 
-    def received(self) -> list[int]:
-        """The numbers of what has arrived at the basestation."""
+    def take(self) -> None:
+        """What has arrived by now."""
         self.basestation.setblocking(False)
-        numbers = []
-        try:
-            while True:
-                numbers.append(int(struct.unpack("<f", self.basestation.recv(1000)[3:])[0]))
-        except BlockingIOError:
-            return numbers
+        with suppress(BlockingIOError):
+            while datagram := self.basestation.recv(1000):
+                self.received.append(int(struct.unpack("<f", datagram[3:])[0]))
 
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Site]:
-    with udp("127.0.0.1") as unused:
-        listen = unused.getsockname()[1]
     with udp("127.0.0.30") as board, udp("127.0.0.1") as basestation:
-        yield Site(tmp_path, board, basestation, listen)
+        yield Site(tmp_path, board, basestation, free_port())
 
 
 def settled(router: Router) -> dict[str, float]:
@@ -152,7 +150,8 @@ def test_nothing_is_lost_or_doubled_or_out_of_order_while_tables_change(site: Si
                 site.write(routes, listen=listen, endpoints=choice.choice(["", tool]))
                 assert router.reload().ok
                 assert next(iter(router.listeners.values())).socket is first
-    assert site.received() == site.sent
+    site.take()
+    assert site.received == site.sent
     assert router.total("datagrams_received") == len(site.sent)
     assert router.total("datagrams_sent") == len(site.sent)
     assert router.total("config_reloads") == 25
@@ -202,8 +201,7 @@ def test_what_only_a_start_can_change_is_refused(site: Site) -> None:
 def test_what_has_arrived_on_a_listener_that_goes_is_routed_before_it_goes(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with udp("127.0.0.1") as unused:
-        second = unused.getsockname()[1]
+    second = free_port()
     both = f'  rover: {{address: "127.0.0.1:{site.listen}"}}\n  second: {{address: "127.0.0.1:{second}"}}'
     with site.router(PH) as router:
         site.write(PH, listen=both)
@@ -245,7 +243,7 @@ def test_a_deadman_with_another_timeout_inherits_the_last_command(site: Site) ->
         while site.basestation.recv(1000) != DRIVE:
             pass
         assert site.basestation.recv(1000) == BRAKE
-        assert router.total("deadman_trips") == 2
+        wait_until(lambda: router.total("deadman_trips") == 2)
 
 
 def test_a_deadman_that_goes_has_the_last_word_if_it_was_armed(site: Site) -> None:
@@ -272,8 +270,7 @@ def test_a_rate_is_kept_over_a_reload(site: Site) -> None:
         site.write(slow + turns("1s"))
         assert router.reload().ok
         site.send(numbered(1))
-        while router.total("datagrams_received") < 2:
-            time.sleep(0.001)
+        wait_until(lambda: router.total("datagrams_received") == 2)
     assert router.total("messages_dropped") == 1
 
 
@@ -287,7 +284,8 @@ def test_reloads_leave_nothing_behind(site: Site) -> None:
                 gc.collect()
                 sizes.append(len(gc.get_objects()))
     assert sizes[-1] <= sizes[1] + 50
-    assert site.received() == site.sent
+    site.take()
+    assert site.received == site.sent
 
 
 def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(site: Site) -> None:
@@ -297,8 +295,7 @@ def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(site: Site) 
     assert program is not None
     with Router(program) as router:
         path.write_text(path.read_text() + turns("1s"))
-        while len(router.program.table.routes) == 1:
-            time.sleep(0.05)
+        wait_until(lambda: len(router.program.table.routes) == 2, "the change")
         site.send(DRIVE)
         assert site.basestation.recv(1000) == DRIVE
 
@@ -312,8 +309,7 @@ def test_a_gateway_keeps_its_clients_unless_it_changes_itself(site: Site) -> Non
         assert router.reload().text == "gateway dashboard added"
         with socket.create_connection(("127.0.0.1", port)) as client:
             client.settimeout(10)
-            while not client_count(router):
-                time.sleep(0.01)
+            wait_until(lambda: client_count(router) == 1, "the client")
             site.write(PH + "# a line more\ngateways:\n" + gateway % "1s")
             assert router.reload().text == "route ph_info changed"
             assert client_count(router) == 1
