@@ -53,7 +53,11 @@ def run(args: argparse.Namespace) -> int:
     message = new_message(args.name, args.number, args.board, args.fields, site)
     planned = changes(message, site, [checked.table for checked in before[1:] if checked.table is not None])
     written = Written(planned.texts)
-    after = _check(args.table)
+    try:
+        after = _check(args.table)
+    except BaseException:  # somebody pressed Ctrl-C
+        written.undo()
+        raise
     findings = _news(before, after)
     print_findings(findings, sys.stderr)
     if any(checked.has_errors for checked in after):

@@ -11,7 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
-from router.errors import did_you_mean
+from router.errors import did_you_mean, nearest, shown_path
 from router.table.model import Endpoint, EndpointKind, RouteTable
 from router.table.scalars import resolve, surprise
 from router.tools import UsageError
@@ -19,6 +19,17 @@ from router.tools.new_message_model import SCALARS, NewField, NewMessage, Site, 
 from router.tools.new_message_number import check_number
 from router.types.model import Enum, MessageType
 
+_OF_C = frozenset(
+    """
+    alignas alignof and and_eq asm auto bitand bitor bool break case catch char class compl concept const consteval
+    constexpr constinit const_cast continue co_await co_return co_yield decltype default delete do double dynamic_cast
+    else enum explicit export extern false float for friend goto if inline int long mutable namespace new noexcept not
+    not_eq nullptr operator or or_eq private protected public register reinterpret_cast requires restrict return short
+    signed sizeof static static_assert static_cast struct switch template this thread_local throw true try typedef
+    typeid typename union unsigned using virtual void volatile wchar_t while xor xor_eq
+    """.split()  # noqa: SIM905 - ninety words are read more easily without quotes
+)
+"""What boards and ROS nodes, which are compiled from the same names, cannot have as a name."""
 _MESSAGE_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
 _FIELD_NAME = re.compile(r"[a-z](_?[a-z0-9])*")
 _WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
@@ -34,7 +45,7 @@ def new_message(name: str, number: int, board: str, fields: Sequence[str], site:
     message = NewMessage(name, number, endpoint.name, case, asked)
     for path in (site.schema.root / site.new_file(message), site.messages / f"{name}.msg"):
         if path.exists():
-            raise UsageError(f"there is a file {path} already")
+            raise UsageError(f"there is a file {shown_path(path)} already; take another name")
     return message
 
 
@@ -73,6 +84,7 @@ def _field(text: str, comment: str, site: Site) -> NewField:
         raise UsageError(f"'{text}' is no field; write name:type, as in dose_rate:float")
     if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name):
         raise UsageError(f"'{name}' is no name of a field; write it as dose_rate")
+    _check_word(name, "take another name for the field")
     if surprise(name) or resolve(name) != name:  # in tables and tests names stand without quotation marks
         raise UsageError(f"'{name}' is no text to readers of YAML; take another name, such as is_{name}")
     if type_ in SCALARS:
@@ -80,10 +92,19 @@ def _field(text: str, comment: str, site: Site) -> NewField:
     named = (*site.schema.messages, *site.schema.enums)
     own = [full for full in named if type_ in (full, full.rpartition(".")[2])]
     if not own:
-        known = [*SCALARS, *named]
-        hint = did_you_mean(type_, known) or f"there are {', '.join(SCALARS)}, and the enums and messages of the protos"
+        close = nearest(type_, sorted((*SCALARS, *named)))
+        there = f"there are {', '.join(SCALARS)}, and the enums and messages of the protos"
+        hint = f"did you mean '{close}'?" if close else there
         raise UsageError(f"there is no type '{type_}' for '{name}'; {hint}")
+    if len(own) > 1:
+        raise UsageError(f"several types are called '{type_}'; write which for '{name}': {', '.join(sorted(own))}")
     return NewField(name, own[0], comment)
+
+
+def _check_word(name: str, remedy: str) -> None:
+    """Boards and ROS nodes have it as a name in their own languages."""
+    if name in _OF_C:
+        raise UsageError(f"'{name}' is a word of C or C++, and no name there; {remedy}")
 
 
 def _endpoint(board: str, table: RouteTable) -> Endpoint:
@@ -110,6 +131,9 @@ def _check_names(name: str, case: str, site: Site) -> None:
     taken = {known.rpartition(".")[2] for known in (*site.schema.messages, *site.schema.enums)}
     if name in taken:
         raise UsageError(f"there is a message '{name}' already")
+    _check_word(case, "take another name for the message")
+    if surprise(case) or resolve(case) != case:
+        raise UsageError(f"'{case}' is no text to readers of YAML; take another name for the message")
     if case in site.envelope.cases:
         number = site.envelope.cases[case].number
         raise UsageError(

@@ -50,18 +50,30 @@ def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Ch
 
 
 class Written:
-    """The files of some changes, written. Raises UsageError when one cannot be, and then none is."""
+    """The files of some changes, written, their ends of lines as they were.
+
+    Raises UsageError when one cannot be written, and then none is.
+    """
 
     def __init__(self, texts: Mapping[Path, str]) -> None:
-        self._before: dict[Path, str | None] = {}
+        self._before: dict[Path, bytes | None] = {}
+        self._folders: list[Path] = []
         try:
             for path, text in texts.items():
-                self._before[path] = _read(path) if path.exists() else None
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(text, encoding="utf-8")
+                self._write(path, text)
         except OSError as error:
             self.undo()
             raise UsageError(f"{error.filename} cannot be written: {error.strerror}") from error
+        except BaseException:  # somebody pressed Ctrl-C
+            self.undo()
+            raise
+
+    def _write(self, path: Path, text: str) -> None:
+        before = path.read_bytes() if path.exists() else None
+        self._before[path] = before
+        self._folders += [folder for folder in path.parents if not folder.exists()]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8", newline="\r\n" if before and b"\r\n" in before else "\n")
 
     @property
     def new(self) -> list[Path]:
@@ -72,12 +84,14 @@ class Written:
         return [path for path, before in self._before.items() if before is not None]
 
     def undo(self) -> None:
-        """Everything as it was; a folder that was made stays."""
+        """Everything as it was."""
         for path, before in self._before.items():
             if before is None:
                 path.unlink(missing_ok=True)
-            else:
-                path.write_text(before, encoding="utf-8")
+            elif path.read_bytes() != before:
+                path.write_bytes(before)
+        for folder in self._folders:  # the innermost first
+            folder.rmdir()
 
 
 def _read(path: Path) -> str:

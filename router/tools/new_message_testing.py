@@ -48,11 +48,18 @@ def _test(message: NewMessage, site: Site) -> Iterator[str]:
     yield f"    case: {message.case}"
     yield f"    from: {message.board}"
     fields = _flow({field.name: _sample(field.type, place, site) for place, field in enumerate(message.fields)})
-    yield from textwrap.wrap(f"    fields: {fields}", WIDEST - 2, subsequent_indent=" " * 13, break_on_hyphens=False)
+    yield from _wrapped(f"    fields: {fields}", " " * 13)
     yield "  expect:"
     if told:
         yield f"    sent: {told[0] if len(told) == 1 else '[' + ', '.join(told) + ']'}"
     yield f"    published: {{{message.case}: unchanged}}"
+
+
+def _wrapped(text: str, indent: str) -> Iterator[str]:
+    """On several lines if it is long; a name and its value stay on one."""
+    together = text.replace(": ", ":\0")
+    for line in textwrap.wrap(together, WIDEST - 2, subsequent_indent=indent, break_on_hyphens=False):
+        yield line.replace("\0", " ")
 
 
 def _flow(values: Mapping[str, str]) -> str:

@@ -82,6 +82,11 @@ def test_the_tests_of_the_rover_pass_and_cover_its_table_completely(
         ("hands_over_to: [arm_ctrl, arm_target]", "hands_over_to: [arm_ctrl]"),
         ("total_count: count", "total_count: index"),
         ("index: index", "index: count"),
+        ("if hdop > 0 and", "if hdop >= 0 and"),
+        ("and vdop > 0", "and vdop > 1"),
+        ("  pump_info:\n", "  pump_info:\n    ttl: 100ms\n"),
+        ("  control_mode:\n", "  control_mode:\n    ttl: 100ms\n"),
+        ("destinations: [basestation]", "destinations: [{endpoint: basestation, max_rate: 10}]"),
     ],
 )
 def test_whatever_is_changed_in_the_table_some_test_notices(rover: Path, old: str, new: str) -> None:

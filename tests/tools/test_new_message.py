@@ -11,8 +11,10 @@ from pathlib import Path
 import pytest
 
 import router.assets
+import router.cli.new
 from router.assets import asset
-from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+from router.cli import BAD_TABLE, BAD_USAGE, INTERRUPTED, OK, main
+from router.compiler import Checked
 
 RADIATION = ("SensorBoardRadiationInfo", "--number", "27", "--board", "sensor")
 FIELDS = ("--fields", "dose_rate:float # microsievert per hour", "state:SensorState status:SensorStatus")
@@ -215,6 +217,12 @@ def test_a_table_beside_that_routes_in_its_own_way_is_left_to_a_person(
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "on:bool"), "take another name"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool b:bool # both"), "belongs to one field"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool a:float"), "there are 2 fields 'a'"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "double:float"), "'double' is a word of C or C++"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "is:State"), "'is' is no name of a field"),
+        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:string"), "there are bool, float, double,"),
+        (("SensorBoardSwitch", "27", "sensor"), "'switch' is a word of C or C++"),
+        (("SensorBoardOn", "27", "sensor"), "'on' is no text to readers of YAML"),
+        (("SensorBoardNull", "27", "sensor"), "'null' is no text to readers of YAML"),
         (("SensorBoardRadiationInfo", "27", "sensor", "--fields", " "), "--fields names no field"),
     ],
 )
@@ -225,6 +233,74 @@ def test_what_cannot_be_is_refused_and_nothing_is_written(
     name, number, board, *rest = words
     assert main(["new", name, "--number", number, "--board", board, *rest]) == BAD_USAGE
     assert why in capsys.readouterr().err
+    assert contents(site) == before
+
+
+def test_a_type_that_several_messages_have_is_to_be_said_whose(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("Left", "Right"):
+        text = f'syntax = "proto3";\nmessage {name} {{\n  enum Side {{ {name.upper()} = 0; }}\n}}\n'
+        (site / f"protos/{name.lower()}.proto").write_text(text, encoding="utf-8")
+    assert main(["new", *RADIATION, "--fields", "side:Side"]) == BAD_USAGE
+    assert "several types are called 'Side'; write which for 'side': Left.Side, Right.Side" in capsys.readouterr().err
+    assert main(["new", *RADIATION, "--fields", "side:Left.Side"]) == OK
+
+
+def test_files_keep_their_ends_of_lines(site: Path) -> None:
+    files = [site / "routes/rover.yaml", site / "routes/rover.test.yaml", site / "routes/legacy.yaml"]
+    for path in files:
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    assert main(["new", *RADIATION]) == OK
+    for path in files:
+        assert path.read_bytes().count(b"\n") == path.read_bytes().count(b"\r\n")
+    assert main(["test", "routes"]) == OK
+
+
+def test_a_name_and_its_value_stay_on_one_line_of_the_test(site: Path) -> None:
+    before = contents(site)
+    fields = " ".join(f"a_quite_long_name_{number}:SensorState" for number in range(6))
+    assert main(["new", *RADIATION, "--fields", fields]) == OK
+    lines = [line for line in added(before, contents(site))["routes/rover.test.yaml"] if "quite" in line]
+    assert len(lines) > 1
+    assert not any(line.endswith(":") for line in lines)
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), KeyboardInterrupt()])
+@pytest.mark.parametrize("ending", [".proto", "rover.test.yaml"])
+def test_what_is_interrupted_is_taken_back(
+    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, ending: str
+) -> None:
+    before, folders = contents(site), set(site.rglob("*"))
+    really = Path.write_text
+
+    def write_text(path: Path, *args: str, **kwargs: str) -> int:
+        if path.name.endswith(ending) and path.resolve().is_relative_to(site):
+            if isinstance(error, OSError):
+                error.filename = str(path)
+            raise error
+        return really(path, *args, **kwargs)
+
+    monkeypatch.setattr(Path, "write_text", write_text)
+    words = ["new", "ContainerBoardRadiationInfo", "--number", "27", "--board", "container"]
+    if isinstance(error, OSError):
+        assert main(words) == BAD_USAGE
+        assert "cannot be written: Permission denied" in capsys.readouterr().err
+    else:
+        assert main(words) == INTERRUPTED
+    assert contents(site) == before
+    assert set(site.rglob("*")) == folders
+
+
+def test_what_is_interrupted_while_it_is_checked_is_taken_back(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = contents(site)
+    really = router.cli.new._check
+
+    def check(table: Path) -> list[Checked]:
+        if contents(site) != before:
+            raise KeyboardInterrupt
+        return really(table)
+
+    monkeypatch.setattr(router.cli.new, "_check", check)
+    assert main(["new", *RADIATION]) == INTERRUPTED
     assert contents(site) == before
 
 
