@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import socket
 import time
 from contextlib import suppress
 from itertools import cycle, islice
@@ -31,7 +32,7 @@ def wait_until_watching(place: Site, client: FoxgloveClient) -> int:
 
 def test_a_client_sees_what_arrives_and_routing_goes_on_without_it(tmp_path: Path) -> None:
     with site(tmp_path) as place:
-        port = free_port()
+        port = free_port(kind=socket.SOCK_STREAM)
         table = place.table(ROVER + f"\nfoxglove:\n  address: 127.0.0.1:{port}\n")
         with RouterProcess(tmp_path, table) as router:
             samples = list(islice(cycle(generated("imu_info")), MANY))

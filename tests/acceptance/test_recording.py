@@ -30,7 +30,7 @@ endpoints:
   manual_drive:
     source: basestation
     destinations: [driving_board]
-    ttl: 200ms
+    ttl: 10s
     deadman: {{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}, to: [driving_board]}}
 """
 DRIVE = b"\xc2\x01\x00"

@@ -8,6 +8,7 @@ import os
 import pty
 import re
 import select
+import socket
 import struct
 import subprocess
 import sys
@@ -71,7 +72,7 @@ def test_the_address_is_that_of_the_table(served: str, tmp_path: Path, capsys: p
 
 
 def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top", "--url", f"127.0.0.1:{free_port()}"]) == 1
+    assert main(["top", "--url", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"]) == 1
     assert re.fullmatch(r"router top: no metrics at http://127\.0\.0\.1:\d+/metrics: .*\n", capsys.readouterr().err)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from websockets.sync.client import ClientConnection, connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-PATIENCE = 10.0
+PATIENCE = 30.0
 """Seconds after which what a test waits for is taken to never come."""
 
 
@@ -46,7 +46,7 @@ class Browser:
             assert time.monotonic() < until, "the browser does not start"
             time.sleep(0.05)
         port, path = file.read_text(encoding="ascii").splitlines()
-        return connect(f"ws://127.0.0.1:{port}{path}", max_size=None, proxy=None)
+        return connect(f"ws://127.0.0.1:{port}{path}", max_size=None, proxy=None, open_timeout=PATIENCE)
 
     def call(self, method: str, session: str | None = None, /, **parameters: Any) -> dict[str, Any]:
         """The answer to one command. What happens meanwhile is kept in `events`."""
