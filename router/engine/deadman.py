@@ -13,9 +13,10 @@ from router.engine.outcome import Report
 Feed = Callable[[int], None]
 """Hears of a command that is about to be sent, at a time of the monotonic clock in ns."""
 
-
 FeedMaker = Callable[[str, Sequence[str]], Feed]
 """Makes of a route's name, and of the names in TargetPlan.deadmen, the call that tells all these deadmen at once."""
+
+_NEVER = 1 << 63
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,12 +90,12 @@ class Deadman:
         earlier._destinations = [each for each in earlier._destinations if (each.endpoint, each.send) not in ours]
         if earlier.next_due is None:
             return
+        due, earlier.next_due = earlier.next_due, _NEVER  # it does nothing any more but end
         if self.next_due is not None:  # it has heard of a command already, which was a later one
             earlier._release()
             return
-        self._tripped = earlier._tripped
-        later = 0 if self._tripped else self._plan.timeout - earlier._plan.timeout
-        self.next_due = earlier.next_due + later
+        self._tripped, now, then = earlier._tripped, earlier._plan, self._plan
+        self.next_due = due + (then.repeat - now.repeat if self._tripped else then.timeout - now.timeout)
 
     def due(self, now: int) -> None:
         due, repeat = self.next_due, self._plan.repeat

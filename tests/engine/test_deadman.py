@@ -246,3 +246,29 @@ def test_served_at_any_time_it_neither_speaks_too_soon_nor_twice_for_one_repeat(
         slot = (now - fed - TIMEOUT) // REPEAT
         earlier = [(time - fed - TIMEOUT) // REPEAT for time in watched.times()[:before] if time > fed]
         assert sent == ([] if slot in earlier else [now])
+
+
+def succession(before: Watched, plan: DeadmanPlan) -> Watched:
+    """One whose endpoints are the same but for the arm board, and which takes the place of `before`."""
+    after = Watched(plan)
+    after.deadman._destinations[0] = before.deadman._destinations[0]
+    after.deadman.inherit(before.deadman)
+    return after
+
+
+def test_one_that_was_replaced_trips_no_more_and_has_its_last_word_where_the_other_has_none() -> None:
+    before = Watched()
+    before.feed(0)
+    succession(before, PLAN)
+    before.run(10 * TIMEOUT)
+    assert (before.sent, before.count("deadman_active"), before.count("deadman_trips")) == ([], 0, 0)
+    before.deadman.end(10 * TIMEOUT)
+    assert [endpoint for _, endpoint, _ in before.sent] == ["arm_board"]
+
+
+def test_one_that_tripped_hands_on_when_it_sent_last() -> None:
+    before = Watched()
+    before.feed(0)
+    before.run(TIMEOUT)
+    after = succession(before, DeadmanPlan("drive", 10 * TIMEOUT, REPEAT // 4, PLAN.datagrams))
+    assert after.deadman.next_due == TIMEOUT + REPEAT // 4
