@@ -26,7 +26,7 @@ def stanza_at(lines: Sequence[str], first: int) -> Stanza:
     """That whose key is in the line `first`. What stands above the next key belongs to that."""
     indent = _indent(lines[first])
     end = first + 1
-    while end < len(lines) and (_says_nothing(lines[end]) or _indent(lines[end]) > indent):
+    while end < len(lines) and (_says_nothing(lines[end]) or _is_below(lines[end], indent)):
         end += 1
     while _says_nothing(lines[end - 1]):
         end -= 1
@@ -47,6 +47,12 @@ def aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
     width = max((len(code) for code, comment in rows if comment), default=0) + _COMMENT_GAP
     for code, comment in rows:
         yield f"{code:{width}}{mark} {comment}" if comment else code
+
+
+def _is_below(line: str, indent: int) -> bool:
+    """A list, and what closes a brace, may stand as far left as their key, or further."""
+    is_item = line.lstrip().startswith("- ") and _indent(line) == indent
+    return _indent(line) > indent or is_item or line.lstrip()[0] in "]}"
 
 
 def _says_nothing(line: str) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from router.errors import Severity, SourceSpan, TableError
@@ -20,7 +20,8 @@ from router.types.lock import check_lock, extended_lock
 from router.types.lock_file import LOCK_NAME, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 
-_IMPORT = re.compile(r'import "(.*)";')
+_IMPORT = re.compile(r'\s*import\s+(?:public\s+)?"(.*)"\s*;')
+_HEAD = re.compile(r"\s*(syntax|package)\b")
 
 
 def proto_texts(message: NewMessage, site: Site) -> Mapping[str, str]:
@@ -70,9 +71,14 @@ def _in_envelope(text: str, message: NewMessage, site: Site) -> str:
     lines[end + 1 : end + 1] = [own] if is_of_same_board else ["", f"{indent}// {message.board_words}", own]
     imports = {index: found[1] for index, line in enumerate(lines) if (found := _IMPORT.match(line))}
     new = site.new_file(message)
-    place = next((index for index, name in imports.items() if name > new), max(imports, default=0) + 1)
+    place = next((index for index, name in imports.items() if name > new), max(imports, default=_head(lines)) + 1)
     lines.insert(place, f'import "{new}";')
     return "\n".join(lines)
+
+
+def _head(lines: Sequence[str]) -> int:
+    """The last line before which there can be no import."""
+    return max((index for index, line in enumerate(lines) if _HEAD.match(line)), default=-1)
 
 
 def _locked(texts: Mapping[str, str], site: Site) -> str:

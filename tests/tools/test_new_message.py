@@ -245,6 +245,35 @@ def test_a_type_that_several_messages_have_is_to_be_said_whose(site: Path, capsy
     assert main(["new", *RADIATION, "--fields", "side:Left.Side"]) == OK
 
 
+@pytest.mark.parametrize(
+    "stanza",
+    [
+        "pump_info: {\n    source: sensor_board, destinations: [basestation],\n    topics: []\n  }\n",
+        "pump_info: {source: sensor_board, topics: [\n  ], destinations: [basestation]\n}\n",
+        "pump_info:\n  - source: sensor_board\n    destinations: [basestation]\n",
+    ],
+)
+def test_the_route_goes_below_one_that_is_laid_out_in_another_way(site: Path, stanza: str) -> None:
+    path = site / "routes/rover.yaml"
+    text = path.read_text(encoding="utf-8")
+    start = text.index("pump_info:")
+    end = text.index("  # ---- driving board", start)
+    path.write_text(f"{text[:start]}{stanza}\n{text[end:]}", encoding="utf-8")
+    (site / "routes/rover.test.yaml").unlink()
+    assert main(["new", *RADIATION]) == OK
+    assert f"{stanza}\n{ROUTE}" in path.read_text(encoding="utf-8")
+
+
+def test_the_import_goes_where_imports_go(site: Path) -> None:
+    path = site / "protos/components/common/envelope.proto"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('import "', 'import  "'), encoding="utf-8")
+    assert main(["new", *RADIATION]) == OK
+    lines = path.read_text(encoding="utf-8").splitlines()
+    place = lines.index('import "components/sensor_board/radiation.proto";')
+    assert lines[place - 1].startswith('import  "components/sensor_board/')
+
+
 def test_files_keep_their_ends_of_lines(site: Path) -> None:
     files = [site / "routes/rover.yaml", site / "routes/rover.test.yaml", site / "routes/legacy.yaml"]
     for path in files:
