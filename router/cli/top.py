@@ -53,9 +53,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _look(url: str) -> Snapshot:
-    from router.tools.live import metrics_text, parse_metrics
+    from router.tools.live import parse_metrics
+    from router.tools.running_router import metrics
 
-    return parse_metrics(metrics_text(url), time.time())
+    return parse_metrics(metrics(url), time.time())
 
 
 def _show_once(url: str, order: Order, interval: float) -> None:

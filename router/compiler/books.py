@@ -105,6 +105,9 @@ GATEWAY_DROP_REASONS: Mapping[str, str] = {
 }
 """Why no client of a gateway got a ROS message, with what each means."""
 
+INTENDED_REASONS = frozenset({"rate_limited", "ignored"})
+"""Drops and rejections that do what the table says: nobody has to be told of them."""
+
 INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 """Those of DROP_REASONS for which a client's message is not published."""
 
@@ -177,7 +180,9 @@ class Books:
 
     def continued(self) -> Books:
         """Books for the program that comes next, in which nothing is current yet. These here stay as they are."""
-        return Books(self._slots.copy(), set(), {length: starts.copy() for length, starts in self._free.items()}, self._size)
+        return Books(
+            self._slots.copy(), set(), {length: starts.copy() for length, starts in self._free.items()}, self._size
+        )
 
     def slot(self, metric: str, *labels: str) -> int:
         declared = _BY_NAME[metric]

@@ -6,13 +6,12 @@ import enum
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from router.compiler.books import INTENDED_REASONS
 from router.edges.diagnostics_look import SEEN, Rest, Situation
 from router.table.model import Endpoint
 
 ERRORS = frozenset({"send_error", "publish_error"})
 """Drop reasons that say that something is broken."""
-INTENDED = frozenset({"rate_limited", "ignored"})
-"""Drop and reject reasons that do what the table says."""
 
 
 class Level(enum.IntEnum):
@@ -58,7 +57,7 @@ def warning(text: str) -> Finding:
 
 def rejections(seen: Situation, listener: str) -> list[Finding]:
     grown = seen.grown("datagrams_rejected", listener)
-    return [warning(f"rejected {n}: {reason}") for (reason,), n in grown if reason not in INTENDED]
+    return [warning(f"rejected {n}: {reason}") for (reason,), n in grown if reason not in INTENDED_REASONS]
 
 
 def drops(grown: Iterable[tuple[Rest, int]]) -> list[Finding]:
@@ -66,7 +65,7 @@ def drops(grown: Iterable[tuple[Rest, int]]) -> list[Finding]:
     return [
         Finding(Level.ERROR if reason in ERRORS else Level.WARN, f"dropped {n} for {target}: {reason}")
         for (target, reason), n in grown
-        if reason not in INTENDED
+        if reason not in INTENDED_REASONS
     ]
 
 

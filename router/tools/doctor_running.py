@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from time import time
 
-from prometheus_client.parser import text_string_to_metric_families
-
+from router.compiler.books import INTENDED_REASONS
 from router.compiler.program import Program
 from router.errors import TransportError
 from router.table.model import RouteTable
 from router.tools.doctor_report import Finding, fine, problem, warning
-from router.tools.live import Snapshot, parse_metrics, scrape
+from router.tools.live import Snapshot, parse_metrics
+from router.tools.running_router import metrics, url_of
 
 _SHOWN = 3
 """Targets that are named for each reason of losses."""
@@ -25,7 +25,6 @@ class Health:
 
     table: RouteTable
     snapshot: Snapshot
-    sha256: str
     now: float
 
     def findings(self) -> Iterator[Finding]:
@@ -37,7 +36,7 @@ class Health:
             yield problem(
                 "router", "its last reload changed nothing, for the table had errors", "router validate, router reload"
             )
-        elif self.sha256 != self.table.sha256:
+        elif self.snapshot.table_sha256 != self.table.sha256:
             yield warning("router", "it runs another table than this file", "router reload, or systemctl restart")
 
     def _silent(self) -> Iterator[Finding]:
@@ -67,7 +66,7 @@ class Health:
                 )
         lost: dict[str, list[tuple[float, str]]] = defaultdict(list)
         for (route, target, reason), count in self.snapshot.counts("messages_dropped").items():
-            if count and reason != "rate_limited":
+            if count and reason not in INTENDED_REASONS:
                 lost[reason].append((count, f"{count:.0f} of {route} for {target}"))
         for reason, each in lost.items():
             worst = [text for _, text in sorted(each, reverse=True)[:_SHOWN]]
@@ -103,14 +102,8 @@ def health(program: Program) -> Health | None:
     if table.metrics is None:
         return None
     try:
-        text = scrape(table.metrics.value)
+        text = metrics(url_of(table))
     except TransportError:
         return None
     snapshot = parse_metrics(text, time())
-    return Health(table, snapshot, _running_table(text), snapshot.at) if snapshot.values else None
-
-
-def _running_table(text: str) -> str:
-    """Its checksum; none where the router does not tell."""
-    samples = (sample for family in text_string_to_metric_families(text) for sample in family.samples)
-    return next((sample.labels["table_sha256"] for sample in samples if sample.name == "router_build_info"), "")
+    return Health(table, snapshot, snapshot.at) if snapshot.values else None

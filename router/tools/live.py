@@ -1,24 +1,18 @@
 """A running router seen from outside: the text of /metrics into rates and rows, one for each route.
 
-Knows the metrics' names from the books and nothing of who shows the rows (see `live_view`).
+Knows the metrics' names from the books; not where the text comes from (`running_router`), nor who shows the rows
+(`live_view`).
 """
 
 from __future__ import annotations
 
-import http.client
-import urllib.request
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from prometheus_client.parser import text_string_to_metric_families
 
 from router.compiler.books import METRICS
-from router.errors import TransportError
-from router.table.model import Address
-
-SCRAPE_TIMEOUT = 2.0
-"""Seconds; a router on this machine answers in milliseconds."""
 
 Labels = tuple[str, ...]
 Counts = Mapping[Labels, float]
@@ -33,10 +27,12 @@ _LABELS |= {f"{metric.name}{BUCKETS}": (*metric.labels, "le") for metric in METR
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """The router's metrics at one time. `at` in seconds of any clock; values by the books' metric name
-    and label values, both as the books order them."""
+    and label values, both as the books order them. `table_sha256` tells which table it ran, empty where that is not
+    told."""
 
     at: float
     values: Mapping[str, Counts]
+    table_sha256: str = ""
 
     def counts(self, metric: str) -> Counts:
         return self.values.get(metric, {})
@@ -84,31 +80,18 @@ class View:
     kernel_drops: int
 
 
-def scrape(address: Address) -> str:
-    """The text of a router's metrics. Raises TransportError when nobody answers there."""
-    return metrics_text(f"http://{address}")
-
-
-def metrics_text(base: str) -> str:
-    """The same of what serves HTTP at `base`, a URL or just host and port."""
-    url = f"{base.rstrip('/')}/metrics" if "://" in base else f"http://{base}/metrics"
-    try:
-        with urllib.request.urlopen(url, timeout=SCRAPE_TIMEOUT) as answer:  # noqa: S310 - whoever says where says how
-            text: str = answer.read().decode()
-    except (OSError, ValueError, http.client.HTTPException) as error:
-        raise TransportError(f"no metrics at {url}: {error}") from error
-    return text
-
-
 def parse_metrics(text: str, at: float) -> Snapshot:
     """The router's own series out of the Prometheus text format."""
     values: dict[str, dict[Labels, float]] = defaultdict(dict)
+    table_sha256 = ""
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
             name = sample.name.removeprefix("router_").removesuffix("_total")
             if name in _LABELS:
                 values[name][tuple(sample.labels[label] for label in _LABELS[name])] = sample.value
-    return Snapshot(at, values)
+            elif name == "build_info":
+                table_sha256 = sample.labels.get("table_sha256", "")
+    return Snapshot(at, values, table_sha256)
 
 
 def view(before: Snapshot, after: Snapshot) -> View:
@@ -122,21 +105,6 @@ def view(before: Snapshot, after: Snapshot) -> View:
         rejected=_by_last_label(after.counts("datagrams_rejected")),
         kernel_drops=_total(after, "kernel_drops"),
     )
-
-
-class Window:
-    """Snapshots of the last seconds: over a short time, one message in two seconds is no rate but a flicker."""
-
-    def __init__(self, seconds: float = 3.0) -> None:
-        self._seconds = seconds
-        self._snapshots: deque[Snapshot] = deque()
-
-    def add(self, newest: Snapshot) -> View:
-        """Totals as of `newest`, rates over the window; the first snapshot alone has rates of 0."""
-        while len(self._snapshots) > 1 and newest.at - self._snapshots[1].at >= self._seconds:
-            self._snapshots.popleft()
-        self._snapshots.append(newest)
-        return view(self._snapshots[0], newest)
 
 
 def _route_row(route: str, before: Snapshot, after: Snapshot) -> RouteRow:

@@ -1,4 +1,4 @@
-"""A running router as another process meets it: its HTTP address, what it can be asked to do, and its tap.
+"""A running router as another process meets it: its HTTP address, its metrics, what it can be told to do, and its tap.
 
 Knows the address and the form of the answers; what is in a datagram is for whoever asks.
 """
@@ -49,6 +49,16 @@ def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
         except ValueError:
             raise TransportError(f"{url}{path}: {response.status} {_first_line(text)}") from None
         return Answer(response.status == http.client.OK, said)
+
+
+def metrics(url: str) -> str:
+    """The text of /metrics. Raises TransportError where nobody answers, or something else than a router."""
+    with closing(_connection(url, PATIENCE)) as connection:
+        response = _asked(connection, url, "GET", "/metrics")
+        text = _read(response, url)
+        if response.status != http.client.OK:
+            raise TransportError(f"{url}/metrics: {response.status} {_first_line(text)}")
+        return text.decode(errors="replace")
 
 
 @contextmanager

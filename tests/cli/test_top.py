@@ -73,7 +73,7 @@ def test_the_address_is_that_of_the_table(served: str, tmp_path: Path, capsys: p
 
 def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top", "--url", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"]) == 1
-    assert re.fullmatch(r"router top: no metrics at http://127\.0\.0\.1:\d+/metrics: .*\n", capsys.readouterr().err)
+    assert re.fullmatch(r"router top: no router answers at 127\.0\.0\.1:\d+: .*\n", capsys.readouterr().err)
 
 
 def read_until(terminal: int, wanted: str, seen: str = "") -> str:

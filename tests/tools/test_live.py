@@ -1,15 +1,6 @@
 from __future__ import annotations
 
-import http.server
-import socket
-import threading
-from collections.abc import Iterator
-
-import pytest
-
-from router.errors import TransportError
-from router.table.model import Address
-from router.tools.live import Snapshot, Window, parse_metrics, scrape, view
+from router.tools.live import Snapshot, parse_metrics, view
 
 METRICS = """\
 # HELP router_datagrams_received_total Datagrams taken from the listener's socket.
@@ -35,6 +26,8 @@ router_messages_dropped_total{route="imu_info",target="basestation",reason="stal
 router_messages_filtered_total{route="imu_info",target="imu_data"} 4
 # TYPE python_info gauge
 python_info{version="3.12"} 1
+# TYPE router_build_info gauge
+router_build_info{version="1.0",table_sha256="abc",protos_sha256="def"} 1
 """
 
 
@@ -67,38 +60,6 @@ def test_a_router_that_was_started_anew_has_no_negative_rate() -> None:
     assert view(snapshot(0, 1000), snapshot(2, 10)).routes[0].rate == 5.0
 
 
-def test_a_window_gives_rates_over_its_last_seconds_only() -> None:
-    window = Window(seconds=3.0)
-    rates = [window.add(snapshot(at, imu)).routes[0].rate for at, imu in ((0, 0), (1, 10), (2, 20), (3, 60), (5, 140))]
-    assert rates == [0.0, 10.0, 10.0, 20.0, 40.0]
-
-
-@pytest.fixture
-def metrics_address() -> Iterator[Address]:
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200 if self.path == "/metrics" else 404)
-            self.end_headers()
-            self.wfile.write(b"# nothing yet\n")
-
-        def log_message(self, *args: object) -> None:
-            """Quiet."""
-
-    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield Address("127.0.0.1", server.server_address[1])
-        server.shutdown()
-        thread.join()
-
-
-def test_metrics_are_scraped_over_http(metrics_address: Address) -> None:
-    assert scrape(metrics_address) == "# nothing yet\n"
-
-
-def test_a_router_that_does_not_answer_is_a_network_fault() -> None:
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))
-        address = Address(*nobody.getsockname())
-        with pytest.raises(TransportError, match=f"no metrics at http://{address}/metrics"):
-            scrape(address)
+def test_which_table_ran_is_told_with_the_numbers() -> None:
+    assert snapshot(0, 0).table_sha256 == "abc"
+    assert parse_metrics("", 0).table_sha256 == ""
