@@ -17,6 +17,7 @@ import pytest
 from router.compiler import check_table
 from router.edges.receiver import ReceiveThread
 from router.runtime import Router
+from router.runtime.edges import Edges
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
 
@@ -326,3 +327,60 @@ def test_a_gateway_keeps_its_clients_unless_it_changes_itself(site: Site) -> Non
 
 def client_count(router: Router) -> int:
     return int(sum(value for name, _, value in router.samples() if name == "router_gateway_clients"))
+
+
+def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = (
+        "  ph_info: {{source: sensor_board, destinations: [{{endpoint: basestation, keep: latest, max_rate: {}}}]}}\n"
+    )
+    with site.router(held.format(0.001)) as router:
+        site.send(*map(numbered, range(2)))
+        wait_until(lambda: router.total("datagrams_received") >= 2)
+        finish = Edges._finish
+
+        def finish_late(edges: Edges, *args: object) -> None:
+            site.send(numbered(2))
+            wait_until(lambda: router.total("datagrams_received") >= 3)
+            finish(edges, *args)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(Edges, "_finish", finish_late)
+        site.write(held.format(1000))
+        assert router.reload().ok
+        assert [site.basestation.recv(1000) for _ in range(3)] == [numbered(number) for number in range(3)]
+
+
+def test_what_waits_for_a_budget_is_counted_when_its_route_goes(site: Site) -> None:
+    board = f'  slow: {{address: "127.0.0.1:{site.basestation.getsockname()[1]}", kind: tool, budget: 1 kB/s}}\n'
+    others = "  pump_info: {source: sensor_board, destinations: [slow]}\n"
+    slow = PH.replace("basestation", "slow") + others
+    program = check_table(site.write(slow, endpoints=board)).program
+    assert program is not None
+    with Router(program) as router:
+        site.send(*map(numbered, range(200)))
+        wait_until(lambda: router.total("datagrams_received") >= 200)
+        site.write(others, endpoints=board)
+        assert router.reload().ok
+        assert router.total("datagrams_sent") == 200
+    site.take()
+    assert site.received == list(range(200))
+
+
+def test_what_a_gateway_let_in_is_stopped_when_a_reload_ends_that(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateway = f"""\
+gateways:
+  operator:
+    transport: {{tcp: 127.0.0.1:{port}}}
+    format: json_lines
+    inbound:
+      - topic: word
+        type: std_msgs/msg/Bool
+        deadman: {{timeout: 1h, send: {{data: false}}}}
+"""
+    with site.router(PH + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
+        wait_until(lambda: router.total("messages_published") == 1)
+        site.write(PH)
+        assert router.reload().ok
+        assert router.total("deadman_datagrams_sent") == 1

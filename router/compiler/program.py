@@ -6,8 +6,9 @@ binds it to those.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from types import CodeType
 
 from router.compiler.books import Books
@@ -172,6 +173,10 @@ class Program:
     ignored: frozenset[int]
     protos: ProtoSchema
     gateways: tuple[GatewayPlan, ...] = ()
+
+    @property
+    def handlers(self) -> Iterator[Handler]:
+        return chain.from_iterable((*self.inbound.values(), *self.outbound.values()))
 
     @property
     def protos_sha256(self) -> str:

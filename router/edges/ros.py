@@ -142,6 +142,8 @@ class RosEdge:
 
         `incompatible` is told of all peers again, for those who have named the topics since.
         """
+        for topic in self.publish.keys() - self._publications.keys():
+            del self.publish[topic], self.wanted[topic]
         if change.left or change.opened:
             self._events.stop()
             for opened in change.left:
@@ -155,8 +157,6 @@ class RosEdge:
         self._publications, self._subscriptions = change.publications, change.subscriptions
         self.publish.update((topic, each.publish) for topic, each in change.publications.items())
         self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
-        for topic in self.publish.keys() - change.publications.keys():
-            del self.publish[topic], self.wanted[topic]
 
     def _receive(self, receive: Mapping[str, Receive]) -> None:
         if self._messages is None:

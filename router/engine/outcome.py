@@ -17,6 +17,10 @@ MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, Mapp
 _FULL = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
 
 
+Place = tuple[str, str]
+"""A route, and which of its targets."""
+
+
 @dataclass(frozen=True, slots=True)
 class Report:
     """Something was lost. `kind` is `drop` (one target), `reject` (a whole datagram) or `deadman` (what one sent).
@@ -41,6 +45,7 @@ class Outcome:
     def __init__(
         self, books: Books, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
     ) -> None:
+        self.place: Place = route, target.target
         self._counts = counts
         self._route = route
         self._target = target.target

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from typing import NamedTuple
 
 from router.engine.delivery import Deliver, immediately, is_stale
 from router.engine.limiter import NS
 from router.engine.machine import Machine
-from router.engine.outcome import Outcome
+from router.engine.outcome import Outcome, Place
 from router.table.model import Priority
 
 BURST = NS // 50
@@ -92,6 +92,15 @@ class Pacer(Machine):
         for lane in self._lanes.values():
             while lane.waiting:
                 self._send_first(lane, now)
+
+    def serve_only(self, now: int, places: Container[Place]) -> None:
+        """Sends what waits for other targets, whatever the budget: later, nobody would count it."""
+        for lane in self._lanes.values():
+            for _ in range(len(lane.waiting)):
+                if lane.waiting[0].outcome.place in places:
+                    lane.waiting.rotate(-1)
+                else:
+                    self._send_first(lane, now)
 
     def _send_first(self, lane: _Lane, now: int) -> None:
         outcome, send, data, expires = lane.waiting.popleft()

@@ -116,18 +116,16 @@ class Edges:
                 self._receiving.finish(listener)
             if self._ros is not None and change.topics is not None:
                 self._ros.apply(change.topics, change.wiring.take)
-            if self.wiring is not None:
-                change.wiring.inherit(self.wiring, self._around.keepers.deadman)
+            change.wiring.succeed(self.wiring, self._around.keepers)
             self.wiring = change.wiring
             self.sockets.apply(change.sockets)
             self._receiving.serve(list(self.sockets.listeners.values()), self._teed())
 
     def _finish(self, change: Change, earlier: Wiring | None) -> None:
-        """Ends what the earlier program had for itself, and then closes what that used."""
+        """Closes what only the earlier program used."""
         if self.gateways is not None and change.gateways is not None:
             self._follow_drops(self.gateways, change.gateways)
             self.gateways.finish(change.gateways)
-        self._around.keepers.release(list(change.wiring.state.left()))
         change.wiring.state.settle()
         if self._ros is not None and change.topics is not None:
             self._ros.finish(change.topics)

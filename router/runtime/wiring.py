@@ -66,6 +66,7 @@ class Wiring:
     feed: FeedMaker
     state: State
     deadmen: Mapping[str, Deadman]
+    pacers: Mapping[str, Pacer]
     cuts: Sequence[Callable[[], None]]
 
     def forget(self) -> None:
@@ -73,12 +74,19 @@ class Wiring:
         for cut in self.cuts:
             cut()
 
-    def inherit(self, earlier: Wiring, keeper: Timekeeper) -> None:
-        """Each deadman with other settings than before takes its predecessor's place. Nobody else calls either."""
+    def succeed(self, earlier: Wiring | None, keepers: Keepers) -> None:
+        """Ends what only `earlier` had, while nothing is received: what waited is sent before anything that comes.
+
+        Each deadman with other settings than before takes its predecessor's place first.
+        """
         for route, deadman in self.deadmen.items():
-            before = earlier.deadmen.get(route)
+            before = earlier.deadmen.get(route) if earlier else None
             if before is not None and before is not deadman:
-                keeper.guard(deadman, deadman.inherit)(before)
+                keepers.deadman.guard(deadman, deadman.inherit)(before)
+        keepers.release(list(self.state.left()))
+        places = {(each.route, target.target) for each in self.program.handlers for target in each.targets}
+        for pacer in self.pacers.values():
+            keepers.pacing.guard(pacer, pacer.serve_only)(monotonic_ns(), places)
 
 
 def wire(
@@ -94,6 +102,7 @@ def wire(
     send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
     deadmen = _deadmen(program, around, send, ros, state)
     feed = feeder(deadmen, keepers.deadman.guard)
+    pacers = _pacers(program, keepers.pacing, send, state)
     outlets = Outlets(
         counts=accounts.receive,
         send=send,
@@ -106,7 +115,7 @@ def wire(
         collecting=Guarded(accounts.collecting, keepers.collecting.guard),
         feed=feed,
         publish_errors=ros.publish_errors if ros else (),
-        pacers=_pacers(program, keepers.pacing, send, state),
+        pacers=pacers,
         state=state,
     )
     inbound = Engine(program, outlets, {name: each.arrived_at for name, each in sockets.listeners.items()})
@@ -118,6 +127,7 @@ def wire(
         feed=feed,
         state=state,
         deadmen=deadmen,
+        pacers=pacers,
         cuts=(inbound.forget, outbound.forget),
     )
 
