@@ -129,7 +129,7 @@ def _ties(route: Route) -> Iterator[Tie]:
 
 
 def _condition(target: Destination | Topic) -> str:
-    words = [f"when {target.when.text}"] if target.when is not None else []
+    words = [f"when {' '.join(target.when.text.split())}"] if target.when is not None else []
     words += [f"at most {target.max_rate.value:g} Hz"] if target.max_rate is not None else []
     return ", ".join(words)
 

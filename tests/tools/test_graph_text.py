@@ -24,7 +24,7 @@ endpoints: {{a: {{address: "127.0.0.1:6000", kind: tool}}}}
 routes:
   imu_info:
     source: any
-    destinations: [{{endpoint: a, when: "str(state) != '\\"#<b>|\\\\\\\\'", max_rate: 5 Hz}}]
+    destinations: [{{endpoint: a, when: "str(state) != '\\"#<b>&lt;|\\\\\\\\'\\n and accel_x > 1\\n", max_rate: 5 Hz}}]
 """
 
 
@@ -57,3 +57,18 @@ def test_mermaid_has_a_line_for_every_part_and_tie(table: RouteTable) -> None:
     links = [line for line in lines if re.fullmatch(r'  n\d+ -->(\|"[^"#<>]*"\|)? n\d+', line)]
     assert (len(nodes), len(links)) == (len(parts), len(ties))
     assert len(lines) == 1 + 2 * 3 + len(parts) + len(ties)
+
+
+@pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")
+def test_a_condition_is_shown_as_it_is_written_on_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "hostile.yaml"
+    path.write_text(HOSTILE.format(protos=asset("protos")))
+    table = check_table(path).table
+    assert table is not None
+    drawn = subprocess.run([str(DOT), "-Tsvg"], input=dot(table, ""), capture_output=True, text=True, check=True)
+    assert "#&lt;b&gt;&amp;lt;|" in drawn.stdout
+    assert "and accel_x &gt; 1, at most 5 Hz" in html_unescaped_space(drawn.stdout)
+
+
+def html_unescaped_space(text: str) -> str:
+    return text.replace("&#160;", " ").replace("&#45;", "-")
