@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 from router.cli import DEFAULT_TABLE, OK, VERBS
 from router.cli.tool_options import explained, positive
@@ -17,8 +19,6 @@ if TYPE_CHECKING:
     from router.tools.top import Order
 
 ORDERS = ("table", "rate", "drops", "age", "latency")
-WINDOW = 3.0
-"""Seconds over which rates and latencies are told: over less, one message in two seconds is a flicker."""
 _DESCRIPTION = """Show each route of a running router: messages per second, where they went, what was dropped and why,
 the time since the last one, and how long routes took in the middle (p50) and at worst, but for one of 100 (p99). On a
 terminal it is shown again and again, and keys sort it."""
@@ -29,12 +29,23 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     where = parser.add_mutually_exclusive_group()
     table = "the table that it runs, for its metrics.address (default: %(default)s)"
     where.add_argument("table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help=table)
-    where.add_argument("--url", help="where it answers instead, as http://10.0.0.5:9108")
+    where.add_argument("--url", type=_url, help="where it answers instead, as http://10.0.0.5:9108")
     parser.add_argument(
         "--sort", choices=ORDERS, default=ORDERS[0], help="the largest first (default: as in the table)"
     )
     parser.add_argument("--interval", type=positive, default=1.0, metavar="SECONDS", help="(default: %(default)g)")
     parser.add_argument("--once", action="store_true", help="show it once and end, as where there is no terminal")
+
+
+def _url(text: str) -> str:
+    try:
+        parts = urlsplit(text if "://" in text else f"http://{text}")
+        is_right = parts.scheme == "http" and parts.hostname and not re.search(r"\s", text) and parts.port != 0
+    except ValueError:  # no number for a port, half an IPv6 address
+        is_right = False
+    if not is_right:
+        raise argparse.ArgumentTypeError(f"'{text}' is not like http://127.0.0.1:9108")
+    return text
 
 
 @explained
@@ -56,7 +67,14 @@ def _look(url: str) -> Snapshot:
     from router.tools.live import parse_metrics
     from router.tools.running_router import metrics
 
-    return parse_metrics(metrics(url), time.time())
+    text = metrics(url)
+    try:
+        look = parse_metrics(text, time.time())
+    except (ValueError, KeyError) as error:
+        raise TransportError(f"what answers at {url}/metrics is no router") from error
+    if not look.values:
+        raise TransportError(f"what answers at {url}/metrics is no router: it has no metrics of one")
+    return look
 
 
 def _show_once(url: str, order: Order, interval: float) -> None:
@@ -81,7 +99,7 @@ def _show(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from router.tools.top import Order, top
+    from router.tools.top import Order, recent, top
     from router.tools.top_keys import Keys
     from router.tools.top_view import screen
 
@@ -93,7 +111,7 @@ def _show(url: str, order: Order, interval: float) -> None:
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 try:
-                    looks, note = [*_recent(looks), _look(url)], ""
+                    looks, note = recent([] if note else looks, _look(url)), ""
                 except TransportError as error:
                     note = str(error)
             shown = top(looks[0], looks[-1], time.time(), order)
@@ -103,10 +121,3 @@ def _show(url: str, order: Order, interval: float) -> None:
             except KeyboardInterrupt:
                 return
             order = orders.get(key, order)
-
-
-def _recent(looks: list[Snapshot]) -> list[Snapshot]:
-    """The last ones, of which the first is as old as the window, if there are so old ones."""
-    while len(looks) > 1 and looks[-1].at - looks[1].at >= WINDOW:
-        looks = looks[1:]
-    return looks

@@ -15,6 +15,10 @@ from router.tools.live import BUCKETS, Counts, RouteRow, Snapshot, View, view
 _HISTOGRAM = f"route_seconds{BUCKETS}"
 
 
+WINDOW = 3.0
+"""Seconds over which rates and latencies are told: over less, one message in two seconds is a flicker."""
+
+
 class Order(enum.Enum):
     """By what rows are sorted, and the key that chooses it. All but TABLE have the largest first."""
 
@@ -61,6 +65,23 @@ def top(before: Snapshot, after: Snapshot, now: float, order: Order = Order.TABL
     return Top(seen, ordered(rows, order), silence)
 
 
+def recent(looks: Sequence[Snapshot], look: Snapshot) -> list[Snapshot]:
+    """The looks from whose first to last rates are told, with one more: of one run of the router, and of WINDOW."""
+    kept = [*looks, look] if looks and not _is_of_another_run(looks[-1], look) else [look]
+    while len(kept) > 2 and kept[-1].at - kept[1].at >= WINDOW:
+        kept = kept[1:]
+    return kept
+
+
+def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
+    """What was counted once stays counted until the router starts anew."""
+    return any(
+        after.counts(metric).get(labels, 0.0) < count
+        for metric in ("datagrams_received", "messages_received")
+        for labels, count in before.counts(metric).items()
+    )
+
+
 def ordered(rows: Sequence[TopRow], order: Order) -> tuple[TopRow, ...]:
     """The largest first, what has no value last; those that are equal stay in the order of the table."""
     if order is Order.TABLE:
@@ -100,7 +121,7 @@ def _buckets(route: str, snapshot: Snapshot) -> dict[float, float]:
 def _since_then(before: Mapping[float, float], after: Mapping[float, float]) -> Mapping[float, float]:
     """What came in between; all that there was where nothing did, and where the router was started anew."""
     between = {bound: count - before.get(bound, 0.0) for bound, count in after.items()}
-    return between if between.get(math.inf, 0.0) > 0 else after
+    return between if between.get(math.inf, 0.0) > 0 and min(between.values()) >= 0 else after
 
 
 def quantile(counts: Mapping[float, float], part: float) -> float | None:

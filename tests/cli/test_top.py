@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from router.cli import OK, main
+from router.cli import BAD_USAGE, OK, main
 from tests.ports import free_port
 
 PATIENCE = 30.0
@@ -74,6 +74,25 @@ def test_the_address_is_that_of_the_table(served: str, tmp_path: Path, capsys: p
 def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top", "--url", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"]) == 1
     assert re.fullmatch(r"router top: no router answers at 127\.0\.0\.1:\d+: .*\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "text", [b"<html>hello</html>", b"", b'node_cpu{cpu="0"} 1\n', b'router_kernel_drops{a="b"} 1\n']
+)
+def test_what_is_no_router_is_said_in_a_line(
+    served: str, text: bytes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(f"{__name__}.METRICS", text)
+    assert main(["top", "--url", served, "--interval", "0.01"]) == 1
+    assert re.fullmatch(rf"router top: what answers at {served}/metrics is no router.*\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("url", ["http://a:99999", "http://[::1", "ftp://a", "http://", "http://a b:1", "a:port"])
+def test_what_is_no_address_is_wrong_usage(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["top", "--url", url])
+    assert ended.value.code == BAD_USAGE
+    assert f"'{url}' is not like http://127.0.0.1:9108" in capsys.readouterr().err
 
 
 def read_until(terminal: int, wanted: str, seen: str = "") -> str:

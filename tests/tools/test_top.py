@@ -9,7 +9,7 @@ from rich.console import Console
 
 from router.compiler.books import HISTOGRAM_BOUNDS_NS
 from router.tools.live import Snapshot
-from router.tools.top import Order, Top, quantile, top
+from router.tools.top import WINDOW, Order, Top, quantile, recent, top
 from router.tools.top_view import age_text, latency_text, page, screen
 
 BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
@@ -54,6 +54,28 @@ def test_latencies_are_those_between_the_snapshots() -> None:
     imu, gps = seen().rows
     assert [imu.median, imu.slowest] == pytest.approx([15e-6, 19.9e-6])
     assert [gps.median, gps.slowest] == pytest.approx([150e-6, 199e-6])
+
+
+def test_rates_are_told_over_a_window_of_one_run() -> None:
+    looks: list[Snapshot] = []
+    for second in range(10):
+        looks = recent(looks, snapshot(second, 10 * second, 0))
+    assert [looks[0].at, looks[-1].at] == [9 - WINDOW, 9]
+    looks = recent(looks, snapshot(10, 5, 0))
+    assert [look.at for look in looks] == [10]
+    looks = recent(looks, snapshot(11, 15, 0))
+    assert top(looks[0], looks[-1], NOW).rows[0].row.rate == 10
+
+
+def test_a_router_that_was_started_anew_has_no_latency_of_the_one_before() -> None:
+    before, after = snapshot(10, 0, 3), snapshot(12, 0, 0)
+    anew = {**after.values, "route_seconds_bucket": buckets("gps_info", 0, 0, 2, 2, 4)}
+    row = top(before, Snapshot(12, anew), NOW).rows[1]
+    assert row.slowest is not None
+    assert row.slowest > 0
+    shrunk = {**before.values, "route_seconds_bucket": buckets("gps_info", 5, 5, 5, 5, 5)}
+    grown = {**after.values, "route_seconds_bucket": buckets("gps_info", 0, 0, 0, 6, 6)}
+    assert top(Snapshot(10, shrunk), Snapshot(12, grown), NOW).rows[1].median == pytest.approx(75e-6)
 
 
 def test_without_new_messages_the_latency_of_all_is_told() -> None:
