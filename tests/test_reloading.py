@@ -384,3 +384,30 @@ gateways:
         site.write(PH)
         assert router.reload().ok
         assert router.total("deadman_datagrams_sent") == 1
+
+
+def test_files_that_go_while_they_are_read_change_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def vanished(*_: object) -> None:
+        raise FileNotFoundError(2, "No such file or directory", "components")
+
+    with site.router(PH) as router:
+        monkeypatch.setattr("router.runtime.reloading.check_table", vanished)
+        result = router.reload()
+        assert (result.ok, "components" in result.text) == (False, True)
+        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)
+
+
+def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with site.router(PH) as router:
+        pass
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as hearing:
+        hearing.bind(str(site.folder / "notify"))
+        hearing.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(site.folder / "notify"))
+        assert router.reload().text == "the router is not running"
+        with pytest.raises(BlockingIOError):
+            hearing.recv(1000)

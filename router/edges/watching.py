@@ -16,35 +16,44 @@ _Look = dict[Path, tuple[int, int, int]]
 
 
 class Watcher:
-    """Calls `changed` in a thread of its own when `files` are not what they were. Close it, but not from there."""
+    """Calls `changed` in a thread of its own when `files` are not what they were.
+
+    Closing it waits for nothing, for who closes it may be who `changed` waits for: it may be called once more.
+    `files` may raise OSError, as folders do that go while they are listed: then it looks again.
+    """
 
     def __init__(self, files: Callable[[], Iterable[Path]], changed: Callable[[], object]) -> None:
         self._files = files
         self._changed = changed
-        self._seen = _look(files())
+        self._seen = self._look()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         self._stopped.set()
-        if threading.current_thread() is not self._thread:
-            self._thread.join()
 
     def _run(self) -> None:
         before = self._seen
         while not self._stopped.wait(PERIOD):
-            now = _look(self._files())
-            if now == before and now != self._seen:
+            now = self._look()
+            if now is not None and now == before and now != self._seen:
                 logger.info("files of the table have changed: it is read again")
                 self._changed()
                 self._seen = now
-                after = _look(self._files())  # perhaps of other files: those are new, and have not changed
+                after = self._look() or now  # perhaps of other files: those are new, and have not changed
                 if now.items() & after.items() == {each for each in after.items() if each[0] in now}:
                     self._seen = after
                 before = after
             else:
                 before = now
+
+    def _look(self) -> _Look | None:
+        """None where it cannot be seen now."""
+        try:
+            return _look(self._files())
+        except OSError:
+            return None
 
 
 def watched_files(program: Program) -> list[Path]:

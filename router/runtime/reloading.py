@@ -5,7 +5,6 @@ Knows what came of it; how a program takes over, `edges` knows.
 
 from __future__ import annotations
 
-import gc
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
@@ -53,11 +52,12 @@ class Reloader:
 
     def reload(self) -> ReloadResult:
         """Raises nothing for a bad table, nor for what cannot be opened: then nothing changes."""
-        with self._one_at_a_time, background_threads(), beside_traffic(), reloading():
+        with self._one_at_a_time:
             if not self._is_open or self._edges.wiring is None:
                 return ReloadResult(False, (), "the router is not running")
             began = monotonic_ns()
-            kind, result = self._reload(self._edges.wiring.program)
+            with background_threads(), beside_traffic(), reloading():
+                kind, result = self._guarded(self._edges.wiring.program)
             self._count(kind)
             self._remember(is_good=result.ok)
             seconds = round((monotonic_ns() - began) / 1e9, 3)
@@ -66,7 +66,19 @@ class Reloader:
         log(event, result=result.text, findings=[str(finding) for finding in result.findings], seconds=seconds)
         return result
 
+    def _guarded(self, now: Program) -> tuple[str, ReloadResult]:
+        try:
+            return self._reload(now)
+        except (StartError, StuckError) as error:
+            return "failed", ReloadResult(False, (), str(error))
+        except OSError as error:  # files come and go while they are read, and descriptors may be short
+            return "failed", ReloadResult(False, (), f"the table cannot be read or opened now: {error}")
+        except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, must not end who asked
+            logger.critical("a fault in the router itself kept it from reloading; please report it", exc_info=error)
+            return "failed", ReloadResult(False, (), f"a fault in the router itself: {error!r}")
+
     def _reload(self, now: Program) -> tuple[str, ReloadResult]:
+        """Raises StartError, StuckError, and OSError for files that change meanwhile."""
         checked = check_table(now.table.path, self._environ, Definitions(now.protos))
         findings = checked.diagnostics
         then = checked.program_in(now.books.continued())
@@ -74,19 +86,9 @@ class Reloader:
             return "invalid", _refused(findings)
         if refused := unchangeable(now.table, then.table):
             return "invalid", _refused([*findings, *refused])
-        try:
-            change = self._edges.prepare(then)
-            self._edges.take_over(change)
-        except (StartError, StuckError) as error:
-            return "failed", ReloadResult(False, tuple(findings), str(error))
-        except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, must not end who asked
-            logger.critical("a fault in the router itself kept it from reloading; please report it", exc_info=error)
-            return "failed", ReloadResult(False, tuple(findings), f"a fault in the router itself: {error!r}")
-        text = changes(now, then)
-        del now, then, checked, change
+        self._edges.take_over(self._edges.prepare(then))
         self._settled()
-        gc.collect()
-        return "ok", ReloadResult(True, tuple(findings), text)
+        return "ok", ReloadResult(True, tuple(findings), changes(now, then))
 
     def _count(self, kind: str) -> None:
         self._accounts.own[self._accounts.books.slot("config_reloads", kind)] += 1
