@@ -24,41 +24,57 @@ if TYPE_CHECKING:
 SCHEMA = "schemas/route-table.schema.json"
 
 
-@functools.lru_cache(maxsize=1)
 def table_schema() -> dict[str, Any]:
     """The schema as data, for whoever documents keys."""
-    schema: dict[str, Any] = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))
+    return _schema(SCHEMA)
+
+
+@functools.lru_cache
+def _schema(name: str) -> dict[str, Any]:
+    schema: dict[str, Any] = json.loads(asset(name).read_text(encoding="utf-8"))
     return schema
 
 
 def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     """The tree with misspelt keys put right and everything that has a finding marked broken."""
     tree: Node = root
-    misfits = _misfits(tree)
-    while unknown := [misfit for misfit in misfits if misfit.keyword == "additionalProperties"]:
+    found = misfits(tree, SCHEMA)
+    while unknown := [misfit for misfit in found if misfit.keyword == "additionalProperties"]:
         repairs = {}
         for misfit in unknown:
             known = list(misfit.schema["properties"])
             findings.extend(_unknown_keys(node_at(tree, misfit.path), misfit.path, known))
             repairs[misfit.path] = functools.partial(_with_known_keys, known=known)
         tree = rewritten(tree, repairs)
-        misfits = _misfits(tree)
-    rests = {misfit.path for misfit in misfits if _is_rest(tree, misfit.path)}
-    misfits = [misfit for misfit in misfits if misfit.path not in rests]
-    findings.extend(finding(misfit, tree) for misfit in misfits if not _is_broken(tree, misfit.path))
-    tree = rewritten(tree, {misfit.path: _as_broken for misfit in misfits})
+        found = misfits(tree, SCHEMA)
+    rests = {misfit.path for misfit in found if _is_rest(tree, misfit.path)}
+    found = [misfit for misfit in found if misfit.path not in rests]
+    findings.extend(finding(misfit, tree) for misfit in found if not _is_broken(tree, misfit.path))
+    tree = rewritten(tree, {misfit.path: _as_broken for misfit in found})
     tree = rewritten(tree, {path[:-1]: _without_rests for path in rests})
     if not isinstance(tree, MappingNode):
         raise TypeError("a table's root stays a mapping")
     return tree
 
 
-@functools.lru_cache(maxsize=1)
-def _validator() -> Validator:
+def misfits(tree: Node, schema: str) -> list[Misfit]:
+    """Where a tree does not fit a schema of ours, which is named by its file.
+
+    One misfit for each value, that of its type before any other; each missing key is one of its own.
+    """
+    data: Any = to_data(tree)
+    found = [Misfit.of(error) for error in _validator(schema).iter_errors(data)]
+    found.sort(key=lambda misfit: misfit.keyword != "type")
+    first = {(misfit.path, misfit.message if misfit.is_about_keys else ""): misfit for misfit in reversed(found)}
+    return list(first.values())
+
+
+@functools.lru_cache
+def _validator(schema: str) -> Validator:
     from jsonschema import Draft7Validator, validators  # takes as long to import as everything else of `validate`
 
     with_exact_end: type[Validator] = validators.extend(Draft7Validator, {"pattern": _pattern})  # type: ignore[no-untyped-call]
-    return with_exact_end(table_schema())
+    return with_exact_end(_schema(schema))
 
 
 def _pattern(validator: Validator, pattern: str, instance: object, schema: object) -> Iterator[Exception]:
@@ -68,15 +84,6 @@ def _pattern(validator: Validator, pattern: str, instance: object, schema: objec
     exact = pattern[:-1] + r"\Z" if pattern.endswith("$") else pattern
     if isinstance(instance, str) and not re.search(exact, instance):
         yield ValidationError(f"{instance!r} does not match {pattern!r}")
-
-
-def _misfits(tree: Node) -> list[Misfit]:
-    """One misfit for each value, that of its type before any other; each missing key is one of its own."""
-    data: Any = to_data(tree)
-    misfits = [Misfit.of(error) for error in _validator().iter_errors(data)]
-    misfits.sort(key=lambda misfit: misfit.keyword != "type")
-    first = {(misfit.path, misfit.message if misfit.is_about_keys else ""): misfit for misfit in reversed(misfits)}
-    return list(first.values())
 
 
 def _as_broken(node: Node) -> Node:

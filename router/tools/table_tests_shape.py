@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import functools
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from router.assets import asset
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
 from router.table.compose import compose
-from router.table.nodes import MappingNode, Node, is_sound, key_at, node_at, to_data
+from router.table.nodes import MappingNode, Node, is_sound, key_at, node_at
 from router.table.sentences import Misfit, finding, subject
+from router.table.shape import misfits
 from router.table.source import read_source
-
-if TYPE_CHECKING:
-    from jsonschema import Draft7Validator
 
 SCHEMA = "schemas/table-test.schema.json"
 
@@ -37,9 +31,9 @@ def read_shape(path: Path) -> MappingNode:
 
 
 def _findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
-    misfits = [Misfit.of(error) for error in _validator().iter_errors(to_data(root))]
-    misspelt = {misfit.path for misfit in misfits if misfit.keyword == "additionalProperties"}
-    for misfit in misfits:
+    found = misfits(root, SCHEMA)
+    misspelt = {misfit.path for misfit in found if misfit.keyword == "additionalProperties"}
+    for misfit in found:
         if misfit.keyword == "additionalProperties":
             yield from _unknown_keys(misfit, node_at(root, misfit.path))
         elif not misfit.path and misfit.path not in misspelt:
@@ -63,11 +57,3 @@ def _unknown_keys(misfit: Misfit, node: Node) -> Iterator[Diagnostic]:
         if name not in known:
             hint = did_you_mean(name, known)
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
-
-
-@functools.lru_cache(maxsize=1)
-def _validator() -> Draft7Validator:
-    from jsonschema import Draft7Validator  # takes as long to import as all the rest
-
-    schema: Any = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))
-    return Draft7Validator(schema)
