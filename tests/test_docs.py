@@ -25,6 +25,7 @@ from router.gateway.json_reading import cdr_builder
 from router.gateway.packets import Packet, pack
 from router.gateway.schema_text import schema_text
 from router.gateway.style import Style
+from router.table.shape import table_schema
 from router.types.ros import ros_interfaces
 from tests.gateway.fake_gateway import FakeGateway
 from tests.ports import free_port
@@ -49,7 +50,7 @@ def test_page_is_what_the_code_says(name: str) -> None:
 def table_examples() -> Iterator[str]:
     """Some show routes without the key above them."""
     for example in (example for page in TABLE_PAGES for example in examples(page, "yaml")):
-        bare = not re.match(r"#|(gateways|routes|endpoints|listen):", example)
+        bare = not re.match(rf"#|({'|'.join(table_schema()['properties'])}):", example)
         yield "routes:\n" + indent(example, "  ") if bare else example
 
 
