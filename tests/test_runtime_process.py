@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -128,4 +129,27 @@ def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
     assert told["event"] == "table reloaded"
     process.terminate()
     process.communicate(timeout=10)
+    assert process.returncode == 0
+
+
+def test_it_stops_however_many_reloads_are_asked_for(table: Path) -> None:
+    process = start(table, LISTEN_PORT=str(free_port()))
+    wait_for_start(process)
+    ended = threading.Event()
+
+    def storm() -> None:
+        while not ended.wait(0.001):
+            process.send_signal(signal.SIGHUP)
+
+    thread = threading.Thread(target=storm)
+    thread.start()
+    try:
+        assert process.stderr
+        assert any('"table reloaded"' in line for line in process.stderr)
+        process.terminate()
+        process.communicate(timeout=10)
+    finally:
+        ended.set()
+        thread.join()
+        process.kill()
     assert process.returncode == 0

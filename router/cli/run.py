@@ -55,6 +55,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
+    # Blocked in all threads, signals wait for sigwait: no handler runs, no system call is interrupted.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
     named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE is
@@ -67,9 +69,8 @@ def run(args: argparse.Namespace) -> int:
     print_findings(checked.diagnostics, sys.stderr)
     if checked.program is None:
         return BAD_TABLE
-    # Blocked in all threads, the signals wait for sigwait: no handler runs, no system call is interrupted.
     ending = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
+    signal.pthread_sigmask(signal.SIG_BLOCK, ending)
     with Router(checked.program, ["--ros-args", *args.ros_args], environ) as router:
         tune_interpreter()
         del checked  # a reload is to free what it replaces
@@ -84,7 +85,8 @@ def run(args: argparse.Namespace) -> int:
 def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:
     """Until one of `ending` comes. What comes while another one is served waits."""
     while True:
-        match signal.sigwait({*ending, signal.SIGHUP, signal.SIGUSR1}):
+        last = signal.sigpending() & set(ending)  # left to itself, sigwait takes SIGHUP first, however often that comes
+        match signal.sigwait(last or {*ending, signal.SIGHUP, signal.SIGUSR1}):
             case signal.SIGHUP:
                 router.reload()
             case signal.SIGUSR1:

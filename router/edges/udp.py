@@ -40,8 +40,7 @@ class Listener:
             if handed is None:
                 # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
                 self.socket.bind(plan.address)
-            if handed is None or receive_buffer(handed) < plan.receive_buffer:
-                _want_receive_buffer(self.socket, plan)
+            self._want_receive_buffer(plan)
             self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
@@ -61,7 +60,7 @@ class Listener:
     def follow(self, plan: ListenerPlan) -> None:
         """Is what another table calls and wants of the same address."""
         if plan.receive_buffer != self._plan.receive_buffer:
-            _want_receive_buffer(self.socket, plan)
+            self._want_receive_buffer(plan)
         self._plan = plan
 
     def kernel_drops(self) -> int:
@@ -90,9 +89,12 @@ class Listener:
         self._drops_at_close = self.kernel_drops()
         self.socket.close()
 
-
-def _want_receive_buffer(opened: socket.socket, plan: ListenerPlan) -> None:
-    if (granted := ask_for_receive_buffer(opened, plan.receive_buffer)) < plan.receive_buffer:
+    def _want_receive_buffer(self, plan: ListenerPlan) -> None:
+        """What was inherited may have a larger one, for what comes while no process listens."""
+        if self.is_inherited and receive_buffer(self.socket) >= plan.receive_buffer:
+            return
+        if (granted := ask_for_receive_buffer(self.socket, plan.receive_buffer)) >= plan.receive_buffer:
+            return
         logger.warning(
             "receive buffer is smaller than the table asks for: bursts may be dropped by the kernel",
             listener=plan.name,

@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -161,6 +162,8 @@ def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listene
     before = held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     assert before > 2 * 65536
     assert listener.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
+    listener.follow(replace(plan(held), receive_buffer=32768))  # as a reload asks for
+    assert held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
 
 
 def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
