@@ -159,14 +159,13 @@ class RosEdge:
         self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
 
     def _receive(self, receive: Mapping[str, Receive]) -> None:
-        if self._messages is None:
-            if not self._subscriptions:
-                return
-            assert self._failed is not None  # noqa: S101 - it has started
-            self._messages = MessageThread(self._failed)
-            self._messages.start()
+        served = {each.raw: receive[topic] for topic, each in self._subscriptions.items()}
         try:
-            self._messages.serve({each.raw: receive[topic] for topic, each in self._subscriptions.items()})
+            if self._messages:
+                self._messages.serve(served)
+            elif served:
+                assert self._failed is not None  # noqa: S101 - it has started
+                self._messages = MessageThread.serving(served, self._failed)
         except RCL_ERRORS as error:
             raise StartError(f"ROS messages cannot be received: {error}") from error
 

@@ -8,7 +8,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 
 from rclpy.event_handler import EventHandler
 from rclpy.node import Node
@@ -102,6 +102,17 @@ class MessageThread(_WaitThread):
         self._arrivals = Arrivals([])
         self._tasks: deque[Callable[[], None]] = deque()
         super().__init__("ros", self._arrivals)
+
+    @classmethod
+    def serving(cls, receive: Mapping[RawSubscription, Receive], failed: Callable[[Exception], None]) -> MessageThread:
+        """One that has started, with these to serve. Raises one of `ros_node.RCL_ERRORS`."""
+        thread = cls(failed)
+        with ExitStack() as opening:
+            opening.callback(thread._arrivals.close)
+            thread.serve(receive)  # before it looks: what has arrived by now is told of at once
+            thread.start()
+            opening.pop_all()
+        return thread
 
     def paused(self) -> AbstractContextManager[None]:
         """The thread takes nothing meanwhile. Raises StuckError."""

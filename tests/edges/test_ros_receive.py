@@ -144,6 +144,24 @@ def test_nothing_is_received_before_the_start_and_nothing_is_lost(publisher: Pub
         wait_until(lambda: receiver.of("greeting") == [HELLO])
 
 
+def test_a_start_that_is_slow_loses_nothing_that_waits_for_it(
+    publisher: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    announce = RawSubscription.announce_to
+
+    def slowly(subscription: RawSubscription, eventfd: int | None) -> None:
+        announce(subscription, eventfd)
+        sleep(0.1)  # a thread that looked already would be told of a subscription that it does not know yet
+
+    monkeypatch.setattr(RawSubscription, "announce_to", slowly)
+    with Receiver(string_topic()) as receiver:
+        peer = publisher("greeting")
+        peer.publish([HELLO])
+        peer.await_receipt()
+        receiver.start()
+        wait_until(lambda: receiver.of("greeting") == [HELLO])
+
+
 def test_a_long_queue_keeps_other_topics_waiting_for_one_turn_only(publisher: Publish) -> None:
     with Receiver(string_topic(DEEP, "many"), string_topic(RELIABLE, "few")) as receiver:
         many, few = publisher("many"), publisher("few")
