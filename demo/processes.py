@@ -17,8 +17,9 @@ from demo.recorded import first_of, recordings
 from demo.screen import open_screen
 from demo.verdict import Finding, judge
 from router.errors import RouterError, TransportError
-from router.table.model import Address, RouteTable
-from router.tools.live import Snapshot, Window, parse_metrics, scrape
+from router.table.model import RouteTable
+from router.tools.live import Snapshot, Window, parse_metrics
+from router.tools.running_router import metrics, url_of
 
 TABLE = Path("routes/sim.yaml")
 DURATION = 12.0
@@ -46,7 +47,7 @@ class Demo:
     def __init__(self, table: RouteTable) -> None:
         if table.metrics is None:
             raise DemoError(f"{TABLE} has no metrics address, and the demo reads its rates there")
-        self._metrics: Address = table.metrics.value
+        self._url = url_of(table)
         self._table = table
         self._env = os.environ | {
             "ROS_DOMAIN_ID": str(free_ros_domain()),
@@ -111,7 +112,7 @@ class Demo:
     def _snapshot(self) -> Snapshot:
         self._check()
         try:
-            return parse_metrics(scrape(self._metrics), time.monotonic())
+            return parse_metrics(metrics(self._url), time.monotonic())
         except TransportError:
             self._check()  # a router that has ended has better words than a refused connection
             raise

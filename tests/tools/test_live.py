@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from router.tools.live import Snapshot, parse_metrics, view
+from router.tools.live import Snapshot, Window, parse_metrics, view
 
 METRICS = """\
 # HELP router_datagrams_received_total Datagrams taken from the listener's socket.
@@ -58,6 +58,12 @@ def test_reasons_that_never_happened_are_left_out() -> None:
 
 def test_a_router_that_was_started_anew_has_no_negative_rate() -> None:
     assert view(snapshot(0, 1000), snapshot(2, 10)).routes[0].rate == 5.0
+
+
+def test_a_window_gives_rates_over_its_last_seconds_only() -> None:
+    window = Window(seconds=3.0)
+    rates = [window.add(snapshot(at, imu)).routes[0].rate for at, imu in ((0, 0), (1, 10), (2, 20), (3, 60), (5, 140))]
+    assert rates == [0.0, 10.0, 10.0, 20.0, 40.0]
 
 
 def test_which_table_ran_is_told_with_the_numbers() -> None:
