@@ -45,6 +45,9 @@ def run(args: argparse.Namespace) -> int:
         return BAD_USAGE
     coverages: dict[Path, Coverage] | None = {} if args.coverage else None
     results, findings = _proven(files, args.only or "", coverages)
+    if args.only and not results and not findings:
+        print(f"router test: the name of no test contains {args.only!r}", file=sys.stderr)
+        return BAD_USAGE
     if findings and args.format != "json":
         print_findings(findings, sys.stderr, args.format)
     print_results(results, findings, coverages or {}, sys.stdout, args.format)

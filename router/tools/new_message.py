@@ -123,7 +123,9 @@ def _case(name: str, board: str) -> str:
     prefix = prefix_of(board)
     rest = name.removeprefix(prefix)
     if not _MESSAGE_NAME.fullmatch(name) or rest == name or not _MESSAGE_NAME.fullmatch(rest):
-        raise UsageError(f"'{name}' is no name for a message of {board}; write it as {prefix}RadiationInfo")
+        better = rest[:1].upper() + rest[1:]
+        example = better if _MESSAGE_NAME.fullmatch(better) else "RadiationInfo"
+        raise UsageError(f"'{name}' is no name for a message of {board}; write it as {prefix}{example}")
     return _WORD_BORDER.sub("_", rest).lower()
 
 

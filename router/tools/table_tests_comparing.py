@@ -97,7 +97,7 @@ class Comparison:
             if isinstance(event, Filtered) and event.target == target:
                 place = self._places.condition(event.route, target)
                 return Failure(items[0].span, f"nothing for {target}: it was withheld", place)
-        return Failure(items[0].span, f"nothing for {target}", self._places.of_name(target))
+        return Failure(items[0].span, f"nothing for {target}", self._of_name(target, happened))
 
     def _unexpected(self, events: Sequence[Sent | Published], happened: Happened) -> Iterator[Failure]:
         first, count = events[0], len(events)
@@ -177,8 +177,12 @@ class Comparison:
                 details = {event.detail: None for event in came.get(target, ()) if event.detail}
                 detail = f" ({next(iter(details))})" if details else ""
                 message = f"dropped for {target}: {_counts(counts)}, not {_counts(wanted.value)}{detail}"
-                place = self._words.place(came[target][0]) if target in came else self._places.of_name(target)
+                place = self._words.place(came[target][0]) if target in came else self._of_name(target, happened)
                 yield Failure(wanted.span, message, place)
+
+    def _of_name(self, target: str, happened: Happened) -> Place | None:
+        """Where the table should have delivered what was given to a target that heard nothing of it."""
+        return self._places.of_name(target, (each.route for each in happened.events if isinstance(each, Received)))
 
     def _filtered(self, expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
         came = Counter(event.target for event in events if isinstance(event, Filtered))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from router.compiler import Checked
@@ -37,9 +38,13 @@ class Places:
         """Of a topic that a route publishes on."""
         return next((served.type for served in self._targets.get((route, topic), ())), None)
 
-    def of_name(self, target: str) -> Place | None:
-        """The first target that is called so, where no route is known."""
-        return next((self.target(*key) for key in self._targets if key[1] == target), None)
+    def of_name(self, target: str, routes: Iterable[str]) -> Place | None:
+        """The target called so of the `routes` that took a message, else the first of them; of any route if none did."""
+        taken = [name for name in routes if name in self._routes]
+        place = next((found for name in taken if (found := self.target(name, target))), None)
+        if place is None and taken:
+            place = Place(self._routes[taken[0]].route.span, "the route that took it has no such target")
+        return place or next((self.target(*key) for key in self._targets if key[1] == target), None)
 
     def condition(self, route: str, target: str) -> Place | None:
         for served in self._targets.get((route, target), ()):

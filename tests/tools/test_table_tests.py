@@ -405,6 +405,19 @@ def test_what_is_expected_beside_a_rejection_is_looked_at(tmp_path: Path) -> Non
     assert messages(tmp_path, IMU, tests) == ["nothing for basestation"]
 
 
+def test_a_target_that_another_route_has_is_shown_as_missing_in_the_route_that_took_the_message(tmp_path: Path) -> None:
+    routes = """
+        ph_info: {source: sensor_board, destinations: [recorder]}
+        imu_info: {source: sensor_board, destinations: [basestation]}
+        """
+    (failure,) = failures(tmp_path, routes, f"a: {{given: {given('{}')}, expect: {{sent: [basestation, recorder]}}}}\n")
+    assert failure.message == "nothing for recorder"
+    assert failure.table is not None
+    assert failure.table.note == "the route that took it has no such target"
+    line = Path(failure.table.span.file).read_text().splitlines()[failure.table.span.line - 1]
+    assert line.lstrip().startswith("imu_info:")
+
+
 def test_a_drop_that_is_not_listed_fails_though_the_target_got_others(tmp_path: Path) -> None:
     routes = "imu_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 10}]}\n"
     tests = f"a: {{given: {given('{}', ', times: 2')}, expect: {{sent: basestation}}}}\n"
