@@ -39,7 +39,7 @@ class Places:
         return next((served.type for served in self._targets.get((route, topic), ())), None)
 
     def of_name(self, target: str, routes: Iterable[str]) -> Place | None:
-        """The target called so of the `routes` that took a message, else the first of them; of any route if none did."""
+        """The target called so of the `routes` that took a message, else the first of them; of any route without."""
         taken = [name for name in routes if name in self._routes]
         place = next((found for name in taken if (found := self.target(name, target))), None)
         if place is None and taken:
