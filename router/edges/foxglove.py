@@ -21,7 +21,7 @@ from router.compiler.program import Program
 from router.edges.background import background_threads
 from router.edges.http_tap import first_field
 from router.edges.log import logger
-from router.edges.mirror import Seen
+from router.edges.mirror import Seen, Shown
 from router.edges.port_holder import port_holder
 from router.edges.recorder_schemas import descriptor_set
 from router.edges.running import Running
@@ -127,15 +127,15 @@ class FoxgloveServer(ServerListener):
         schema = Schema(name=kind.message, encoding="protobuf", data=kind.descriptors)
         return Channel(kind.case, message_encoding="protobuf", schema=schema, context=self._context)
 
-    def _show(self, batch: Sequence[Seen]) -> None:
+    def _show(self, batch: Sequence[Shown]) -> None:
         """Called by the mirror's thread. What is no payload for the router is not shown."""
         program, _, channels = self._shown
         assert program is not None  # noqa: S101 - there is one since the start
         wanted = {case.number for case in program.envelope.cases.values() if channels[case.name].has_sinks()}
-        for seen in batch:
-            if first_field(seen.data) in wanted and (found := _payload(seen, program)) is not None:
+        for shown in batch:
+            if first_field(shown[3]) in wanted and (found := _payload(Seen(*shown), program)) is not None:
                 case, payload = found
-                channels[case].log(payload, log_time=seen.at)
+                channels[case].log(payload, log_time=shown[0])
 
 
 def _payload(seen: Seen, program: Program) -> tuple[str, bytes] | None:

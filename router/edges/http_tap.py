@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from router.compiler.network import recognisers
 from router.compiler.program import Program
-from router.edges.mirror import Mirror, Seen
+from router.edges.mirror import Mirror, Shown
 from router.edges.tap_stream import MAGIC, encode, encode_alive, encode_lost
 from router.errors import RouterError, did_you_mean
 
@@ -21,7 +21,7 @@ MOST_WAITING = 4 << 20
 
 ALIVE_SECONDS = 1.0
 
-Wanted = Callable[[Seen], bool]
+Wanted = Callable[[Shown], bool]
 
 
 class TapRequestError(RouterError):
@@ -38,7 +38,7 @@ def wanted(program: Program, cases: Sequence[str], sources: Sequence[str]) -> Wa
     from_source = _from_source(program, sources) if sources else None
     if of_case is None or from_source is None:
         return of_case or from_source
-    return lambda seen: from_source(seen) and of_case(seen)
+    return lambda shown: from_source(shown) and of_case(shown)
 
 
 def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
@@ -46,7 +46,7 @@ def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
     if unknown := [name for name in cases if name not in known]:
         raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
     unwanted = frozenset(case.number for name, case in known.items() if name not in cases)
-    return lambda seen: first_field(seen.data) not in unwanted
+    return lambda shown: first_field(shown[3]) not in unwanted
 
 
 def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
@@ -56,9 +56,9 @@ def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
     by_host, by_address = recognisers(endpoints)
     names = frozenset(sources)
 
-    def is_wanted(seen: Seen) -> bool:
-        host = seen.peer[0]
-        return host in names or by_address.get(seen.peer, by_host.get(host)) in names
+    def is_wanted(shown: Shown) -> bool:
+        peer = shown[2]
+        return peer[0] in names or by_address.get(peer, by_host.get(peer[0])) in names
 
     return is_wanted
 
@@ -103,14 +103,14 @@ class Tap:
             self._is_closed = True
             self._changed.notify()
 
-    def _take(self, batch: Sequence[Seen]) -> None:
+    def _take(self, batch: Sequence[Shown]) -> None:
         """Called by the mirror's thread."""
-        seen = batch if self._wants is None else list(filter(self._wants, batch))
-        piece = encode(seen)
+        shown = batch if self._wants is None else list(filter(self._wants, batch))
+        piece = encode(shown)
         unseen, self._lost_before = self._mirror.lost - self._lost_before, self._mirror.lost
         with self._changed:
             if self._waiting + len(piece) > MOST_WAITING:
-                self._lost += len(seen)
+                self._lost += len(shown)
             elif piece:
                 self._pieces.append(piece)
                 self._waiting += len(piece)

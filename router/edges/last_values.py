@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError as ProtobufError
 from router.compiler.network import recognisers
 from router.compiler.program import Program
 from router.edges.http_tap import first_field
-from router.edges.mirror import Seen
+from router.edges.mirror import Seen, Shown
 from router.edges.running import Running
 from router.engine import MAX_DATAGRAM
 from router.engine.framing import restored
@@ -35,7 +35,7 @@ class LastValues:
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._fresh: dict[int, Seen] = {}
+        self._fresh: dict[int, Shown] = {}
         self._values: dict[str, Value] = {}
         self._detach: Callable[[], None] | None = None
         self._until = 0.0
@@ -53,8 +53,8 @@ class LastValues:
                 threading.Thread(target=self._end_when_idle, name="last values", daemon=True).start()
             with self._taking:
                 fresh, self._fresh = self._fresh, {}
-            for seen in fresh.values():
-                self._keep(seen, program)
+            for shown in fresh.values():
+                self._keep(Seen(*shown), program)
             return dict(self._values)
 
     def close(self) -> None:
@@ -62,11 +62,11 @@ class LastValues:
         with self._lock:
             self._end()
 
-    def _take(self, batch: Sequence[Seen]) -> None:
+    def _take(self, batch: Sequence[Shown]) -> None:
         """Called by the mirror's thread."""
         with self._taking:
-            for seen in batch:
-                self._fresh[first_field(seen.data)] = seen
+            for shown in batch:
+                self._fresh[first_field(shown[3])] = shown
 
     def _keep(self, seen: Seen, program: Program) -> None:
         try:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import NamedTuple
 
 from router.edges.clock import wall_ns
@@ -34,10 +33,10 @@ class Seen(NamedTuple):
     data: bytes
 
 
-_SEEN = partial(tuple.__new__, Seen)
-"""Makes one of a tuple, without a function of Python's between."""
+Shown = tuple[int, str, "tuple[str, int]", bytes]
+"""What a Seen has, in its order: of thousands in a second, names alone would cost as much as all else here."""
 
-Consumer = Callable[[Sequence[Seen]], None]
+Consumer = Callable[[Sequence[Shown]], None]
 
 
 class Mirror:
@@ -53,7 +52,7 @@ class Mirror:
         self._limit = limit
         self._rewire = rewire
         self._failed = failed
-        self._waiting: deque[tuple[int, str, tuple[str, int], bytes]] = deque()
+        self._waiting: deque[Shown] = deque()
         self._consumers: tuple[Consumer, ...] = ()
         self._attaching = threading.Lock()
         self._showing = threading.Lock()
@@ -120,7 +119,7 @@ class Mirror:
     def _show(self) -> None:
         with self._showing:
             pop = self._waiting.popleft
-            batch = list(map(_SEEN, [pop() for _ in range(len(self._waiting))]))
+            batch = [pop() for _ in range(len(self._waiting))]
             if not batch:
                 return
             for consumer in self._consumers:

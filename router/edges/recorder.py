@@ -18,13 +18,13 @@ from router.edges.alarm import Alarm
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.log import logger
 from router.edges.metrics import Asked
-from router.edges.mirror import Seen
+from router.edges.mirror import Shown
 from router.edges.recorder_channels import Channels
-from router.edges.recorder_chunk import Chunk
 from router.edges.recorder_continuous import Continuous
 from router.edges.recorder_directory import open_directory
-from router.edges.recorder_encoding import Encoder
-from router.edges.recorder_saving import RecordError, Saving
+from router.edges.recorder_encoding import Encoder, Known
+from router.edges.recorder_packed import Packer
+from router.edges.recorder_saving import LONGEST_CHUNK, RecordError, Saving
 from router.edges.running import Running
 from router.table.model import RecordSettings
 
@@ -36,8 +36,6 @@ PERIOD = 500_000_000
 MOST_WAITING = 64 << 20
 """Bytes that may wait for a disk that is slow."""
 
-LONGEST_CHUNK = 4 << 20
-
 _BESIDE_DATA = 256
 """About what Python needs for a datagram beside its data, in bytes."""
 _PATIENCE = 30.0
@@ -45,7 +43,8 @@ _PATIENCE = 30.0
 
 
 class _Batch(NamedTuple):
-    datagrams: Sequence[Seen]
+    datagrams: Sequence[Shown]
+    known: Known
     wall: int
     monotonic: int
     size: int
@@ -58,7 +57,9 @@ class Recorder:
         self._running = running
         self._channels = Channels()
         self._encoder = Encoder(self._channels)
-        self._known: object = None
+        self._program = running.program
+        self._known = self._encoded = Known.of(self._program.envelope, self._program.table.endpoints)
+        self._encoder.know(self._known)
         directory = open_directory(settings, running.program.table.path.stem)
         self._continuous = Continuous(settings, directory, self._channels, self._about) if settings.continuous else None
         self._saving = (
@@ -66,6 +67,7 @@ class Recorder:
             if settings.last is not None
             else None
         )
+        self._packer = Packer()
         self._waiting: deque[_Batch] = deque()
         self._taken_in = self._taken_out = 0  # bytes, each written by one thread
         self._overflow = 0
@@ -122,14 +124,26 @@ class Recorder:
         with suppress(ValueError):  # it has ended
             self._alarm.ring()
 
-    def _take(self, batch: Sequence[Seen]) -> None:
+    def _take(self, batch: Sequence[Shown]) -> None:
         """Called by the mirror's thread."""
-        size = sum(len(seen.data) for seen in batch) + _BESIDE_DATA * len(batch)
+        known, wall, monotonic = self._known_now(), wall_ns(), monotonic_ns()
+        if self._saving is not None:
+            self._saving.add(self._packer.pack(batch, known, wall, monotonic))
+        if self._continuous is None:
+            return
+        size = sum([len(data) for _, _, _, data in batch]) + _BESIDE_DATA * len(batch)
         if self._taken_in - self._taken_out + size > MOST_WAITING:
             self._overflow += len(batch)
             return
         self._taken_in += size
-        self._waiting.append(_Batch(batch, wall_ns(), monotonic_ns(), size))
+        self._waiting.append(_Batch(batch, known, wall, monotonic, size))
+
+    def _known_now(self) -> Known:
+        """A reload may have changed it."""
+        program = self._running.program
+        if program is not self._program:
+            self._program, self._known = program, Known.of(program.envelope, program.table.endpoints)
+        return self._known
 
     def _run(self) -> None:
         flush_at = monotonic_ns() + PERIOD
@@ -156,8 +170,8 @@ class Recorder:
         logger.critical("a fault in the recorder lost datagrams; please report it", exc_info=error)
 
     def _turn(self, now: int, is_last: bool = False) -> None:
-        self._encode(now)
         if self._continuous is not None:
+            self._write(self._continuous, now)
             self._continuous.close_if_old(now)
         if self._saving is None:
             return
@@ -175,26 +189,18 @@ class Recorder:
     def _writing(self) -> Path | None:
         return self._continuous.path if self._continuous is not None else None
 
-    def _encode(self, now: int) -> None:
-        program = self._running.program
-        if program is not self._known:
-            self._encoder.know(program.envelope, program.table.endpoints)
-            self._known = program
+    def _write(self, continuous: Continuous, now: int) -> None:
         for _ in range(len(self._waiting)):
             batch = self._waiting.popleft()
+            if batch.known is not self._encoded:
+                self._encoded = batch.known
+                self._encoder.know(batch.known)
             self._encoder.add(batch.datagrams, batch.wall, batch.monotonic)
             self._taken_out += batch.size
-            if self._encoder.offset > LONGEST_CHUNK:
-                self._keep(self._encoder.take(), now)
-        self._keep(self._encoder.take(), now)
-
-    def _keep(self, chunk: Chunk | None, now: int) -> None:
-        if chunk is None:
-            return
-        if self._continuous is not None:
-            self._continuous.write(chunk, now)
-        if self._saving is not None:
-            self._saving.add(chunk)
+            if self._encoder.offset > LONGEST_CHUNK and (chunk := self._encoder.take()) is not None:
+                continuous.write(chunk, now)
+        if (chunk := self._encoder.take()) is not None:
+            continuous.write(chunk, now)
 
     def _about(self, reason: str = "continuous") -> dict[str, str]:
         """What a file says of itself."""

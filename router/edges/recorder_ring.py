@@ -1,30 +1,36 @@
-"""The last datagrams, in memory: chunks that are written only when somebody asks. Knows no file."""
+"""The last datagrams, in memory, until somebody asks for them. Knows no file."""
 
 from __future__ import annotations
 
+import threading
 from collections import deque
-from collections.abc import Iterator
 
-from router.edges.recorder_chunk import Chunk
+from router.edges.recorder_packed import Packed
 
 
 class Ring:
-    """What came within `last` ns, in chunks of at most `most` bytes together: of a flood it keeps less than `last`."""
+    """What came within `last` ns, in batches of at most `most` bytes together: of a flood it keeps less than `last`.
+
+    Any thread may use it.
+    """
 
     def __init__(self, last: int, most: int) -> None:
         self._last = last
         self._most = most
-        self._chunks: deque[Chunk] = deque()
-        self.size = 0
+        self._batches: deque[Packed] = deque()
+        self._changing = threading.Lock()
+        self._size = 0
 
-    def add(self, chunk: Chunk) -> None:
-        self._chunks.append(chunk)
-        self.size += len(chunk.record.data)
-        while self._chunks[0].steady < chunk.steady - self._last or (self.size > self._most and len(self._chunks) > 1):
-            self.size -= len(self._chunks.popleft().record.data)
+    def add(self, batch: Packed) -> None:
+        with self._changing:
+            batches = self._batches
+            batches.append(batch)
+            self._size += batch.size
+            oldest = batch.monotonic - self._last
+            while batches[0].monotonic < oldest or (self._size > self._most and len(batches) > 1):
+                self._size -= batches.popleft().size
 
-    def __iter__(self) -> Iterator[Chunk]:
-        return iter(self._chunks)
-
-    def __len__(self) -> int:
-        return len(self._chunks)
+    def batches(self) -> list[Packed]:
+        """The oldest first."""
+        with self._changing:
+            return list(self._batches)

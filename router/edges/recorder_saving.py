@@ -5,16 +5,24 @@ Knows no thread. What is called with `now` is monotonic, in ns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from time import monotonic, sleep
 
 from router.edges.clock import wall_ns
 from router.edges.log import logger
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_chunk import Chunk
 from router.edges.recorder_directory import RecordingDirectory
+from router.edges.recorder_encoding import Encoder
+from router.edges.recorder_packed import Packed
 from router.edges.recorder_ring import Ring
 from router.errors import RouterError
+
+LONGEST_CHUNK = 4 << 20
+
+_REST = 1.0
+"""Beside each piece of work, in its time: so long others have the interpreter to themselves."""
 
 
 class RecordError(RouterError):
@@ -40,8 +48,9 @@ class Saving:
         self._about = about
         self._trips_saved_at: int | None = None
 
-    def add(self, chunk: Chunk) -> None:
-        self._ring.add(chunk)
+    def add(self, batch: Packed) -> None:
+        """Any thread may."""
+        self._ring.add(batch)
 
     def save(self, reason: str, writing: Path | None) -> Path:
         """`writing` is the file that all goes to, where there is one. Raises RecordError."""
@@ -61,11 +70,30 @@ class Saving:
         return True
 
     def _write(self, reason: str, writing: Path | None) -> Path:
-        self._directory.make_room(self._ring.size + (self._max_size if writing is not None else 0), writing)
+        chunks = _chunks(self._ring.batches(), self._channels)
+        coming = sum(chunk.size_in_file for chunk in chunks)
+        self._directory.make_room(coming + (self._max_size if writing is not None else 0), writing)
         file = self._directory.new(wall_ns(), reason, self._channels, self._about(reason))
         try:
-            for chunk in self._ring:
+            for chunk in chunks:
                 file.write(chunk)
         finally:
             file.close()
         return file.path
+
+
+def _chunks(batches: Sequence[Packed], channels: Channels) -> list[Chunk]:
+    """Takes its time: what is received meanwhile goes first."""
+    encoder, known = Encoder(channels, batches[0].before if batches else 0), None
+    chunks: list[Chunk] = []
+    for batch in batches:
+        since = monotonic()
+        if batch.known is not known:
+            known = batch.known
+            encoder.know(known)
+        encoder.add(batch.unpacked(), batch.wall, batch.monotonic)
+        if encoder.offset > LONGEST_CHUNK or batch is batches[-1]:
+            chunk = encoder.take()
+            chunks += [chunk] if chunk is not None else []
+        sleep(_REST * (monotonic() - since))
+    return chunks

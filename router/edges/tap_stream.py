@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
-from router.edges.mirror import Seen
+from router.edges.mirror import Seen, Shown
 from router.errors import TransportError
 
 MAGIC = b"router tap 1\n"
@@ -38,7 +38,7 @@ class Lost(NamedTuple):
     number: int
 
 
-def encode(batch: Iterable[Seen]) -> bytes:
+def encode(batch: Iterable[Shown]) -> bytes:
     """One record for each."""
     pieces: list[bytes] = []
     for at, listener, peer, data in batch:

@@ -14,7 +14,7 @@ from router.assets import asset
 from router.edges.mirror import Seen
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_chunk import Chunk
-from router.edges.recorder_encoding import Encoder
+from router.edges.recorder_encoding import Encoder, Known
 from router.edges.recorder_file import RecordingFile
 from router.edges.running import Running
 from router.errors import SourceSpan
@@ -48,7 +48,7 @@ def endpoints() -> dict[str, Endpoint]:
 
 def encoder(channels: Channels) -> Encoder:
     made = Encoder(channels)
-    made.know(wire().envelope, endpoints())
+    made.know(Known.of(wire().envelope, endpoints()))
     return made
 
 

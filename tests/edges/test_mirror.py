@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import pytest
 
-from router.edges.mirror import MOST, Mirror, Receive, Seen
+from router.edges.mirror import MOST, Consumer, Mirror, Receive, Seen, Shown
 
 PEER = ("127.0.0.2", 8)
 LIMIT = 100
@@ -32,10 +32,10 @@ class Source:
         self.receive = self.mirror.tee("rover", self._route)
 
 
-def into(got: queue.SimpleQueue[Seen]) -> Callable[[Sequence[Seen]], None]:
-    def consume(batch: Sequence[Seen]) -> None:
-        for seen in batch:
-            got.put(seen)
+def into(got: queue.SimpleQueue[Seen]) -> Consumer:
+    def consume(batch: Sequence[Shown]) -> None:
+        for shown in batch:
+            got.put(Seen(*shown))
 
     return consume
 
@@ -104,7 +104,7 @@ def test_a_slow_consumer_costs_datagrams_that_are_counted_and_no_routing(source:
     held, entered = threading.Event(), threading.Event()
     seen: list[int] = []
 
-    def slow(batch: Sequence[Seen]) -> None:
+    def slow(batch: Sequence[Shown]) -> None:
         entered.set()
         held.wait(20)
         seen.append(len(batch))
@@ -124,7 +124,7 @@ def test_a_slow_consumer_costs_datagrams_that_are_counted_and_no_routing(source:
 def test_a_consumer_that_fails_is_told_of_and_spares_the_others(source: Source) -> None:
     got: queue.SimpleQueue[Seen] = queue.SimpleQueue()
 
-    def failing(batch: Sequence[Seen]) -> None:
+    def failing(batch: Sequence[Shown]) -> None:
         raise LookupError("a bug")
 
     source.mirror.attach(failing)
