@@ -17,6 +17,7 @@ import pytest
 
 SYSTEMD = Path("/usr/lib/systemd/systemd")
 PATIENCE = 60.0
+OWN = (Path("/run"), Path("/tmp"), Path("/dev/shm"), Path("/var/lib/systemd"))  # noqa: S108 - not to write to
 
 BOOT = r"""
 set -e
@@ -30,7 +31,7 @@ mount -t proc proc proc
 mount -t sysfs sysfs sys
 mount -t cgroup2 cgroup2 sys/fs/cgroup
 mount --rbind /dev dev
-for folder in run tmp dev/shm var/lib/systemd; do mount -t tmpfs -o mode=1777 tmpfs $folder; done
+for folder in "${@:2}"; do mount -t tmpfs -o mode=1777 tmpfs $folder; done
 chmod 755 run var/lib/systemd
 ip link set lo up
 # Of what this computer starts at boot, nothing.
@@ -92,6 +93,11 @@ class Machine:
             sleep(0.05)
 
 
+def hidden_by(folder: Path) -> Path | None:
+    """The folder of the machine's own in whose place that one is here."""
+    return next((own for own in OWN if folder.is_relative_to(own)), None)
+
+
 def why_not() -> str | None:
     """What keeps this computer from running a machine within it."""
     if os.geteuid() != 0:
@@ -120,9 +126,9 @@ def machine(base: Path) -> Iterator[Machine]:
     assert cgroups is not None
     own = cgroups / f"router-test-{os.getpid()}"
     own.mkdir()
-    script = f'echo $$ > {own}/cgroup.procs; exec unshare -mpnuiC --fork --kill-child bash -c "$1" boot "$2"'
+    script = f'echo $$ > {own}/cgroup.procs; exec unshare -mpnuiC --fork --kill-child bash -c "$1" boot "${{@:2}}"'
     booting = subprocess.Popen(
-        ["/bin/bash", "-c", script, "enter", BOOT, str(base)],
+        ["/bin/bash", "-c", script, "enter", BOOT, str(base), *(str(own)[1:] for own in OWN)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

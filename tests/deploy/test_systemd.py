@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from tests.deploy.machine import Machine, machine
+from tests.deploy.machine import Machine, hidden_by, machine
 
 ROOT = Path(__file__).parent.parent.parent
 UNITS = ROOT / "deploy" / "systemd"
@@ -56,6 +56,8 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A computer on which `make install-service` was done, for the simulated rover's table."""
     if not Path(ROUTER).exists():
         pytest.skip("needs .venv")
+    if hidden := hidden_by(ROOT):
+        pytest.skip(f"the machine has a {hidden} of its own, without this checkout")
     with machine(tmp_path_factory.mktemp("machine")) as found:
         found.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
         yield found
