@@ -65,7 +65,8 @@ def _table(path: Path, variables: Mapping[str, str]) -> Iterator[Finding | Progr
         return
     table = checked.program.table
     if warnings:
-        yield warning("table", f"{warnings} warnings", f"`router validate {shown_path(path)}` shows them")
+        count = f"{warnings} warning{'s' if warnings > 1 else ''}"
+        yield warning("table", count, f"`router validate {shown_path(path)}` shows them")
     yield fine("table", f"{shown_path(path)}: {len(table.routes)} routes, {len(table.endpoints)} endpoints")
     yield checked.program
 

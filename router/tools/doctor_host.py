@@ -29,7 +29,12 @@ _UNSYNCHRONISED = 0x40
 def receive_buffers(program: Program) -> Iterator[Finding]:
     """Whether a burst has the room that the table wants for it."""
     wanted = max((listener.receive_buffer for listener in program.listeners), default=0)
-    allowed = int(RMEM_MAX.read_text())
+    try:
+        allowed = int(RMEM_MAX.read_text())
+    except FileNotFoundError:  # in a container with a network of its own
+        what = "the kernel does not say here how large receive buffers may be"
+        yield warning("buffers", what, "run this on the host as well; the router's log says when it got less")
+        return
     if wanted <= allowed or os.geteuid() == 0:
         yield fine("buffers", f"a listener may have the {wanted} bytes that the table asks for")
         return
@@ -47,7 +52,12 @@ def recordings(program: Program) -> Iterator[Finding]:
     if settings is None:
         return
     directory = settings.directory.resolve()
-    there = next(folder for folder in (directory, *directory.parents) if folder.exists())
+    # os.path, since Path.exists raises where a folder above is not ours to read.
+    there = next(folder for folder in (directory, *directory.parents) if os.path.exists(folder))  # noqa: PTH110
+    if not there.is_dir():
+        remedy = "move that file away, or give `record` another directory"
+        yield problem("recordings", f"{there} is a file, and no folder", remedy)
+        return
     if not os.access(there, os.W_OK | os.X_OK):
         yield problem(
             "recordings",

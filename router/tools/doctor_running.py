@@ -97,13 +97,12 @@ class Health:
 
 
 def health(program: Program) -> Health | None:
-    """None where no router answers, and where the table does not say at which address."""
+    """None where nobody answers, or another program, and where the table does not say at which address."""
     table = program.table
     if table.metrics is None:
         return None
     try:
-        text = metrics(url_of(table))
-    except TransportError:
+        snapshot = parse_metrics(metrics(url_of(table)), time())
+    except (TransportError, ValueError, KeyError):  # nobody, or somebody else
         return None
-    snapshot = parse_metrics(text, time())
     return Health(table, snapshot, snapshot.at) if snapshot.values else None

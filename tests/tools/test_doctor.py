@@ -118,6 +118,14 @@ def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
     assert "sysctl -w net.core.rmem_max=65536" in found.remedy
 
 
+def test_where_the_kernel_does_not_tell_of_buffers_that_is_said(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container on many kernels."""
+    monkeypatch.setattr(doctor_host, "RMEM_MAX", tmp_path / "rmem_max")
+    assert [found.grade for found in receive_buffers(compiled(table))] == [Grade.WARNING]
+
+
 def recorded(table: Path, folder: Path, keep: str) -> Program:
     table.write_text(f"{table.read_text()}record: {{directory: {folder}, keep: {keep}}}\n")
     return compiled(table)
@@ -141,6 +149,31 @@ def test_a_folder_that_takes_no_recordings_is_a_problem(
     monkeypatch.setattr(os, "access", lambda *_: False)
     [found] = recordings(recorded(table, tmp_path, "4GiB"))
     assert (found.grade, f"may not write to {tmp_path}" in found.text) == (Grade.PROBLEM, True)
+
+
+def test_a_file_is_no_place_for_recordings(table: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    [found] = recordings(recorded(table, tmp_path / "file" / "below", "4GiB"))
+    assert (found.grade, found.text) == (Grade.PROBLEM, f"{tmp_path / 'file'} is a file, and no folder")
+
+
+def test_a_folder_below_one_that_is_not_ours_to_read_is_a_problem(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    private = tmp_path / "private"
+    private.mkdir()
+    program = recorded(table, private / "recordings", "4GiB")
+    really = os.stat
+
+    def stat(path: str | Path, **options: bool) -> os.stat_result:
+        if str(path).startswith(f"{private}/"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return really(path, **options)
+
+    monkeypatch.setattr(os, "stat", stat)
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != private)
+    [found] = recordings(program)
+    assert (found.grade, f"may not write to {private}" in found.text) == (Grade.PROBLEM, True)
 
 
 @pytest.mark.parametrize(
@@ -192,11 +225,9 @@ def test_who_answers_a_ping() -> None:
 
 
 @contextmanager
-def answering(table: Path, *samples: str) -> Iterator[Program]:
-    """A router that serves these metrics."""
-    program = compiled(table)
+def serving(program: Program, text: str) -> Iterator[None]:
+    """Whoever answers at the table's metrics.address with this."""
     assert program.table.metrics is not None
-    text = "\n".join([f'router_build_info{{table_sha256="{program.table.sha256}"}} 1', *samples, ""])
 
     class Metrics(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -208,13 +239,23 @@ def answering(table: Path, *samples: str) -> Iterator[Program]:
             pass
 
     with HTTPServer(program.table.metrics.value, Metrics) as server:
-        serving = threading.Thread(target=server.serve_forever, args=(0.01,))
-        serving.start()
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
         try:
-            yield program
+            yield
         finally:
             server.shutdown()
-            serving.join()
+            thread.join()
+
+
+@contextmanager
+def answering(table: Path, *samples: str) -> Iterator[Program]:
+    """A router that serves these metrics."""
+    program = compiled(table)
+    text = "\n".join([f'router_build_info{{table_sha256="{program.table.sha256}"}} 1', *samples, ""])
+
+    with serving(program, text):
+        yield program
 
 
 def seen(endpoint: str, ago: float) -> str:
@@ -226,6 +267,15 @@ def diagnosis(table: Path, *samples: str) -> list[Finding]:
         running = health(program)
     assert running is not None
     return list(running.findings())
+
+
+@pytest.mark.parametrize("text", ["<html>hello</html>", "", 'node_cpu{cpu="0"} 1\n', 'router_kernel_drops{a="b"} 1\n'])
+def test_another_program_at_the_routers_address_has_its_port(table: Path, text: str) -> None:
+    program = compiled(table)
+    with serving(program, text):
+        found = list(examine(table, {}))
+    [problem] = texts(found, Grade.PROBLEM)
+    assert f"(pid {os.getpid()}) has tcp port" in problem
 
 
 def test_a_healthy_router_is_fine(table: Path) -> None:
