@@ -15,8 +15,10 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
+from router.compiler.books import Books
 from router.edges.receiver import ReceiveThread
 from router.runtime import Router
+from router.runtime.accounts import Accounts
 from router.runtime.edges import Edges
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
@@ -325,6 +327,23 @@ def test_a_gateway_keeps_its_clients_unless_it_changes_itself(site: Site) -> Non
             socket.create_connection(("127.0.0.1", port))
 
 
+def test_a_gateway_that_made_room_in_vain_is_opened_again(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateways = f"gateways:\n  dashboard: {{transport: {{tcp: 127.0.0.1:{port}}}, publish_period: %s}}\n"
+    with socket.create_server(("127.0.0.1", 0)) as taken, site.router(PH + gateways % "1s") as router:
+        another = f"  another: {{transport: {{tcp: 127.0.0.1:{taken.getsockname()[1]}}}}}\n"
+        for _ in range(2):
+            site.write(PH + gateways % "2s" + another)
+            assert "gateway 'another' cannot be opened" in router.reload().text
+            with socket.create_connection(("127.0.0.1", port)):
+                wait_until(lambda: client_count(router) == 1)
+        site.write(PH + gateways % "2s")
+        assert router.reload().text == "gateway dashboard changed"
+        with socket.create_connection(("127.0.0.1", port)):
+            wait_until(lambda: client_count(router) == 1)
+
+
 def client_count(router: Router) -> int:
     return int(sum(value for name, _, value in router.samples() if name == "router_gateway_clients"))
 
@@ -411,3 +430,16 @@ def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
         assert router.reload().text == "the router is not running"
         with pytest.raises(BlockingIOError):
             hearing.recv(1000)
+
+
+def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:
+    accounts = Accounts(Books())
+    abandoned = accounts.books.continued()
+    slot = abandoned.slot("datagrams_padded", "another")
+    accounts.make_room(abandoned)
+    accounts.gateways[slot] += 1
+    then = accounts.books.continued()
+    assert then.slot("datagrams_received", "rover") == slot
+    accounts.make_room(then)
+    accounts.settle(then)
+    assert accounts.total("datagrams_received") == 0

@@ -72,7 +72,7 @@ class RosEdge:
         One thread does that. What it raises goes to `failed`. Raises StartError.
         """
         self._failed = failed
-        self._receive(receive)
+        self._receive(self._subscriptions, receive)
 
     def stop_receiving(self) -> None:
         """Lets what has arrived be received, and nothing after that. Publishing goes on."""
@@ -125,15 +125,16 @@ class RosEdge:
     def apply(self, change: RosChange, receive: Mapping[str, Receive]) -> None:
         """From now on these are used. To be called while paused; `receive` is as in `start`.
 
-        What has arrived on what is to be closed is received before that, in the way it was until now.
+        What has arrived on what is to be closed is received before that, in the way it was until now. Raises StartError,
+        and then the topics are as they were.
         """
         change.left = [
             *left_by(change.publications, self._publications),
             *left_by(change.subscriptions, self._subscriptions),
         ]
         more = hand_over(self._messages, self._subscriptions, change.subscriptions) if self._messages else ()
+        self._receive(change.subscriptions, receive)
         self._use(change)
-        self._receive(receive)
         for topic, cdr, sent_at in more:
             receive[topic](cdr, sent_at)
 
@@ -158,15 +159,15 @@ class RosEdge:
         self.publish.update((topic, each.publish) for topic, each in change.publications.items())
         self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
 
-    def _receive(self, receive: Mapping[str, Receive]) -> None:
-        served = {each.raw: receive[topic] for topic, each in self._subscriptions.items()}
+    def _receive(self, subscriptions: Mapping[str, Subscription], receive: Mapping[str, Receive]) -> None:
+        served = {each.raw: receive[topic] for topic, each in subscriptions.items()}
         try:
             if self._messages:
                 self._messages.serve(served)
             elif served:
                 assert self._failed is not None  # noqa: S101 - it has started
                 self._messages = MessageThread.serving(served, self._failed)
-        except RCL_ERRORS as error:
+        except (*RCL_ERRORS, OSError) as error:
             raise StartError(f"ROS messages cannot be received: {error}") from error
 
     def _event_thread(self) -> EventThread:

@@ -130,7 +130,8 @@ class Arrivals:
         eventfd = self._eventfds.pop(subscription)
         del self._subscriptions[eventfd]
         subscription.announce_to(None)
-        os.close(eventfd)  # which ends that epoll watches it
+        self._epoll.unregister(eventfd)  # closing it does that too, unless a child process is just being made
+        os.close(eventfd)
 
     def _remove_all(self) -> None:
         for subscription in list(self._eventfds):

@@ -121,10 +121,13 @@ class MessageThread(_WaitThread):
     def serve(self, receive: Mapping[RawSubscription, Receive]) -> None:
         """From now on these and no others, each by its function. To be called before the start, or while paused.
 
-        Raises one of `ros_node.RCL_ERRORS`.
+        Raises one of `ros_node.RCL_ERRORS`, or OSError, and then all is as it was.
         """
-        for subscription in receive.keys() - self._receive.keys():
-            self._arrivals.add(subscription)
+        with ExitStack() as adding:
+            for subscription in receive.keys() - self._receive.keys():
+                self._arrivals.add(subscription)
+                adding.callback(self._arrivals.remove, subscription)
+            adding.pop_all()
         for subscription in self._receive.keys() - receive.keys():
             self._arrivals.remove(subscription)
         self._receive = dict(receive)

@@ -58,11 +58,16 @@ class GatewayService:
             settings, around, self._encoding, ledger, self._tasks, lambda: bool(self.audience), self._deliver
         )
         self._topics = Topics(plan, around, outlet, ledger, self._tasks, self._deliver)
+        self._new_transport = transport
         self._transport = transport(self)
         self._answered = -_ANSWER_NS
         self._reader = Reader(self._encoding, inlet, self._tasks, around.reading, self._settle)
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
+
+    def anew(self) -> GatewayService:
+        """One like this, which was closed: with the same limits and books, without its clients."""
+        return GatewayService(self.plan, self._around, self._ledger, self._inlet, self._new_transport)
 
     async def open(self) -> None:
         """Raises StartError."""

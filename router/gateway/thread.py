@@ -79,7 +79,6 @@ class GatewayThread:
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
         self._services: dict[str, GatewayService] = {}
-        self._makers: dict[GatewayService, Callable[[], GatewayService]] = {}  # of another one that is the same
         self._hub = Hub(ros.topics, ros_interfaces(), self._loop)
         self._around = Surroundings(self._hub, self._converting, self._reading, failed, monotonic_ns, wall_ns)
         self._thread.start()
@@ -96,7 +95,9 @@ class GatewayThread:
         kept = {
             plan.settings.name: service
             for plan in program.gateways
-            if (service := self._services.get(plan.settings.name)) and are_same(service.plan, plan)
+            if (service := self._services.get(plan.settings.name))
+            and not service.is_closed
+            and are_same(service.plan, plan)
         }
         change = GatewayChange(kept, [], [each for each in self._services.values() if each.name not in kept])
         try:
@@ -119,13 +120,16 @@ class GatewayThread:
     async def _abandon(self, change: GatewayChange) -> None:
         for service in change.opened:
             await service.close()
-            del self._makers[service]
-        for service in change.left:
-            if service.is_closed:
-                self._makers[again := self._makers[service]()] = self._makers.pop(service)
-                self._services[service.name] = again
-                await again.open()
-                again.start()
+        async with AsyncExitStack() as opening:  # all of them, whatever one raises
+            for service in change.left:
+                if service.is_closed:
+                    opening.push_async_callback(self._open_again, service)
+
+    async def _open_again(self, service: GatewayService) -> None:
+        again = service.anew()
+        await again.open()
+        again.start()
+        self._services[again.name] = again
 
     def retire(self, change: GatewayChange) -> None:
         """Closes what nobody wants any more; `abandon` would still open it again."""
@@ -140,7 +144,6 @@ class GatewayThread:
         """From now on these serve, and no others."""
         self._services = change.services
         for service in change.left:
-            del self._makers[service]
             if service.name not in change.services:
                 self.kernel_drops.pop(service.name, None)
         self._call(self._start(change))
@@ -151,15 +154,9 @@ class GatewayThread:
 
     async def _open(self, plan: GatewayPlan, books: Books, outlets: InletOutlets) -> GatewayService:
         settings = plan.settings
-        style = ENCODINGS[settings.format].style
-
-        def made() -> GatewayService:
-            ledger = Ledger(settings, books, self._counts, outlets.report, wall_ns)
-            inlet = Inlet(plan, style, books, self._counts, outlets)
-            return GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))
-
-        service = made()
-        self._makers[service] = made
+        ledger = Ledger(settings, books, self._counts, outlets.report, wall_ns)
+        inlet = Inlet(plan, ENCODINGS[settings.format].style, books, self._counts, outlets)
+        service = GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))
         try:
             await service.open()
         except StartError as error:

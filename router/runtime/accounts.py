@@ -26,13 +26,17 @@ class Accounts:
 
     def make_room(self, books: Books) -> None:
         """For what books that continue ours count, beside what ours do."""
+        ours = dict(self.books.series())
+        new = [slot for series, slot in books.series() if series not in ours]
         for counts in self.threads:
             books.grow(counts)
+            for slot in new:  # where a program may have counted that was abandoned
+                counts[slot] = 0
 
     def settle(self, books: Books) -> None:
         """These are the books now; nobody counts by the earlier ones any more."""
-        self.books = books
         books.settle(self.threads)
+        self.books = books  # from here on others read them: they do not change any more
 
 
 class KernelDrops:

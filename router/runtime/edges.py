@@ -112,10 +112,10 @@ class Edges:
     def _swap(self, change: Change) -> None:
         """While nothing is received: on the receive thread, and with that of ROS standing still."""
         with self._ros.paused() if self._ros else nullcontext():
+            if self._ros is not None and change.topics is not None:
+                self._ros.apply(change.topics, change.wiring.take)  # first: it may still fail
             for listener in self.sockets.left(change.sockets):
                 self._receiving.finish(listener)
-            if self._ros is not None and change.topics is not None:
-                self._ros.apply(change.topics, change.wiring.take)
             change.wiring.succeed(self.wiring, self._around.keepers)
             self.wiring = change.wiring
             self.sockets.apply(change.sockets)

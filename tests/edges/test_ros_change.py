@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.edges.ros import RosEdge
+from router.edges.ros_arrivals import RawSubscription
 from router.errors import StartError
 from tests.edges.ros_opening import RELIABLE, SPAN, cdr, open_ros, string_topic
 
@@ -94,3 +95,27 @@ def test_what_was_prepared_can_be_abandoned(speaker: RosEdge) -> None:
     speaker.abandon(made)
     assert list(speaker.publish) == ["greeting"]
     wait_until(lambda: not speaker.topics.publishers("/farewell"))
+
+
+def test_a_change_that_fails_at_last_leaves_the_topics_as_they_were(
+    speaker: RosEdge, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    got: list[bytes] = []
+    receive: dict[str, Take] = {"greeting": lambda data, _: got.append(data), "farewell": lambda *_: None}
+    announce = RawSubscription.announce_to
+
+    def fail(subscription: RawSubscription, eventfd: int | None) -> None:
+        if eventfd is not None and subscription is made.subscriptions["farewell"].raw:
+            raise OSError(24, "Too many open files")
+        announce(subscription, eventfd)
+
+    with closing(open_ros(subscriptions=[string_topic()])) as ros:
+        ros.start(receive, print)
+        made = ros.prepare([], [string_topic(), string_topic(topic="farewell")], SPANS)
+        monkeypatch.setattr(RawSubscription, "announce_to", fail)
+        with ros.paused(), pytest.raises(StartError, match="Too many open files"):
+            ros.apply(made, receive)
+        ros.abandon(made)
+        wait_until(lambda: speaker.wanted["greeting"][0])
+        speaker.publish["greeting"](cdr("still there"))
+        wait_until(lambda: got == [cdr("still there")])
