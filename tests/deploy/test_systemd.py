@@ -56,6 +56,9 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A computer on which `make install-service` was done, for the simulated rover's table."""
     if not Path(ROUTER).exists():
         pytest.skip("needs .venv")
+    for tool in ("curl", "setpriv", "ss"):
+        if shutil.which(tool) is None:
+            pytest.skip(f"needs {tool}")
     if hidden := hidden_by(ROOT):
         pytest.skip(f"the machine has a {hidden} of its own, without this checkout")
     with machine(tmp_path_factory.mktemp("machine")) as found:
