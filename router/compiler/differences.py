@@ -69,7 +69,7 @@ def _changes(old: Mapping[str, str], new: Mapping[str, str]) -> Iterator[str]:
     for name in dict.fromkeys((*new, *old)):
         now, was = new.get(name, NONE), old.get(name, NONE)
         if now != was:
-            yield f"{name} is {now}, was {was}"
+            yield f"{name} is {' '.join(now.split())}, was {' '.join(was.split())}"
 
 
 def _parts(checked: Checked) -> Iterator[Named]:

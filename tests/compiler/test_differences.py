@@ -69,6 +69,10 @@ def test_a_table_differs_in_nothing_from_itself(told: Told) -> None:
             ],
         ),
         (
+            'routes: {pump_info: {destinations: [{endpoint: basestation, when: "enabled or\\n\\nspeed_rpm > 1\\n"}]}}',
+            ["route pump_info, destination basestation: when is enabled or speed_rpm > 1, was none"],
+        ),
+        (
             "routes: {pump_info: {destinations: [{endpoint: basestation, when: enabled, max_rate: 5 Hz}]}}",
             [
                 "route pump_info, destination basestation: when is enabled, was none",
