@@ -5,8 +5,11 @@ Knows payload cases and what the table calls senders; knows no file and no threa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate, chain, count, repeat
+from operator import getitem, itemgetter, le
+from typing import NamedTuple, cast
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
@@ -23,6 +26,7 @@ from router.table.model import Endpoint
 from router.types.protobuf import Envelope, PayloadCase
 
 _SEQUENCE = 0xFFFFFFFF
+_TAG = itemgetter(slice(2))
 _MOST_SHAPES = 8192
 _CLOCK_WAS_SET = 1_000_000
 """ns. What the wall clock has moved by beside the monotonic one; less is a clock that is being slewed."""
@@ -35,11 +39,11 @@ class _Shape(NamedTuple):
     """
 
     header: bytes
-    skip: int
+    skip: slice
     length: int
     channel: int
     size: int
-    note: Callable[[int], object]
+    notes: list[int]
     parse: Callable[[bytes], Message]
 
 
@@ -91,29 +95,21 @@ class Encoder:
 
     def add(self, batch: Sequence[Shown], wall: int, monotonic: int) -> None:
         """`wall` and `monotonic` are what the two clocks said when the batch was seen (ns)."""
-        latest = self._set_clocks(wall, monotonic)
-        shift, steady, sequence = self._shift, self._steady, self._sequence
-        head, opcode = HEAD.pack, Opcode.MESSAGE.value
-        chunk, append, offset = self._chunk, self._chunk.pieces.append, self._chunk.offset
-        for (at, listener, peer, data), shape in zip(batch, self._shapes_of(batch), strict=True):
-            came = at + shift
-            if came > steady:
-                steady = came if came < latest else latest  # noqa: FURB136 - `min` takes three times as long
-            sequence += 1
-            if shape is not None:
-                append(head(opcode, shape.length, shape.channel, sequence & _SEQUENCE, at, steady))
-                append(data[shape.skip :])
-                shape.note(at)
-                shape.note(offset)
-                offset += shape.size
-            else:
-                chunk.offset = offset
-                self._add_unusual(listener, peer, data, (sequence & _SEQUENCE, at, steady))
-                offset = chunk.offset
-        chunk.offset = offset
-        self._sequence, self._steady = sequence, steady
+        if not batch:
+            return
+        times, listeners, peers, data = zip(*batch, strict=True)
+        steady = self._steady_times(times, wall, monotonic)
+        shapes = self._shapes_of(listeners, peers, data)
+        if None in shapes:
+            for each, came, shape in zip(batch, steady, shapes, strict=True):
+                if shape is not None:
+                    self._add_usual((each[0],), (came,), (shape,), (each[3],))
+                else:
+                    self._add_unusual(each, came)
+        else:
+            self._add_usual(times, steady, cast("Sequence[_Shape]", shapes), data)
         self._datagrams += len(batch)
-        self._bytes += sum([len(data) for _, _, _, data in batch])
+        self._bytes += sum(map(len, data))
 
     def take(self) -> Chunk | None:
         """What was added since the last time, None where that is nothing."""
@@ -121,36 +117,61 @@ class Encoder:
         self._datagrams = self._bytes = 0
         return chunk
 
-    def _set_clocks(self, wall: int, monotonic: int) -> int:
-        """The latest time, by the clock that nobody sets, at which something in a batch can have come."""
+    def _steady_times(self, times: Sequence[int], wall: int, monotonic: int) -> Sequence[int]:
+        """What the clock that nobody sets said when each datagram came; as `times` while nobody sets the other."""
         if self._first_ahead is None:
             self._first_ahead = wall - monotonic
         now = monotonic + self._first_ahead
         if abs(now - wall - self._shift) > _CLOCK_WAS_SET:
             self._shift = now - wall
-        return now + _CLOCK_WAS_SET
+        latest, shift, steady = now + _CLOCK_WAS_SET, self._shift, self._steady
+        if not shift and steady <= times[0] and times[-1] <= latest and all(map(le, times, times[1:])):
+            self._steady = times[-1]
+            return times
+        found = [steady := max(steady, min(at + shift, latest)) for at in times]
+        self._steady = steady
+        return found
 
-    def _shapes_of(self, batch: Sequence[Shown]) -> list[_Shape | None]:
+    def _add_usual(
+        self, times: Sequence[int], steady: Sequence[int], shapes: Sequence[_Shape], data: Sequence[bytes]
+    ) -> None:
+        """Each is as its shape says. Nothing here is a loop of Python's own: that would take twice as long."""
+        skips, lengths, channels, sizes, notes = tuple(zip(*shapes, strict=True))[1:6]
+        sequences = map(_SEQUENCE.__and__, count(self._sequence + 1))
+        self._sequence += len(data)
+        heads = map(HEAD.pack, repeat(Opcode.MESSAGE.value), lengths, channels, sequences, times, steady)
+        chunk = self._chunk
+        payloads: Iterator[bytes] = map(getitem, data, skips)  # type: ignore[arg-type]  # mypy takes another overload
+        chunk.pieces += chain.from_iterable(zip(heads, payloads, strict=True))
+        *offsets, chunk.offset = accumulate(sizes, initial=chunk.offset)
+        deque(map(list.extend, notes, zip(times, offsets, strict=True)), maxlen=0)
+
+    def _shapes_of(
+        self, listeners: Sequence[str], peers: Sequence[Peer], data: Sequence[bytes]
+    ) -> Sequence[_Shape | None]:
         """None for each that is to be recorded raw."""
-        known, new = self._shapes.get, self._shape
-        found = [
-            known((listener, peer, len(data), data[:2])) or new(listener, peer, data)
-            for _, listener, peer, data in batch
+        keys = zip(listeners, peers, map(len, data), map(_TAG, data), strict=True)
+        shapes = list(map(self._shapes.get, keys))
+        if None in shapes:
+            shapes = list(map(self._shape, listeners, peers, data))
+        shapes = [
+            shape if shape is not None and each.startswith(shape.header) else None
+            for shape, each in zip(shapes, data, strict=True)
         ]
-        fitting = [
-            shape if shape is not None and data.startswith(shape.header) else None
-            for shape, (_, _, _, data) in zip(found, batch, strict=True)
-        ]
-        usual = [data for shape, (_, _, _, data) in zip(fitting, batch, strict=True) if shape is not None]
+        usual = (
+            [each for shape, each in zip(shapes, data, strict=True) if shape is not None] if None in shapes else data
+        )
         if _parses(self._known.envelope.message_class.FromString, b"".join(usual)):
-            return fitting
+            return shapes
         return [
-            shape if shape is not None and _parses(shape.parse, data[shape.skip :]) else None
-            for shape, (_, _, _, data) in zip(fitting, batch, strict=True)
+            shape if shape is not None and _parses(shape.parse, each[shape.skip]) else None
+            for shape, each in zip(shapes, data, strict=True)
         ]
 
     def _shape(self, listener: str, peer: Peer, data: bytes) -> _Shape | None:
         """None for a datagram that is not one field, encoded as protobuf encodes it, of a known case."""
+        if (known := self._shapes.get((listener, peer, len(data), data[:2]))) is not None:
+            return known
         tag = next((data[:size] for size in (1, 2, 3) if data[:size] in self._known.tags), None)
         header = _header(tag, data) if tag is not None and len(data) <= MAX_DATAGRAM else None
         if tag is None or header is None:
@@ -160,8 +181,9 @@ class Encoder:
         if channel is None:
             return None
         size = len(data) - len(header)
-        note, parse = self._chunk.index(channel).append, case.message_class.FromString
-        shape = _Shape(header, len(header), BEHIND_LENGTH + size, channel, HEAD.size + size, note, parse)
+        notes, parse = self._chunk.index(channel), case.message_class.FromString
+        skip = slice(len(header), None)
+        shape = _Shape(header, skip, BEHIND_LENGTH + size, channel, HEAD.size + size, notes, parse)
         if len(self._shapes) >= _MOST_SHAPES:
             self._shapes.clear()
         self._shapes[listener, peer, len(data), data[:2]] = shape
@@ -175,8 +197,11 @@ class Encoder:
             self._payload_channels[sender] = self._channels.payload(case, listener, peer, self._known.endpoint(peer))
         return self._payload_channels[sender]
 
-    def _add_unusual(self, listener: str, peer: Peer, data: bytes, times: tuple[int, int, int]) -> None:
+    def _add_unusual(self, shown: Shown, steady: int) -> None:
         """The datagram as it is, and its payload where there is one, so that people see that as well."""
+        at, listener, peer, data = shown
+        self._sequence += 1
+        times = (self._sequence & _SEQUENCE, at, steady)
         raw = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=self._known.endpoint(peer))
         self._chunk.add(self._channels.datagrams(), raw.SerializeToString(), *times)
         if len(data) > MAX_DATAGRAM:
