@@ -92,7 +92,9 @@ def _run(arguments: Sequence[str]) -> int:
             module.add_parser(subparsers)
         else:
             subparsers.add_parser(verb, help=summary)
-    args = parser.parse_args(arguments)
+    args, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        subparsers.choices[args.verb].error(f"unrecognized arguments: {' '.join(unknown)}")
     if module is None:
         raise AssertionError("argparse refuses what is no verb")
     try:

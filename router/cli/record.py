@@ -30,7 +30,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "routed, also what no route takes, with sender and time. Foxglove opens the file as it is, 'router replay' "
         "sends it again. To record always, without this command, give the table a 'record'.",
     )
-    parser.add_argument("table", nargs="?", type=Path, default=DEFAULT_TABLE, help=f"default: {DEFAULT_TABLE}")
+    parser.add_argument(
+        "table",
+        nargs="?",
+        type=Path,
+        default=DEFAULT_TABLE,
+        metavar="TABLE",
+        help=f"the table that it runs, for its metrics.address (default: {DEFAULT_TABLE})",
+    )
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: TABLE_TIME.mcap in this folder")
     parser.add_argument("--last", action="store_true", help="have the router save what it has kept in memory instead")
     parser.add_argument("--url", metavar="URL", help="of the running router (default: the table's metrics.address)")

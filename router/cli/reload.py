@@ -13,9 +13,10 @@ from router.tools import UsageError
 PATIENCE = 60.0
 """Seconds; a large table takes one to compile where there is much traffic."""
 
-_DESCRIPTION = f"""Have a running router read its table again, with all files that the table names, and
-take it over between two datagrams: nothing is lost, and what has not changed goes on as it is. A table with errors
-changes nothing; its findings are printed. SIGHUP does the same, and tells in the log.
+_DESCRIPTION = f"""\
+Have a running router read its table again, with all files that the table names, and take it over between two datagrams:
+nothing is lost, and what has not changed goes on as it is. A table with errors changes nothing; its findings are
+printed. SIGHUP does the same, and tells in the log.
 Exit code: {OK} it was taken over, {BAD_USAGE} wrong usage, {BAD_TABLE} it was not, 1 no router answers."""
 
 

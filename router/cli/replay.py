@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 
 DIFFERENT = 1
 
+_DESCRIPTION = """\
+Send the datagrams of a recording again, with the times between them, to the listeners of the table, from the addresses
+that it has for their senders. With --against, send nothing, but run them through the table and another one, and print
+what would be delivered differently; exit code 1 where anything would.
+"""
+
 EPILOG = """\
 examples:
   router replay rover_20260412T101500Z.mcap --table routes/sim.yaml
@@ -34,9 +40,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "replay",
         help=VERBS["replay"],
-        description="Send the datagrams of a recording again, with the times between them, to the listeners of the "
-        "table, from the addresses that it has for their senders. With --against, send nothing, but run them through "
-        "the table and another one, and print what would be delivered differently; exit code 1 where anything would.",
+        description=_DESCRIPTION,
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -18,18 +18,30 @@ if TYPE_CHECKING:
     from router.tools.tapping import Heard, HeardMessage
     from router.tools.wire import Wire
 
+_DESCRIPTION = """\
+Print what a running router receives, before it routes it, one line for each datagram: the fields that are not default.
+The router is asked where the table's 'metrics.address' says, on this computer; it does not wait for this terminal, and
+says how many datagrams were too many for it. With a port, or the name of an endpoint or listener, it is that UDP port
+instead, which must be free: no router then has part in it.
+"""
+
+_EPILOG = """\
+examples:
+  router tap imu_info gps_info --table routes/sim.yaml
+  router tap --from arm_board
+  router tap imu_info --where 'accel_z < 0 or not is_calibrated'
+  router tap 9000
+  router tap --topic imu_data
+"""
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "tap",
         help=VERBS["tap"],
-        description="Print what a running router receives, before it routes it, one line for each datagram: the fields "
-        "that are not default. The router is asked where the table's 'metrics.address' says, on this computer; it "
-        "does not wait for this terminal, and says how many datagrams were too many for it. With a port, or the name "
-        "of an endpoint or listener, it is that UDP port instead, which must be free: no router then has part in it.",
-        epilog="router tap;  router tap imu_info gps_info;  router tap --from arm_board;  "
-        "router tap imu_info --where 'accel_z < 0 or not is_calibrated';  router tap 9000;  "
-        "router tap --topic imu_data",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "words",

@@ -39,6 +39,14 @@ def test_wrong_usage_ends_with_2(arguments: list[str], capsys: pytest.CaptureFix
     assert "usage: router" in capsys.readouterr().err
 
 
+def test_an_option_that_a_verb_does_not_have_shows_those_that_it_has(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["record", "--table", "routes/sim.yaml"])
+    said = capsys.readouterr().err
+    assert said.startswith("usage: router record")
+    assert "router record: error: unrecognized arguments: --table" in said
+
+
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     try:
         installed = version("rover-router")
