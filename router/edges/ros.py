@@ -125,8 +125,8 @@ class RosEdge:
     def apply(self, change: RosChange, receive: Mapping[str, Receive]) -> None:
         """From now on these are used. To be called while paused; `receive` is as in `start`.
 
-        What has arrived on what is to be closed is received before that, in the way it was until now. Raises StartError,
-        and then the topics are as they were.
+        What has arrived on what is to be closed is received before that, in the way it was until now.
+        Raises StartError, and then the topics are as they were.
         """
         change.left = [
             *left_by(change.publications, self._publications),
