@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 # Before anything imports rclpy. Domains above 101 would use ports that the kernel gives to others.
@@ -23,3 +25,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # No deadline: how long an example takes says more about the machine than about the code.
 settings.register_profile("router", deadline=None)
 settings.load_profile("router")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _in_the_checkout() -> None:
+    """Wherever the tests were started: files below here are told by their path from here."""
+    os.chdir(Path(__file__).parent.parent)

@@ -15,7 +15,6 @@ from router.edges.tap_stream import Lost
 from router.tools import UsageError
 from router.tools import recording_tap as module
 from router.tools.recording_tap import TapRecording
-from tests.acceptance.site import ROOT
 from tests.edges.recorder_rig import again, endpoints, imu, read, seen, wire
 from tests.ports import free_port
 
@@ -57,10 +56,7 @@ def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [[], ["--last"]])
-def test_a_router_that_does_not_run_is_told(
-    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(ROOT)  # where the table is that is meant when none is named
+def test_a_router_that_does_not_run_is_told(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     url = f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
     assert main(["record", *words, "--url", url]) == 1
     assert f"router record: no router answers at {url}" in capsys.readouterr().err
