@@ -61,6 +61,28 @@ def test_each_example_of_a_table_is_good_in_place_of_what_the_rover_has(tmp_path
     assert list(map(str, check_table(table).diagnostics)) == []
 
 
+# -- links ---------------------------------------------------------------------------------------------------------
+
+TEXTS = [*DOCS.parent.glob("*.md"), *DOCS.glob("*.md")]
+
+
+def anchors(page: Path) -> set[str]:
+    """Those that code hosts give to headings."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+        for heading in re.findall(r"^#+ (.*)", text, re.MULTILINE)
+    }
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
+def test_links_to_files_and_headings_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!\w+://)([^)\s#]*)(?:#([^)\s]*))?\)", page.read_text(encoding="utf-8"))
+    places = [((page.parent / path).resolve() if path else page, anchor) for path, anchor in links]
+    wrong = [place for place in places if not place[0].exists() or (place[1] and place[1] not in anchors(place[0]))]
+    assert wrong == []
+
+
 # -- docs/gateway.md -----------------------------------------------------------------------------------------------
 
 VECTOR = ros_interfaces().get("geometry_msgs/msg/Vector3")
