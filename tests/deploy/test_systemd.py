@@ -143,10 +143,12 @@ def test_a_killed_router_comes_back(running: Machine) -> None:
 def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_where(running: Machine) -> None:
     running.shell(
         "mkdir -p /run/systemd/system/rover-router.service.d\n"
-        "printf '[Service]\\nWatchdogSec=1s\\n' > /run/systemd/system/rover-router.service.d/test.conf\n"
-        "systemctl daemon-reload; systemctl restart rover-router; sleep 2"
+        "printf '[Service]\\nWatchdogSec=2s\\n' > /run/systemd/system/rover-router.service.d/test.conf\n"
+        "systemctl daemon-reload; systemctl restart rover-router"
     )
-    before = running.show("MainPID")  # as it is fed, it lives
+    before = running.show("MainPID")
+    running.shell("sleep 2.5")
+    assert running.show("MainPID") == before  # as it is fed, it lives
     running.shell(f"kill -STOP {before}")
     running.wait_for(
         f"systemctl is-active -q rover-router && [ $(systemctl show -P MainPID rover-router) != {before} ]"
