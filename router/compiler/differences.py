@@ -6,14 +6,16 @@ Knows no running router, and no file but by the positions that findings have too
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 from router.compiler.check import Checked
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.settings_text import duration, field_map, flat
 from router.compiler.topics import qos_of
-from router.errors import SourceSpan
+from router.errors import SourceSpan, shown_path
 from router.table.model import Deadman, Destination, Gateway, Route, RouteTable, Topic
 
 NONE = "none"
@@ -105,7 +107,8 @@ def _surroundings(table: RouteTable) -> Iterator[Named]:
     }
     yield ("table", ""), Part(SourceSpan(table.routes_span.file), "", settings)
     if table.record is not None:
-        yield ("record", ""), Part(table.record.span, str(table.record.directory), flat(table.record))
+        directory = shown_path(Path(os.path.normpath(table.record.directory)))
+        yield ("record", ""), Part(table.record.span, directory, flat(table.record))
 
 
 def _route_parts(checked: CheckedRoute) -> Iterator[tuple[str, Part]]:

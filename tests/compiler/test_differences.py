@@ -125,6 +125,19 @@ routes:
     assert told(topics) == []
 
 
+def test_a_record_that_is_new_is_told_with_its_folder_as_a_person_writes_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "routes"
+    folder.mkdir()
+    plain = f"version: 1\nextends: {asset('routes') / 'legacy.yaml'}\n"
+    (folder / "old.yaml").write_text(plain)
+    (folder / "new.yaml").write_text(plain + "record: {directory: ../recordings}\n")
+    (found,) = differences(checked(folder / "old.yaml"), checked(folder / "new.yaml"))
+    assert (found.subject, found.text) == ("record", "added, recordings")
+
+
 def test_what_is_added_one_way_is_removed_the_other() -> None:
     there, back = (differences(*tables) for tables in ((checked(ROVER), checked(SIM)), (checked(SIM), checked(ROVER))))
     added = {(each.subject, each.part) for each in there if each.text.startswith("added")}
