@@ -53,8 +53,7 @@ class Runner:
                 result.findings.append(error.diagnostic)
                 return result
             self._told(happened)
-            if not step.expected.anything:
-                result.failures += self._comparison.failures(step, happened)
+            result.failures += self._comparison.failures(step, happened)
         return result
 
     def _happened(self, step: Step, rehearsal: Rehearsal) -> Happened:

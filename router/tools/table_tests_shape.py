@@ -19,9 +19,11 @@ def read_shape(path: Path) -> MappingNode:
     """The nodes of a test file whose shape is right. Raises TableError with every finding."""
     findings: list[Diagnostic] = []
     source = read_source(path)
+    message = "a test file is a mapping with the key 'tests'"
+    if not source.text.strip():
+        raise TableError([Diagnostic(SourceSpan(source.file), Code.WRONG_TYPE, message)])
     root = compose(source, {}, findings)
     if not isinstance(root, MappingNode):
-        message = "a test file is a mapping with the key 'tests'"
         raise TableError([*findings, Diagnostic(root.span, Code.WRONG_TYPE, message)])
     if not findings and is_sound(root):
         findings += _findings(root, SourceSpan(source.file))

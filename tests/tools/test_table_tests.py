@@ -424,14 +424,15 @@ def test_a_drop_that_is_not_listed_fails_though_the_target_got_others(tmp_path: 
     assert messages(tmp_path, routes, tests) == ["dropped for basestation: rate_limited, not nothing"]
 
 
-def test_what_happens_between_two_steps_fails(tmp_path: Path) -> None:
-    tests = """
+@pytest.mark.parametrize("expect", ["nothing", "any"])
+def test_what_happens_between_two_steps_fails(tmp_path: Path, expect: str) -> None:
+    tests = f"""
         a:
           steps:
-            - given: {topic: drive_motor}
+            - given: {{topic: drive_motor}}
               expect: any
             - at: 650ms
-              expect: nothing
+              expect: {expect}
         """
     (failure,) = failures(tmp_path, DRIVE, tests)
     assert failure.message == (
@@ -521,6 +522,13 @@ def test_table_is_the_one_that_the_file_is_named_after_or_that_it_names(tmp_path
         read_test_file(other, DEFINITIONS)
     other.write_text("table: table.yaml\ntests: {a: {expect: nothing}}\n")
     assert read_test_file(other, DEFINITIONS).checked.path == tmp_path / "table.yaml"
+
+
+def test_an_empty_file_is_told_what_a_test_file_is(tmp_path: Path) -> None:
+    path = tmp_path / "empty.test.yaml"
+    path.write_text("\n")
+    with pytest.raises(TableError, match="a test file is a mapping with the key 'tests'"):
+        read_test_file(path, DEFINITIONS)
 
 
 def test_table_with_errors_is_told_as_validate_does(tmp_path: Path) -> None:
