@@ -605,9 +605,8 @@ def test_a_late_joiner_on_zenoh_gets_schema_and_latest_value_at_once_and_can_sen
             assert b'"namespace":"std_msgs::msg"' in found["rovers/loki/schema/std_msgs/msg/String"]
             heard: list[bytes] = []
             session.declare_subscriber("rovers/loki/data/**", lambda sample: heard.append(sample.payload.to_bytes()))
-            time.sleep(0.5)  # until the router knows of it, or the next value would be lost
-            now.speaker.say("/gw/word", {"data": "next"})
-            wait_until(lambda: any(data.endswith(b'{"data":["next"]}') for data in heard), "the next value")
+            with repeating(partial(now.speaker.say, "/gw/word", {"data": "next"})):  # the router knows of it late
+                wait_until(lambda: any(data.endswith(b'{"data":["next"]}') for data in heard), "the next value")
             head = struct.pack("<dB", time.time(), 0) + b"/gw/set\0std_msgs/msg/Int32\0"
             put = partial(session.put, "rovers/loki/inbound/gw/set", head + b'{"data":[5]}')
             with repeating(put):

@@ -24,7 +24,7 @@ from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "deploy" / "ros" / "rover_router"
-PATIENCE = 30.0
+PATIENCE = 120.0
 
 TABLE = """\
 version: 1
