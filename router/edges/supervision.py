@@ -19,6 +19,9 @@ from router.edges.timekeeper import Timekeeper
 _LOOKS = 4
 """How often the watchdog looks in the time that it is given."""
 
+PATIENCE = 5.0
+"""Seconds for which a service manager may be too busy to listen; reloads and the end wait that long at most."""
+
 _REMEDY = "ListenDatagram= in rover-router.socket says something else than the table: install the service anew"
 
 
@@ -79,6 +82,7 @@ def tell(*lines: str) -> None:
         return
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as telling:
+            telling.settimeout(PATIENCE)
             telling.connect(f"\0{place[1:]}" if place.startswith("@") else place)
             telling.send("\n".join(lines).encode())
     except OSError as error:  # it will do about that what it does about a router that is silent

@@ -83,6 +83,18 @@ def test_a_service_manager_that_is_gone_is_told_of_in_the_log(tmp_path: Path, mo
     assert [line["event"] for line in log] == ["the service manager cannot be told"]
 
 
+def test_a_service_manager_that_does_not_listen_holds_nobody_up(
+    manager: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("router.edges.supervision.PATIENCE", 0.05)
+    with capture_logs() as logged:
+        for _ in range(1000):
+            if logged:
+                break
+            tell("READY=1")
+    assert [entry["event"] for entry in logged] == ["the service manager cannot be told"]
+
+
 def test_the_watchdog_is_fed_only_while_there_is_progress(manager: socket.socket) -> None:
     reached = 7
     watchdog = Watchdog(lambda: reached, 100, now=1000)
