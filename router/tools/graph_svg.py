@@ -13,6 +13,7 @@ from router.edges.route_map import COLUMNS, Link, Node, RouteMap
 _STYLE = """
 .route-map { --ground: #fff; --box: #f3f4f6; --text: #000; --faint: #505050; --line: #b4b8bf; --edge: #7d838c;
   --endpoint: #0047b3; --topic: #00602b; --gateway: #8a1c9c; background: var(--ground);
+  color-scheme: light dark;   /* browsers that darken pages on their own leave this one as it is */
   font-family: system-ui, "DejaVu Sans", sans-serif; }
 @media (prefers-color-scheme: dark) {
   .route-map { --ground: #101215; --box: #1b1e23; --text: #f2f4f7; --faint: #a3a9b3; --line: #474d57; --edge: #7d838c;

@@ -52,3 +52,8 @@ def test_it_refers_to_nothing_outside_itself(table: RouteTable) -> None:
     text = svg(route_map(table), "title").replace("http://www.w3.org/2000/svg", "")
     for outside in ("http:", "https:", "url(", "@import", "href", "<script"):
         assert outside not in text
+
+
+def test_browsers_that_darken_pages_on_their_own_leave_it_alone(table: RouteTable) -> None:
+    """They would make its dark boxes light, and keep the light text in them."""
+    assert "color-scheme: light dark" in svg(route_map(table), "title").replace("prefers-color-scheme", "")
