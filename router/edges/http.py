@@ -19,8 +19,10 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from http.server import ThreadingHTTPServer
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from router.edges.http_answers import Answers
@@ -33,6 +35,9 @@ from router.errors import SourceSpan, StartError
 from router.table.model import Address
 
 MOST_CONNECTIONS = 64
+
+PATIENCE = 5.0
+"""Seconds after which a connection that has asked nothing, or is still asking, goes where another one needs room."""
 
 
 class HttpServer:
@@ -68,7 +73,7 @@ class HttpServer:
 
 
 class _Server(ThreadingHTTPServer):
-    """Of a bounded number of connections; those beyond it are closed at once."""
+    """Of a bounded number of connections; those beyond it are closed at once, unless there is one that only waits."""
 
     daemon_threads = True
     block_on_close = False
@@ -76,8 +81,9 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, address: Address, answers: Answers) -> None:
         self._connections: set[socket.socket] = set()
+        self._waiting: dict[socket.socket, float] = {}  # since when (monotonic, s): those that wait longest come first
         self._changing = threading.Lock()
-        super().__init__(address, lambda *connection: Connection(answers, *connection))
+        super().__init__(address, partial(Connection, answers, self._waits, self._asks))
 
     def server_bind(self) -> None:
         """As HTTPServer does, but without asking the network for this computer's name."""
@@ -88,14 +94,34 @@ class _Server(ThreadingHTTPServer):
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         with self._changing:
-            if len(self._connections) >= MOST_CONNECTIONS:
+            if len(self._connections) >= MOST_CONNECTIONS and not self._has_made_room():
                 return False
             self._connections.add(request)
             return True
 
+    def _has_made_room(self) -> bool:
+        """Who sends a request byte by byte could hold all connections for ever."""
+        longest = next(iter(self._waiting), None)
+        if longest is None or monotonic() - self._waiting[longest] < PATIENCE:
+            return False
+        del self._waiting[longest]
+        self._connections.discard(longest)
+        with suppress(OSError):  # its other end has gone already
+            longest.shutdown(socket.SHUT_RDWR)
+        return True
+
+    def _waits(self, request: socket.socket) -> None:
+        with self._changing:
+            self._waiting[request] = monotonic()
+
+    def _asks(self, request: socket.socket) -> None:
+        with self._changing:
+            self._waiting.pop(request, None)
+
     def shutdown_request(self, request: Any) -> None:
         with self._changing:
             self._connections.discard(request)
+            self._waiting.pop(request, None)
         super().shutdown_request(request)
 
     def end_connections(self) -> None:

@@ -19,9 +19,10 @@ def refusal(peer: str, own: str, headers: Message) -> str | None:
     """
     if not ipaddress.ip_address(peer).is_loopback and peer != own:
         return f"only from the router's own computer, not from {peer}"
-    if any(headers.get(name) for name in _BY_BROWSERS):
+    if any(name in headers for name in _BY_BROWSERS):
         return "not for browsers: use the command line"
-    if not _is_plain(headers.get("Host", "")):
+    hosts = headers.get_all("Host", [])
+    if len(hosts) != 1 or not _is_plain(hosts[0]):
         return "only by an IP address or localhost, not by a name"
     return None
 

@@ -6,6 +6,7 @@ Knows the protocol; what is answered comes from `http_answers` and `http_tap`.
 from __future__ import annotations
 
 import gzip
+import socket
 from collections.abc import Callable
 from contextlib import closing
 from http import HTTPStatus
@@ -28,16 +29,36 @@ GZIP_FROM = 1000
 
 
 class Connection(BaseHTTPRequestHandler):
-    """Lives in a thread of its own until the other end goes."""
+    """Lives in a thread of its own until the other end goes.
+
+    `waits` and `asks` are called when it begins to wait for a request, and when there is a whole one.
+    """
 
     protocol_version = "HTTP/1.1"
     timeout = IDLE_SECONDS
     wbufsize = -1
     """Head and body of an answer leave together."""
 
-    def __init__(self, answers: Answers, *connection: Any) -> None:
+    def __init__(
+        self,
+        answers: Answers,
+        waits: Callable[[socket.socket], None],
+        asks: Callable[[socket.socket], None],
+        *connection: Any,
+    ) -> None:
         self._answers = answers
+        self._waits = waits
+        self._asks = asks
         super().__init__(*connection)
+
+    def handle_one_request(self) -> None:
+        self._waits(self.connection)
+        super().handle_one_request()
+
+    def parse_request(self) -> bool:
+        is_whole = super().parse_request()
+        self._asks(self.connection)
+        return is_whole
 
     def do_GET(self) -> None:
         url = urlsplit(self.path)
@@ -93,6 +114,8 @@ class Connection(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.send_header("Connection", "close")
         self.end_headers()
+        if self.command == "HEAD":
+            return
         with closing(Tap(running.mirror, wants)) as tap:
             for piece in tap.stream():
                 self.wfile.write(piece)

@@ -7,13 +7,14 @@ import json
 import socket
 import struct
 from collections.abc import Iterator, Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from email.message import Message
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import router.edges.http
 import router.edges.http_answers
 from router.edges.http import MOST_CONNECTIONS, HttpServer
 from router.edges.http_callers import refusal
@@ -113,6 +114,11 @@ def test_a_head_without_a_body_tells_how_long_it_would_be(server: HttpServer, pa
     assert int(head.headers["Content-Length"]) > 0
 
 
+def test_the_head_of_a_tap_ends(server: HttpServer) -> None:
+    head = ask(server, "/tap", "HEAD")
+    assert (head.status, head.text) == (200, "")
+
+
 def test_a_connection_serves_one_question_after_the_other(server: HttpServer) -> None:
     with closing(http.client.HTTPConnection(*server.address, timeout=10)) as connection:
         for path in ("/status.json", "/nothing", "/ready"):
@@ -156,6 +162,7 @@ def test_what_is_not_kept_cannot_be_saved(running: FakeRunning) -> None:
     "headers",
     [
         {"Origin": "http://127.0.0.1:9108"},
+        {"Origin": ""},
         {"Sec-Fetch-Site": "cross-site"},
         {"Host": "rover.example.org"},
         {"Host": "rover.example.org:9108"},
@@ -184,6 +191,12 @@ def test_only_the_own_computer_can_order(peer: str, own: str, is_refused: bool) 
     assert (refusal(peer, own, headers) is not None) == is_refused
 
 
+def test_who_names_two_hosts_can_order_nothing() -> None:
+    headers = Message()
+    headers["Host"], headers["host"] = "127.0.0.1:9108", "rover.example.org"
+    assert refusal("127.0.0.1", "127.0.0.1", headers) is not None
+
+
 def test_of_too_many_connections_the_last_are_closed(server: HttpServer) -> None:
     kept = [socket.create_connection(server.address, 10) for _ in range(MOST_CONNECTIONS)]
     try:
@@ -193,6 +206,16 @@ def test_of_too_many_connections_the_last_are_closed(server: HttpServer) -> None
         for each in kept:
             each.close()
     wait_until(lambda: answers(server), "room for one more")
+
+
+def test_who_does_not_come_to_an_end_makes_room_for_others(server: HttpServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(router.edges.http, "PATIENCE", 0.2)
+    with ExitStack() as opened:
+        slow = [opened.enter_context(socket.create_connection(server.address, 10)) for _ in range(MOST_CONNECTIONS)]
+        for each in slow:
+            each.sendall(b"GET /ready HTTP/1.1\r\nHost: 127")
+        for _ in range(3):
+            wait_until(lambda: answers(server), "room for one more")
 
 
 def answers(server: HttpServer) -> bool:
