@@ -74,8 +74,8 @@ class Browser:
         return page
 
     def close(self) -> None:
+        self.call("Browser.close")  # a signal would leave files of its own behind
         self._stack.close()
-        self._process.terminate()
         self._process.wait(PATIENCE)
 
 
