@@ -12,7 +12,7 @@ from contextlib import closing
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from prometheus_client.exposition import gzip_accepted
 
@@ -61,20 +61,20 @@ class Connection(BaseHTTPRequestHandler):
         return is_whole
 
     def do_GET(self) -> None:
-        url = urlsplit(self.path)
-        query = parse_qs(url.query)
-        if url.path == "/tap":
+        path, _, asked = self.path.partition("?")
+        query = parse_qs(asked)
+        if path == "/tap":
             self._for_programs_here(lambda: self._tap(query.get("case", []), query.get("from", [])))
-        elif url.path == "/metrics":
+        elif path == "/metrics":
             self._answer(self._answers.metrics(self.headers.get("Accept", "")))
         else:
-            self._answer(self._answers.get(url.path, query))
+            self._answer(self._answers.get(path, query))
 
     do_HEAD = do_GET  # noqa: N815 - as http.server calls it
 
     def do_POST(self) -> None:
         self.close_connection = True  # what it may have brought along is not read
-        self._for_programs_here(lambda: self._answer(self._answers.post(urlsplit(self.path).path)))
+        self._for_programs_here(lambda: self._answer(self._answers.post(self.path.partition("?")[0])))
 
     def _for_programs_here(self, serve: Callable[[], None]) -> None:
         why = refusal(self.client_address[0], self.connection.getsockname()[0], self.headers)

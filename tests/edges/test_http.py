@@ -18,6 +18,7 @@ import router.edges.http
 import router.edges.http_answers
 from router.edges.http import MOST_CONNECTIONS, HttpServer
 from router.edges.http_callers import refusal
+from router.edges.log import logger
 from router.edges.running import ReloadResult
 from router.errors import Code, Diagnostic, RouterError, SourceSpan
 from router.table.model import Address
@@ -226,12 +227,28 @@ def answers(server: HttpServer) -> bool:
 
 
 @pytest.mark.parametrize(
-    "nonsense", [b"", b"GET\r\n\r\n", b"\x16\x03\x01" + bytes(100), b"GET / HTTP/1.1\r\nA: " + b"x" * 99999]
+    "nonsense",
+    [
+        b"",
+        b"GET\r\n\r\n",
+        b"\x16\x03\x01" + bytes(100),
+        b"GET / HTTP/1.1\r\nA: " + b"x" * 99999,
+        b"GET http://[::1 HTTP/1.1\r\n\r\n",
+        b"GET /tap?case=%ff%00&&==;&from=[ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    ],
 )
-def test_nonsense_ends_its_own_connection_only(server: HttpServer, nonsense: bytes) -> None:
+def test_nonsense_ends_its_own_connection_only(
+    server: HttpServer, nonsense: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(logger, "critical", lambda event, **_: told.append(event))
     with socket.create_connection(server.address, 10) as caller:
         caller.sendall(nonsense)
+        caller.shutdown(socket.SHUT_WR)
+        while caller.recv(65536):
+            pass
     assert ask(server, "/ready").status == 200
+    assert not told
 
 
 def test_closing_minds_nobody_who_has_gone(running: FakeRunning) -> None:
