@@ -82,6 +82,9 @@ class Continuous:
     def _file_for(self, chunk: Chunk, now: int) -> RecordingFile:
         if self._file is not None and self._file.size + chunk.size_in_file > self._max_size:
             self.close()
+        if self._file is not None and self._file.is_removed:
+            logger.warning("somebody removed the recording that was being written", file=str(self._file.path))
+            self.close()
         if self._file is None:
             self._directory.make_room(self._max_size)
             self._file = self._directory.new(wall_ns(), "", self._channels, self._about())

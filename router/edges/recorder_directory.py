@@ -48,9 +48,13 @@ class RecordingDirectory:
         raise FileExistsError(errno.EEXIST, f"there are a thousand recordings of {time}", str(self.path))
 
     def make_room(self, coming: int, writing: Path | None = None) -> None:
-        """Removes the oldest, by name, until there is room for `coming` bytes. The one at `writing` is not counted."""
+        """Removes the oldest, by name, until there is room for `coming` bytes. The one at `writing` is not counted.
+
+        Somebody may have removed the directory; then it is made again.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
         ours = sorted(path for path in self.path.iterdir() if path != writing and self._ours.fullmatch(path.name))
-        sizes = {path: path.stat().st_size for path in ours}
+        sizes = {path: size for path in ours if (size := _size(path)) is not None}
         total = sum(sizes.values())
         for path, size in sizes.items():
             if total + coming <= self._keep:
@@ -58,6 +62,14 @@ class RecordingDirectory:
             path.unlink(missing_ok=True)
             total -= size
             logger.info("removed the oldest recording, to keep within 'keep'", file=str(path), bytes=size)
+
+
+def _size(path: Path) -> int | None:
+    """None for what somebody has removed meanwhile."""
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return None
 
 
 def open_directory(settings: RecordSettings, stem: str) -> RecordingDirectory:

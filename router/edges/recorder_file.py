@@ -60,6 +60,16 @@ class RecordingFile:
             path.unlink()
             raise
 
+    @property
+    def is_removed(self) -> bool:
+        """Whether somebody has removed it: what is written to it is in no directory any more."""
+        return os.fstat(self._descriptor).st_nlink == 0
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no chunk in it."""
+        return not self._indexes
+
     def write(self, chunk: Chunk) -> None:
         """What could not be written whole is cut off again."""
         introduced = self._introduce(chunk)

@@ -77,6 +77,10 @@ class Saving:
         try:
             for chunk in chunks:
                 file.write(chunk)
+        except OSError:
+            if file.is_empty:
+                file.path.unlink(missing_ok=True)
+            raise
         finally:
             file.close()
         return file.path

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from time import monotonic, sleep, time_ns
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,7 +19,7 @@ from router.edges.mirror import Seen
 from router.edges.recorder import MOST_WAITING, Recorder, RecordError
 from router.errors import StartError
 from router.tools.recording import Recording
-from tests.edges.recorder_rig import FakeMirror, again, imu, read, running, seen, settings
+from tests.edges.recorder_rig import FakeMirror, again, imu, read, running, seen, settings, wire
 
 PATIENCE = 20.0
 
@@ -214,6 +216,48 @@ def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
         show(made, mirror, now(imu(2)))
         monkeypatch.undo()
     assert files(tmp_path) == []
+
+
+def test_what_cannot_be_saved_leaves_no_empty_file_and_can_be_saved_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.write
+
+    def full_after_the_head(descriptor: int, data: bytes) -> int:
+        return real(descriptor, data) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
+
+    with recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
+        mirror.show(batch := now(imu(1), imu(2)))
+        monkeypatch.setattr(os, "write", full_after_the_head)
+        with pytest.raises(RecordError, match="No space left"):
+            made.save("http")
+        assert files(tmp_path) == []
+        monkeypatch.setattr(os, "write", real)
+        assert [again(each) for each in read(made.save("http"))] == batch
+
+
+def test_where_the_directory_is_removed_it_is_made_again(tmp_path: Path) -> None:
+    directory = tmp_path / "recordings"
+    with recorder(directory, last=10**11) as (made, mirror):
+        show(made, mirror, now(imu(1)))
+        shutil.rmtree(directory)
+        show(made, mirror, batch := now(imu(2)))
+        [path] = files(directory)
+        assert [again(each) for each in read(path)] == batch
+        assert len(read(made.save("http"))) == 2
+
+
+def test_what_came_before_a_reload_is_saved_as_it_was_known_then(tmp_path: Path) -> None:
+    mirror = FakeMirror()
+    router = running(mirror)
+    with closing(Recorder(router, settings(tmp_path, continuous=False, last=10**11))) as made:
+        mirror.show(now(imu(1)))
+        table: Any = SimpleNamespace(path=Path("routes/rover.yaml"), endpoints={})
+        changed = SimpleNamespace(table=table, envelope=wire().envelope, protos_sha256="1" * 64)
+        router.program = changed  # type: ignore[misc, assignment]
+        mirror.show(now(imu(2)))
+        saved = made.save("http")
+    assert [each.endpoint for each in read(saved)] == ["sensor_board", ""]
 
 
 def test_what_comes_after_the_end_is_refused(tmp_path: Path) -> None:
