@@ -7,8 +7,6 @@ Between two datagrams it does what others ask for: so what it calls can be repla
 from __future__ import annotations
 
 import select
-import socket
-import struct
 import sys
 import threading
 import time
@@ -18,24 +16,15 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from time import monotonic_ns
 
-from router.edges.coalescing import SAMPLE, Coalescing
+from router.edges.coalescing import SAMPLE
+from router.edges.intake import TURN, WAIT, Intake, Receive
 from router.edges.udp import Listener
-
-Receive = Callable[[bytes, "tuple[str, int]"], None]
-
-_WAIT = socket.MSG_TRUNC.value
-_LOOK = _WAIT | socket.MSG_DONTWAIT.value
 
 _PATIENCE = 0.25
 """Seconds for which it waits for a datagram before it looks whether there is something else to do."""
 
-_TIMEVAL = struct.Struct("@ll")
-
 _MOST_WAITING = 1 << 16
 """Datagrams that are taken from a socket at its end, at most: more than a receive buffer holds."""
-
-_TURN = 4
-"""The most that one of several listeners may hand in while the others wait."""
 
 
 class ReceiveThread:
@@ -57,7 +46,7 @@ class ReceiveThread:
     ) -> None:
         self._size = limit + 1
         self._enough = enough
-        self._intakes: list[_Intake] = []
+        self._intakes: list[Intake] = []
         self.serve(listeners, receive)
         self._failed = failed
         self._ended = False
@@ -76,7 +65,7 @@ class ReceiveThread:
     def serve(self, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
         """From now on these listeners, each by `receive[listener.name]`. For a task only, once it has started."""
         self._listeners = listeners
-        self._intakes = [_Intake(each, receive[each.name], self._size, self._enough) for each in listeners]
+        self._intakes = [Intake(each, receive[each.name], self._size, self._enough) for each in listeners]
 
     def give_to(self, receive: Mapping[str, Receive]) -> None:
         """From now on each listener's datagrams go to `receive[listener.name]`. For a task only."""
@@ -132,7 +121,7 @@ class ReceiveThread:
                 self._empty(intake)
         self._ended = True
 
-    def _empty(self, intake: _Intake) -> None:
+    def _empty(self, intake: Intake) -> None:
         for _ in range(_MOST_WAITING):
             try:
                 if not intake.take(1):
@@ -162,7 +151,7 @@ class ReceiveThread:
             since = monotonic_ns()
             for _ in range(SAMPLE):
                 try:
-                    data, peer = receive_from(size, _WAIT)
+                    data, peer = receive_from(size, WAIT)
                 except BlockingIOError:
                     break
                 if peer is None:  # input has ended
@@ -195,7 +184,7 @@ class ReceiveThread:
                         looks[descriptor] = time.monotonic() + rest
                 for descriptor in _due(looks):
                     taken, rest = intakes[descriptor].take_some()
-                    if taken == _TURN:
+                    if taken == TURN:
                         continue
                     if rest:
                         looks[descriptor] = time.monotonic() + rest
@@ -216,53 +205,3 @@ def _ready(waiting: select.epoll, looks: Mapping[int, float]) -> list[int]:
 def _due(looks: Mapping[int, float]) -> list[int]:
     now = time.monotonic() if looks else 0.0
     return [descriptor for descriptor, at in looks.items() if at <= now]
-
-
-class _Intake:
-    """One listener's datagrams, and how long it rests between looks."""
-
-    def __init__(self, listener: Listener, receive: Receive, size: int, enough: Callable[[], int]) -> None:
-        self.listener = listener
-        self.descriptor = listener.socket.fileno()
-        self._socket = listener.socket
-        self.receive_from = listener.socket.recvfrom
-        self.receive = receive
-        self.size = size
-        self.coalescing = Coalescing(listener.coalesce, enough)
-        self._taken = 0  # since the last look at the clock, or the last rest
-        self._since = 0
-
-    def wait_at_most(self, seconds: float) -> None:
-        """A blocking receive ends with BlockingIOError after that; Python's own timeout would cost a call of poll."""
-        timeout = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
-
-    def take(self, most: int) -> int:
-        """Takes what has arrived, and returns how much that was: less than `most` when there is no more."""
-        receive, receive_from, size, flags = self.receive, self.receive_from, self.size, _LOOK
-        for taken in range(most):
-            try:
-                data, peer = receive_from(size, flags)
-            except BlockingIOError:  # also for one that arrived damaged
-                return taken
-            receive(data, peer)
-        return most
-
-    def take_one(self) -> tuple[int, float]:
-        """For one of several listeners that was waited for: how many it took, and for how long it rests then."""
-        taken, rest = self.take(1), 0.0
-        self._taken += taken
-        if self._taken == SAMPLE:
-            now = monotonic_ns()
-            rest = self.coalescing.first(now - self._since)
-            self._taken, self._since = 0, now
-        return taken, rest
-
-    def take_some(self) -> tuple[int, float]:
-        """For one of several listeners that has rested: the same, but the rest only after less than a whole turn."""
-        taken, rest = self.take(_TURN), 0.0
-        self._taken += taken
-        if taken < _TURN:
-            rest = self.coalescing.next(self._taken)
-            self._taken, self._since = 0, monotonic_ns()
-        return taken, rest

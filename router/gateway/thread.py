@@ -7,17 +7,14 @@ import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.compiler.books import Books
 from router.compiler.program import GatewayPlan, Program
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.daemon_thread import DaemonThread
-from router.edges.gateway_tcp import TcpTransport
 from router.edges.gateway_transport import Ears, Transport
 from router.edges.gateway_udp import UdpTransport
-from router.edges.gateway_websocket import WebsocketTransport
 from router.engine import Report
 from router.engine.deadman import FeedMaker
 from router.errors import StartError
@@ -28,8 +25,8 @@ from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
 from router.gateway.subscriber import Subscriber
 from router.gateway.surroundings import Surroundings
-from router.table.model import Gateway, GatewayFormat
-from router.table.model import Transport as Way
+from router.gateway.transports import new_transport
+from router.table.model import Gateway
 from router.table.sameness import are_same
 from router.types.ros import ros_interfaces
 
@@ -37,11 +34,6 @@ if TYPE_CHECKING:  # which imports rclpy
     from router.edges.ros import RosEdge
 
 T = TypeVar("T")
-
-MOST_ASKED = 4096
-"""Bytes of what a client may send that may publish nothing: it can only ask for schemas."""
-
-PAGE = Path(__file__).with_name("page.html")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +158,7 @@ class GatewayThread:
         return service
 
     def _transport(self, settings: Gateway, ears: Ears) -> Transport:
-        transport = _transport(settings, ears)
+        transport = new_transport(settings, ears)
         if isinstance(transport, UdpTransport) and settings.receive is not None:
             self.kernel_drops[settings.name] = transport.kernel_drops
         return transport
@@ -220,21 +212,3 @@ def _outlets(program: Program, ros: RosEdge, feed: FeedMaker, report: Callable[[
         clock_ns=monotonic_ns,
         wall_ns=wall_ns,
     )
-
-
-def _transport(settings: Gateway, ears: Ears) -> Transport:
-    address = settings.address
-    most = settings.max_message if settings.inbound else MOST_ASKED
-    if settings.zenoh is not None:
-        from router.edges.gateway_zenoh import ZenohTransport  # takes 50 ms to import
-
-        return ZenohTransport(settings.zenoh, ears, most)
-    assert address is not None  # noqa: S101 - the schema wants one for all others
-    if settings.transport.value is Way.UDP:
-        return UdpTransport(address.value, settings.receive.value if settings.receive else None, ears)
-    if settings.transport.value is Way.TCP:
-        prefixed = settings.format is GatewayFormat.GATEWAY_V1
-        return TcpTransport(address.value, ears, prefixed=prefixed, max_clients=settings.max_clients, most=most)
-    text = settings.format is GatewayFormat.JSON
-    page = PAGE.read_bytes()
-    return WebsocketTransport(address.value, ears, text=text, max_clients=settings.max_clients, most=most, page=page)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from router.compiler.program import Program
 from router.edges.background import background_threads
 from router.edges.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
-from router.edges.receiver import Receive, ReceiveThread
+from router.edges.intake import Receive
+from router.edges.receiver import ReceiveThread
 from router.engine import MAX_DATAGRAM
 from router.engine.state import State
 from router.runtime.sockets import SocketChange, Sockets

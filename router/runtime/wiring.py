@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from router.compiler.program import DeadmanPlan, Program
 from router.edges.clock import monotonic_ns, wall_ns
-from router.edges.receiver import Receive
+from router.edges.intake import Receive
 from router.edges.reports import Reporter
 from router.edges.timekeeper import Timekeeper
 from router.engine import Engine, OutboundEngine

@@ -17,7 +17,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.compiler.program import ListenerPlan, SenderPlan
-from router.edges import receiver
+from router.edges import intake
 from router.edges.clock import wall_ns
 from router.edges.coalescing import FOR_SOCKETS, SAMPLE, Coalescing
 from router.edges.receiver import ReceiveThread
@@ -65,7 +65,7 @@ def rests(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
             told.append((taken, super().next(taken)))
             return told[-1][1]
 
-    monkeypatch.setattr(receiver, "Coalescing", Watched)
+    monkeypatch.setattr(intake, "Coalescing", Watched)
     return told
 
 

@@ -1,0 +1,36 @@
+"""The transport that a gateway's settings ask for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from router.edges.gateway_tcp import TcpTransport
+from router.edges.gateway_transport import Ears, Transport
+from router.edges.gateway_udp import UdpTransport
+from router.edges.gateway_websocket import WebsocketTransport
+from router.table.model import Gateway, GatewayFormat
+from router.table.model import Transport as Way
+
+MOST_ASKED = 4096
+"""Bytes of what a client may send that may publish nothing: it can only ask for schemas."""
+
+PAGE = Path(__file__).with_name("page.html")
+
+
+def new_transport(settings: Gateway, ears: Ears) -> Transport:
+    """It is not open yet."""
+    address = settings.address
+    most = settings.max_message if settings.inbound else MOST_ASKED
+    if settings.zenoh is not None:
+        from router.edges.gateway_zenoh import ZenohTransport  # takes 50 ms to import
+
+        return ZenohTransport(settings.zenoh, ears, most)
+    assert address is not None  # noqa: S101 - the schema wants one for all others
+    if settings.transport.value is Way.UDP:
+        return UdpTransport(address.value, settings.receive.value if settings.receive else None, ears)
+    if settings.transport.value is Way.TCP:
+        prefixed = settings.format is GatewayFormat.GATEWAY_V1
+        return TcpTransport(address.value, ears, prefixed=prefixed, max_clients=settings.max_clients, most=most)
+    text = settings.format is GatewayFormat.JSON
+    page = PAGE.read_bytes()
+    return WebsocketTransport(address.value, ears, text=text, max_clients=settings.max_clients, most=most, page=page)
