@@ -33,10 +33,10 @@ def parse_rate(text: str) -> float | None:
 
 def on_time(recording: Recording, rate: float | None) -> Iterator[Recorded]:
     """Each datagram when it is due; None is without waiting. A clock that was set meanwhile changes nothing."""
-    start, first = time.monotonic(), None
+    start, first = 0.0, None
     for found in recording.datagrams():
         if first is None:
-            first = found.steady
+            start, first = time.monotonic(), found.steady  # not before: opening a large recording takes its time
         if rate is not None:
             wait = start + (found.steady - first) / 1e9 / rate - time.monotonic()
             if wait > 0:

@@ -12,7 +12,7 @@ import pytest
 from router.assets import asset
 from router.cli import main
 from router.tools import UsageError
-from router.tools.recording import Recording
+from router.tools.recording import Recorded, Recording
 from router.tools.replaying import on_time, parse_rate
 from tests.edges.recorder_rig import MILLISECOND, START, imu, recorded, seen
 from tests.ports import free_port
@@ -138,6 +138,23 @@ def test_datagrams_are_due_when_they_came(path: Path, rate: float | None, monkey
     sent = [now[0] - 1000 for _ in on_time(Recording(path), rate)]
     steps = [0, 0.001, 0.002, 0.05, 0.051, 0.052]
     assert sent == pytest.approx([step / rate if rate else 0 for step in steps])
+
+
+def test_a_recording_that_is_slow_to_open_does_not_hurry_what_comes_first(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [1000.0]
+    recording = Recording(path)
+    datagrams = list(recording.datagrams())
+
+    def slowly() -> Iterator[Recorded]:
+        now[0] += 5
+        yield from datagrams
+
+    monkeypatch.setattr(recording, "datagrams", slowly)
+    monkeypatch.setattr(time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    assert [now[0] for _ in on_time(recording, 1.0)][:3] == pytest.approx([1005, 1005.001, 1005.002])
 
 
 @pytest.mark.parametrize(("text", "rate"), [("2x", 2), ("2", 2), ("0.5x", 0.5), (".5x", 0.5), ("max", None)])
