@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import os
 import signal
+import socket
 import statistics
 import subprocess
 import sys
@@ -52,6 +53,8 @@ def tapped(subject: Subject, is_wanted: bool) -> Iterator[None]:
         yield
         return
     url = f"http://127.0.0.1:{subject.ports.metrics}/tap"
+    while not answers(subject.ports.metrics):  # it is the last thing that a router opens
+        time.sleep(0.1)
     reader = spawn(["curl", "--silent", "--no-buffer", url], cores().helpers, stdout=subprocess.DEVNULL)
     try:
         time.sleep(1)
@@ -61,6 +64,11 @@ def tapped(subject: Subject, is_wanted: bool) -> Iterator[None]:
     finally:
         reader.kill()
         reader.wait()
+
+
+def answers(port: int) -> bool:
+    with socket.socket() as caller:
+        return caller.connect_ex(("127.0.0.1", port)) == 0
 
 
 def cost(work: str, condition: str, rate: float, pace: Pace, folder: Path) -> tuple[float, float]:
