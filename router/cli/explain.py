@@ -24,9 +24,9 @@ from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.link import compile_handlers
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
-from router.compiler.settings_text import duration
 from router.errors import did_you_mean
 from router.table.model import ANY, ROS, Destination, Route, RouteTable, Topic
+from router.table.quantities import duration
 from router.types.sizes import framed_size
 
 _WIDEST_CELL = 48

@@ -11,11 +11,11 @@ from time import sleep
 from router.cli.explain_words import quality
 from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.selection import TopicSelector
-from router.compiler.settings_text import duration
 from router.compiler.topics import resolved
 from router.errors import StartError
 from router.gateway.following import by_frequency
 from router.table.model import EACH, Gateway, GatewayFormat, IgnoredGateway, RouteTable, TopicPattern, Transport
+from router.table.quantities import duration
 
 Topics = Mapping[str, str]
 """What is known of topics, by absolute name: types, and how many publish them where somebody looked."""

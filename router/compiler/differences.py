@@ -13,10 +13,11 @@ from pathlib import Path
 
 from router.compiler.check import Checked
 from router.compiler.checked import CheckedRoute, CheckedTarget
-from router.compiler.settings_text import duration, field_map, flat
+from router.compiler.settings_text import field_map, flat
 from router.compiler.topics import qos_of
 from router.errors import SourceSpan, shown_path
 from router.table.model import Deadman, Destination, Gateway, Route, RouteTable, Topic
+from router.table.quantities import duration
 
 NONE = "none"
 """Stands for a setting that one of the tables does not have."""
@@ -100,10 +101,10 @@ def _surroundings(table: RouteTable) -> Iterator[Named]:
     """What is neither endpoint nor route. It is always there, so that it can only change."""
     settings = {
         "node": f"{table.node.namespace.rstrip('/')}/{table.node.name}",
-        "diagnostics": "yes" if table.node.diagnostics else "no",
-        "reload on change": "yes" if table.reload_on_change else "no",
-        **flat(table.metrics, "metrics"),
-        **flat(table.foxglove, "foxglove"),
+        **flat(table.node.diagnostics is not None, "node.diagnostics"),
+        **flat(table.reload_on_change, "reload.on_change"),
+        **flat(table.metrics, "metrics.address"),
+        **flat(table.foxglove, "foxglove.address"),
     }
     yield ("table", ""), Part(SourceSpan(table.routes_span.file), "", settings)
     if table.record is not None:
@@ -135,7 +136,7 @@ def _route_settings(route: Route) -> dict[str, str]:
         **flat(route.for_each, "for_each"),
         **flat(route.collect, "collect"),
         **flat(route.ignore, "ignore"),
-        **flat(route.no_deadman, "no deadman"),
+        **flat(route.no_deadman, "no_deadman"),
     }
     return {name: text for name, text in settings.items() if text}
 
@@ -163,10 +164,18 @@ def _targets(targets: Iterable[CheckedTarget], route: Route, origin: str) -> Ite
 
 
 def _gateway_parts(gateway: Gateway) -> Iterator[tuple[str, Part]]:
-    yield "", Part(gateway.span, gateway.transport.value.value, flat(replace(gateway, inbound=())))
+    yield "", Part(gateway.span, gateway.transport.value.value, _gateway_settings(gateway))
     for inbound in gateway.inbound:
         settings = {**_topic(inbound.topic), **flat(inbound.ttl, "ttl"), **flat(inbound.deadman, "deadman")}
         yield f"inbound {inbound.topic.topic.value}", Part(inbound.span, inbound.topic.type.value, settings)
+
+
+def _gateway_settings(gateway: Gateway) -> dict[str, str]:
+    keys = {"include": "topics.include", "exclude": "topics.exclude", "compression": "compression.zstd"}
+    settings = flat(replace(gateway, inbound=()))
+    if not gateway.compression:
+        del settings["compression"]
+    return {keys.get(key, key): text for key, text in settings.items()}
 
 
 def _topic(topic: Topic) -> dict[str, str]:
@@ -175,5 +184,4 @@ def _topic(topic: Topic) -> dict[str, str]:
 
 
 def _conditions(target: Destination | Topic) -> dict[str, str]:
-    settings = {**flat(target.when, "when"), **flat(target.keep, "keep")}
-    return settings | ({"max_rate": f"{target.max_rate.value:g} Hz"} if target.max_rate else {})
+    return {**flat(target.when, "when"), **flat(target.keep, "keep"), **flat(target.max_rate, "max_rate")}

@@ -1,24 +1,56 @@
 """What a table says as flat text: `transport.key` to value, without places. So two tables can be compared.
 
-Knows how values are told to people; which of them matter is for `differences`.
+Values are told as the table writes them, so that one can be taken over. Which of them matter is for `differences`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from router.errors import SourceSpan
 from router.table.model import Address, Expression, FieldMap, Located, TopicPattern, TopicRate
 from router.table.places import TextPlace
+from router.table.quantities import (
+    data_rate,
+    disk_size,
+    duration,
+    duration_or_never,
+    period,
+    rate,
+    size,
+    topic_rate,
+)
+from router.table.units import NEVER
 
-_DURATIONS = frozenset((
-    "coalesce", "deadline", "discovery_period", "last", "lifespan", "liveliness_lease_duration", "max_age", "period",
-    "publish_period", "repeat", "schema_period", "stale_after", "timeout", "ttl",
-))  # fmt: skip
-"""Keys whose numbers are nanoseconds."""
+NUMBERS: Mapping[str, Callable[[Any], str]] = {
+    "budget": data_rate,
+    "coalesce": duration_or_never,
+    "deadline": duration,
+    "discovery_period": duration,
+    "keep": disk_size,
+    "last": duration,
+    "lifespan": duration,
+    "liveliness_lease_duration": duration,
+    "max_age": duration,
+    "max_datagram": size,
+    "max_message": size,
+    "max_rate": rate,
+    "max_size": disk_size,
+    "publish_period": period,
+    "receive_buffer": size,
+    "repeat": duration,
+    "schema_period": duration,
+    "stale_after": duration,
+    "timeout": duration,
+    "ttl": duration,
+}
+"""How the numbers of those keys are written that have a unit."""
+
+_WITHOUT = {"stale_after": NEVER}
+"""What a table writes for the lack of a setting, where that is a word."""
 
 _PLACES = (SourceSpan, TextPlace)
 
@@ -26,10 +58,6 @@ _PLACES = (SourceSpan, TextPlace)
 def flat(value: object, key: str = "") -> dict[str, str]:
     """Every setting in it by its key, those of what is inside with dots; what is not set is left out."""
     return dict(_flat(value, key))
-
-
-def duration(ns: int) -> str:
-    return f"{ns / 1e9:g} s" if ns >= 1_000_000_000 else f"{ns / 1e6:g} ms"
 
 
 def field_map(fields: FieldMap) -> str:
@@ -48,6 +76,8 @@ def _flat(value: object, key: str) -> Iterator[tuple[str, str]]:
     elif dataclasses.is_dataclass(value) and not isinstance(value, (Expression, FieldMap, TopicPattern, TopicRate)):
         for field in dataclasses.fields(value):
             inner = getattr(value, field.name)
+            if inner is None:
+                inner = _WITHOUT.get(field.name)
             if not isinstance(inner, _PLACES) and inner is not None and inner != ():
                 yield from _flat(inner, _below(key, field.name))
     elif value is not None:
@@ -60,9 +90,9 @@ def _below(key: str, name: str) -> str:
 
 def _text(value: Any, key: str) -> str:
     if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int) and key in _DURATIONS:
-        return duration(value)
+        return "true" if value else "false"
+    if isinstance(value, (int, float)) and key in NUMBERS:
+        return NUMBERS[key](value)
     if isinstance(value, enum.Enum):
         return str(value.value)
     if isinstance(value, Expression):
@@ -70,9 +100,9 @@ def _text(value: Any, key: str) -> str:
     if isinstance(value, FieldMap):
         return field_map(value)
     if isinstance(value, TopicPattern):
-        return value.text
+        return f"{{regex: {value.text}}}" if value.is_regex else value.text
     if isinstance(value, TopicRate):
-        return f"{value.pattern.text} every {duration(value.period)}" if value.period else f"{value.pattern.text} each"
+        return f"{value.pattern.text}: {topic_rate(value.period)}"
     if isinstance(value, tuple) and not isinstance(value, Address):
         return ", ".join(_text(item.value if isinstance(item, Located) else item, key) for item in value)
     return str(value)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from router.compiler.books import CLIENTS
-from router.compiler.settings_text import duration
 from router.compiler.topics import resolved
 from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, RouteTable, Topic
+from router.table.quantities import duration
 
 
 class PartKind(enum.Enum):

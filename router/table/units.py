@@ -33,6 +33,9 @@ MAX_DATA_RATE = 10**12
 EACH = "each"
 """In place of a gateway's period or rate: every message is sent."""
 
+NEVER = "never"
+"""In place of a duration: what waits for it to pass does not happen."""
+
 MIN_PERIOD = 1_000_000
 """ns. A gateway that ticks faster does nothing else; `each` is meant for that."""
 
@@ -58,7 +61,7 @@ def parse_duration(text: str) -> int:
 
 def parse_coalesce(text: str) -> int:
     """`1ms` as nanoseconds, or `never` as 0."""
-    return 0 if text == "never" else _exact(text, _NANOSECONDS, "nanoseconds", MAX_COALESCE)
+    return 0 if text == NEVER else _exact(text, _NANOSECONDS, "nanoseconds", MAX_COALESCE)
 
 
 def parse_size(text: str) -> int:
@@ -73,7 +76,7 @@ def parse_disk_size(text: str) -> int:
 
 def parse_patience(text: str) -> int:
     """`5s` as nanoseconds, or `never` as 0."""
-    return 0 if text == "never" else parse_duration(text)
+    return 0 if text == NEVER else parse_duration(text)
 
 
 def parse_datagram_size(text: str) -> int:

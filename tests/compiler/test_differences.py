@@ -53,12 +53,15 @@ def test_a_table_differs_in_nothing_from_itself(told: Told) -> None:
 @pytest.mark.parametrize(
     ("more", "expected"),
     [
-        ("metrics: {address: 127.0.0.1:9999}", ["table: metrics is 127.0.0.1:9999, was 127.0.0.1:9108"]),
-        ("reload: {on_change: true}", ["table: reload on change is yes, was no"]),
-        ("node: {diagnostics: true}", ["table: diagnostics is yes, was no"]),
-        ("foxglove: {address: 127.0.0.1:8767}", ["table: foxglove is 127.0.0.1:8767, was 127.0.0.1:8766"]),
-        ("listen: {rover: {receive_buffer: 1MiB}}", ["listener rover: receive_buffer is 1048576, was 4194304"]),
+        ("metrics: {address: 127.0.0.1:9999}", ["table: metrics.address is 127.0.0.1:9999, was 127.0.0.1:9108"]),
+        ("reload: {on_change: true}", ["table: reload.on_change is true, was false"]),
+        ("node: {diagnostics: true}", ["table: node.diagnostics is true, was false"]),
+        ("foxglove: {address: 127.0.0.1:8767}", ["table: foxglove.address is 127.0.0.1:8767, was 127.0.0.1:8766"]),
+        ("listen: {rover: {receive_buffer: 1MiB}}", ["listener rover: receive_buffer is 1 MiB, was 4 MiB"]),
         ("endpoints: {arm_board: {stale_after: 2s}}", ["endpoint arm_board: stale_after is 2 s, was 5 s"]),
+        ("endpoints: {arm_board: {stale_after: never}}", ["endpoint arm_board: stale_after is never, was 5 s"]),
+        ("endpoints: {arm_board: {budget: 10kB/s}}", ["endpoint arm_board: budget is 10 kB/s, was none"]),
+        ("listen: {rover: {coalesce: 250us}}", ["listener rover: coalesce is 250 us, was 1 ms"]),
         ("endpoints: {x: {address: 10.0.0.9:99, kind: tool}}", ["endpoint x: added, 10.0.0.9:99"]),
         ("routes: {drive_motor: {ttl: 50ms}}", ["route drive_motor: ttl is 50 ms, was 200 ms"]),
         (
@@ -85,6 +88,11 @@ def test_a_table_differs_in_nothing_from_itself(told: Told) -> None:
         ),
         ("routes: {drive_progress: {ignore: not wanted}}", ["route drive_progress: ignore is not wanted, was none"]),
         ("gateways: {dashboard: {publish_period: 1s}}", ["gateway dashboard: publish_period is 1 s, was 200 ms"]),
+        ("gateways: {dashboard: {publish_period: each}}", ["gateway dashboard: publish_period is each, was 200 ms"]),
+        (
+            'gateways: {dashboard: {rates: {"/imu*": 12.5 Hz}}}',
+            ["gateway dashboard: rates is /imu*: 12.5 Hz, was none"],
+        ),
         ("gateways: {more: {transport: {tcp: 127.0.0.1:8000}}}", ["gateway more: added, tcp"]),
         (
             "gateways: {dashboard: {inbound: [{topic: a, type: std_msgs/msg/Float32}]}}",
