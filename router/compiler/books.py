@@ -56,7 +56,7 @@ METRICS = (
     Metric("recorded_bytes", "counter", (), "Bytes in those datagrams."),
     Metric("record_dropped", "counter", ("reason",), "Datagrams that a recording lacks, by reason."),
     Metric("config_reloads", "counter", ("result",), "Changed tables that the running router was to take."),
-    Metric("config_last_reload_successful", "number", (), "1 unless the last reload changed nothing for its errors."),
+    Metric("config_last_reload_successful", "number", (), "1 unless the last reload failed."),
     Metric("config_last_reload_timestamp_seconds", "time", (), "When the running table was taken."),
     Metric("qos_incompatible", "number", ("route", "topic", "policy"), "Peers that got or gave nothing for their QoS."),
 )

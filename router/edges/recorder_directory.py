@@ -33,7 +33,7 @@ class RecordingDirectory:
         self.path = path.resolve()
         self._stem = stem
         self._keep = keep
-        self._ours = re.compile(re.escape(stem) + r"_\d{8}T\d{6}\.\d{6}Z(_[a-z0-9_.-]+)?" + re.escape(SUFFIX))
+        self._ours = _names(stem)
 
     def new(self, wall: int, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
         """A file that is not there yet; two at one time, as where the clock begins anew at each start, get numbers."""
@@ -62,6 +62,17 @@ class RecordingDirectory:
             path.unlink(missing_ok=True)
             total -= size
             logger.info("removed the oldest recording, to keep within 'keep'", file=str(path), bytes=size)
+
+
+def kept_bytes(path: Path, stem: str) -> int:
+    """Of our recordings below `path`, which is a directory or not there."""
+    ours = _names(stem)
+    there = path.iterdir() if path.is_dir() else ()
+    return sum(_size(file) or 0 for file in there if ours.fullmatch(file.name))
+
+
+def _names(stem: str) -> re.Pattern[str]:
+    return re.compile(re.escape(stem) + r"_\d{8}T\d{6}\.\d{6}Z(_[a-z0-9_.-]+)?" + re.escape(SUFFIX))
 
 
 def _size(path: Path) -> int | None:

@@ -12,6 +12,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from router.compiler.program import Program
+from router.edges.recorder_directory import kept_bytes
 from router.tools.doctor_report import Finding, fine, problem, warning
 
 RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
@@ -58,14 +59,14 @@ def recordings(program: Program) -> Iterator[Finding]:
         remedy = "move that file away, or give `record` another directory"
         yield problem("recordings", f"{there} is a file, and no folder", remedy)
         return
-    if not os.access(there, os.W_OK | os.X_OK):
+    if not os.access(there, os.R_OK | os.W_OK | os.X_OK):
         yield problem(
             "recordings",
             f"{_user(os.geteuid())} may not write to {there}",
             "chown it, or give `record` another directory; for a service, run deploy/install-service.sh again then",
         )
         return
-    kept = sum(file.stat().st_size for file in directory.glob("*.mcap"))
+    kept = kept_bytes(directory, program.table.path.stem)
     free = shutil.disk_usage(there).free
     if settings.continuous and kept + free < settings.keep:
         yield warning(

@@ -11,6 +11,7 @@ from router.compiler.books import INTENDED_REASONS
 from router.compiler.program import Program
 from router.errors import TransportError
 from router.table.model import RouteTable
+from router.table.quantities import duration
 from router.tools.doctor_report import Finding, fine, problem, warning
 from router.tools.live import Snapshot, parse_metrics
 from router.tools.running_router import metrics, url_of
@@ -33,9 +34,8 @@ class Health:
 
     def _table(self) -> Iterator[Finding]:
         if self.snapshot.counts("config_last_reload_successful").get(()) == 0:
-            yield problem(
-                "router", "its last reload changed nothing, for the table had errors", "router validate, router reload"
-            )
+            what = "its last reload failed, and the table from before it goes on"
+            yield problem("router", what, "`router reload` says why")
         elif self.snapshot.table_sha256 != self.table.sha256:
             yield warning("router", "it runs another table than this file", "router reload, or systemctl restart")
 
@@ -45,16 +45,17 @@ class Health:
             endpoint = self.table.endpoints.get(name)
             if endpoint is None or endpoint.stale_after is None or name not in sources:
                 continue
-            limit = endpoint.stale_after / 1e9
-            if self.now - seen > limit:
-                silence = f"silent for {self.now - seen:.0f} s" if seen else "never heard"
-                listening = ", ".join(str(each.address.value) for each in self.table.listeners.values())
-                yield problem(
-                    "endpoints",
-                    f"{name} is stale: {silence}, and more than {limit:g} s is too long",
-                    f"is it on, and does it send to this computer, where the router listens ({listening})? "
-                    f"`tcpdump -n udp and host {endpoint.address.value.host}` shows whether anything comes",
-                )
+            listening = ", ".join(str(each.address.value) for each in self.table.listeners.values())
+            remedy = (
+                f"is it on, and does it send to this computer, where the router listens ({listening})? "
+                f"`tcpdump -n udp and host {endpoint.address.value.host}` shows whether anything comes"
+            )
+            if not seen:
+                yield warning("endpoints", f"{name} was never heard since the router started", remedy)
+            elif self.now - seen > endpoint.stale_after / 1e9:
+                limit = duration(endpoint.stale_after)
+                what = f"{name} is stale: silent for {self.now - seen:.0f} s, and more than {limit} is too long"
+                yield problem("endpoints", what, remedy)
 
     def _lost(self) -> Iterator[Finding]:
         for (listener,), count in self.snapshot.counts("kernel_drops").items():

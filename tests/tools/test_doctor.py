@@ -143,6 +143,19 @@ def test_more_recordings_than_the_disk_holds_are_a_warning(
     assert (found.grade, "room for 100 MiB, `keep` says 4096" in found.text) == (Grade.WARNING, True)
 
 
+def test_only_our_recordings_make_room_for_new_ones(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(1 << 30, 1 << 30, 250 << 20))
+    for name in ("table_20260412T101500.000000Z.mcap", "somebody_elses.mcap"):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(6 << 20)
+    program = recorded(table, tmp_path, "260MiB")
+    assert [each.grade for each in recordings(program)] == [Grade.WARNING]
+    (tmp_path / "table_20260412T101500.000000Z_signal.mcap").write_bytes(bytes(4 << 20))
+    assert [each.grade for each in recordings(program)] == [Grade.FINE]
+
+
 def test_a_folder_that_takes_no_recordings_is_a_problem(
     table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -289,6 +302,11 @@ def test_only_what_sends_and_may_be_stale_is_stale(table: Path) -> None:
     assert found.text == "sensor_board is stale: silent for 9 s, and more than 5 s is too long"
 
 
+def test_who_was_never_heard_may_not_have_been_switched_on_yet(table: Path) -> None:
+    [found] = diagnosis(table, 'router_endpoint_last_seen_timestamp_seconds{endpoint="sensor_board"} 0')
+    assert (found.grade, found.text) == (Grade.WARNING, "sensor_board was never heard since the router started")
+
+
 @pytest.mark.parametrize(
     ("sample", "grade", "text"),
     [
@@ -304,7 +322,7 @@ def test_only_what_sends_and_may_be_stale_is_stale(table: Path) -> None:
             "1 peers get nothing of topic ph",
         ),
         ('router_deadman_active{route="ph_info"} 1', Grade.WARNING, "the deadman sends"),
-        ("router_config_last_reload_successful 0", Grade.PROBLEM, "its last reload changed nothing"),
+        ("router_config_last_reload_successful 0", Grade.PROBLEM, "its last reload failed"),
     ],
 )
 def test_what_a_running_router_tells(table: Path, sample: str, grade: Grade, text: str) -> None:
