@@ -17,12 +17,23 @@ die() {
   exit 1
 }
 
+# Paths go into units, into settings that shell and systemd read, and through sed.
+check_place() {
+  case $1 in
+    *[[:space:][:cntrl:]\|\&\\\"\'\`\$%\;\#*?\<\>\(\)]*) die "'$1' has characters that systemd or a shell would misread: move it" ;;
+  esac
+}
+
+check_place "$root"
 [ "$(id -u)" = 0 ] || die "needs root: sudo make install-service"
 [ -x "$root/.venv/bin/router" ] || die "$root has no .venv yet: run 'make setup' first, as yourself"
 command -v systemctl >/dev/null || die "this computer has no systemd"
 
 chosen=
-if [ $# -gt 0 ]; then chosen=$(realpath -e "$1") || die "there is no table $1"; fi
+if [ $# -gt 0 ]; then
+  chosen=$(realpath -e "$1") || die "there is no table $1"
+  check_place "$chosen"
+fi
 
 # What the units have to know of the table: "socket ADDRESS", "write FOLDER", "read FOLDER"; findings go to stderr.
 facts=$(
@@ -67,7 +78,14 @@ ROS_DOMAIN_ID=0
 #BASESTATION=192.168.0.10:9000
 END
 fi
-if [ -n "$chosen" ]; then sed -i "s|^ROUTER_TABLE=.*|ROUTER_TABLE=$chosen|" "$settings"; fi
+if [ -n "$chosen" ]; then
+  if grep -q '^ROUTER_TABLE=' "$settings"; then
+    sed -i "s|^ROUTER_TABLE=.*|ROUTER_TABLE=$chosen|" "$settings"
+  else
+    sed -i '$a\' "$settings"  # ends the last line
+    echo "ROUTER_TABLE=$chosen" >>"$settings"
+  fi
+fi
 
 for unit in rover-router.service rover-router.socket rover-router-hold.service; do
   sed -e "s|/opt/rover-router|$root|g" "$root/deploy/systemd/$unit" >"$units/$unit.new"

@@ -51,6 +51,18 @@ def test_the_socket_has_the_addresses_of_the_rovers_table() -> None:
     assert re.findall("^ListenDatagram=(.*)$", text, re.MULTILINE) == [str(each.address) for each in program.listeners]
 
 
+@pytest.mark.parametrize("name", ["our rover", "r&d", "a|b", "100%", "it's", "a$b", "a#b"])
+def test_a_place_that_units_or_settings_would_garble_is_refused(tmp_path: Path, name: str) -> None:
+    script = tmp_path / name / "deploy" / "install-service.sh"
+    script.parent.mkdir(parents=True)
+    script.write_text((ROOT / "deploy" / "install-service.sh").read_text())
+    finished = subprocess.run(["bash", script], capture_output=True, text=True, check=False)
+    assert finished.returncode == 1
+    assert finished.stderr == (
+        f"install-service: '{tmp_path / name}' has characters that systemd or a shell would misread: move it\n"
+    )
+
+
 @pytest.fixture(scope="module")
 def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     """A computer on which `make install-service` was done, for the simulated rover's table."""
@@ -86,6 +98,16 @@ def test_installing_again_changes_nothing_and_restarts_it(running: Machine) -> N
     running.shell(f"{ROOT}/deploy/install-service.sh")
     assert running.show("MainPID") != before
     assert running.show("ActiveEnterTimestamp", "rover-router.socket") == sockets
+
+
+def test_a_table_is_chosen_also_where_the_settings_name_none(running: Machine) -> None:
+    settings = "/etc/default/rover-router"
+    running.shell(f"cp {settings} /opt/settings; sed -i 's/^ROUTER_TABLE=/#&/' {settings}; printf 'A=b' >> {settings}")
+    running.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
+    assert running.shell(f"grep ^ROUTER_TABLE= {settings}").strip() == f"ROUTER_TABLE={SIM}"
+    assert "A=b\n" in running.shell(f"cat {settings}")
+    assert SIM in running.shell("xargs -0 < /proc/$(systemctl show -P MainPID rover-router)/cmdline")
+    running.shell(f"cp /opt/settings {settings}; systemctl restart rover-router")
 
 
 def test_a_table_with_errors_is_not_installed(running: Machine) -> None:
