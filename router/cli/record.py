@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import DEFAULT_TABLE, OK, VERBS
-from router.cli.tool_options import explained
+from router.cli import OK, VERBS
+from router.cli.tool_options import add_router_options, explained, progress, running_url
 from router.tools import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Iterable
+
+    from rich.progress import ProgressColumn
 
     from router.tools.recording_tap import TapRecording
 
@@ -30,17 +30,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "routed, also what no route takes, with sender and time. Foxglove opens the file as it is, 'router replay' "
         "sends it again. To record always, without this command, give the table a 'record'.",
     )
-    parser.add_argument(
-        "table",
-        nargs="?",
-        type=Path,
-        default=DEFAULT_TABLE,
-        metavar="TABLE",
-        help=f"the table that it runs, for its metrics.address (default: {DEFAULT_TABLE})",
-    )
+    add_router_options(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: TABLE_TIME.mcap in this folder")
     parser.add_argument("--last", action="store_true", help="have the router save what it has kept in memory instead")
-    parser.add_argument("--url", metavar="URL", help="of the running router (default: the table's metrics.address)")
 
 
 @explained
@@ -51,10 +43,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _save_last(args: argparse.Namespace) -> int:
-    from router.tools.running_router import post, url_of
-    from router.tools.wire import read_table
+    from router.tools.running_router import post
 
-    answer = post(args.url or url_of(read_table(args.table)), "/record/save", patience=60)
+    answer = post(running_url(args), "/record/save", patience=60)
     if not answer.ok:
         print(f"router record: {answer.said.get('text', answer.said)}", file=sys.stderr)
         return FAILED
@@ -65,11 +56,11 @@ def _save_last(args: argparse.Namespace) -> int:
 def _record(args: argparse.Namespace) -> int:
     from router.edges.background import background_threads
     from router.tools.recording_tap import TapRecording
-    from router.tools.running_router import tap, url_of
+    from router.tools.running_router import tap
     from router.tools.wire import read_table, wire_of_table
 
     table = read_table(args.table)
-    url = args.url or url_of(table)
+    url = running_url(args)
     time = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
     # The router goes before whatever runs on its computer to watch it.
     with background_threads(), tap(url) as batches:
@@ -78,10 +69,10 @@ def _record(args: argparse.Namespace) -> int:
         )
         print(f"recording the router at {url} to {recording.path}; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
-            with _progress(recording) as tell:
+            with progress(_columns) as tell:
                 for batch in batches:
                     recording.take(batch)
-                    tell()
+                    tell(description=_told(recording))
         except KeyboardInterrupt:
             pass
         finally:
@@ -95,16 +86,7 @@ def _told(recording: TapRecording) -> str:
     return f"{recording.path}: {recording.datagrams} datagrams{missed}, {recording.size / 1e6:.2f} MB"
 
 
-@contextmanager
-def _progress(recording: TapRecording) -> Iterator[Callable[[], None]]:
-    """A line that counts, where somebody looks."""
-    if not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+def _columns() -> Iterable[ProgressColumn]:
+    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=4, transient=True) as progress:
-        task = progress.add_task("")
-        yield lambda: progress.update(task, description=_told(recording))
+    return (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))

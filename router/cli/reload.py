@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
-from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
-from router.cli.tool_options import explained
-from router.tools import UsageError
+from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
+from router.cli.tool_options import add_router_options, explained, running_url
 
 PATIENCE = 60.0
 """Seconds; a large table takes one to compile where there is much traffic."""
@@ -24,22 +22,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "reload", help=VERBS["reload"], description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "table",
-        nargs="?",
-        type=Path,
-        default=DEFAULT_TABLE,
-        metavar="TABLE",
-        help=f"only tells where the router answers, by its metrics.address (default: {DEFAULT_TABLE})",
-    )
-    parser.add_argument("--url", metavar="URL", help="of the running router, instead")
+    add_router_options(parser)
 
 
 @explained
 def run(args: argparse.Namespace) -> int:
     from router.tools.running_router import post
 
-    answer = post(args.url or _url(args.table), "/-/reload", PATIENCE)
+    answer = post(running_url(args), "/-/reload", PATIENCE)
     for finding in answer.said.get("findings", ()):
         print(finding, file=sys.stderr)
     text = answer.said.get("text", "")
@@ -48,14 +38,3 @@ def run(args: argparse.Namespace) -> int:
         return BAD_TABLE
     print(text)
     return OK
-
-
-def _url(path: Path) -> str:
-    """By what is sound of the table: it may have errors, which the router will tell."""
-    from router.table import load_table
-    from router.tools.running_router import url_of
-
-    table, _ = load_table(path)
-    if table is None:
-        raise UsageError(f"{path} does not tell where the router answers: give --url")
-    return url_of(table)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import DEFAULT_TABLE, OK, VERBS
-from router.cli.tool_options import explained
+from router.cli.tool_options import explained, progress
 from router.errors import TableError
 from router.tools import UsageError
 
 if TYPE_CHECKING:
+    from rich.progress import ProgressColumn
+
     from router.compiler import Checked
     from router.compiler.definitions import Definitions
     from router.tools.recording import Recording
@@ -80,7 +82,7 @@ def _send(args: argparse.Namespace, recording: Recording) -> int:
         with closing(replayer), _progress(recording, "sending") as tell:
             for found in on_time(recording, rate):
                 replayer.send(found)
-                tell()
+                tell(completed=recording.position)
     except KeyboardInterrupt:
         pass
     print(f"sent {replayer.resent.datagrams} datagrams")
@@ -114,7 +116,7 @@ def _compare(args: argparse.Namespace, recording: Recording) -> int:
     with _progress(recording, "comparing") as tell:
         for found in recording.datagrams():
             against.take(found)
-            tell()
+            tell(completed=recording.position)
     for line in Report(old, new).lines(against):
         print(line)
     return DIFFERENT if against.differs else OK
@@ -130,23 +132,12 @@ def _checked(path: Path, definitions: Definitions) -> Checked:
     return checked
 
 
-@contextmanager
-def _progress(recording: Recording, doing: str) -> Iterator[Callable[[], None]]:
-    """A bar, where somebody looks; a chunk, which is half a second, is one step of it."""
-    if not sys.stderr.isatty():
-        yield lambda: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+def _progress(recording: Recording, doing: str) -> AbstractContextManager[Callable[..., None]]:
+    """A chunk, which is half a second, is one step of it."""
 
-    columns = (TextColumn(doing), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=4, transient=True) as progress:
-        task, shown = progress.add_task("", total=recording.size), 0
+    def columns() -> Iterable[ProgressColumn]:
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-        def tell() -> None:
-            nonlocal shown
-            if recording.position != shown:
-                shown = recording.position
-                progress.update(task, completed=shown)
+        return (TextColumn(doing), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
 
-        yield tell
+    return progress(columns, recording.size)

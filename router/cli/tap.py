@@ -9,7 +9,7 @@ from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from router.cli import VERBS
-from router.cli.tool_options import add_wire_options, explained, load_wire, whole
+from router.cli.tool_options import add_url_option, add_wire_options, explained, load_wire, running_url, whole
 from router.errors import StartError, nearest
 from router.tools import UsageError
 
@@ -60,7 +60,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--where", metavar="EXPR", help="only what this expression of the table's language holds for: 'satellites < 4'"
     )
-    parser.add_argument("--url", metavar="URL", help="of the running router (default: the table's metrics.address)")
+    add_url_option(parser)
     parser.add_argument("--topic", metavar="NAME", help="a ROS topic instead")
     parser.add_argument("--type", metavar="TYPE", help="of the topic (default: what its publishers say)")
     parser.add_argument("--count", type=whole, metavar="N", help="end after N messages (default: at Ctrl-C)")
@@ -116,14 +116,14 @@ def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> 
     from router.edges.background import background_threads
     from router.tools.conditions import Condition
     from router.tools.places import peer_names
-    from router.tools.running_router import tap, url_of
+    from router.tools.running_router import tap
     from router.tools.running_tap import RunningTap
 
     cases = [wire.case(word) for word in args.words]
     condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
     if args.url is None and table is None:
         raise UsageError("--table or --url says which running router")
-    url = args.url or url_of(table) if table is not None else args.url
+    url = running_url(args)
     taken = RunningTap(wire, peer_names(table), args.words, condition)
     wanted = args.words or (sorted(condition.cases) if condition else [])
     # The router goes before whatever runs on its computer to watch it.

@@ -1,13 +1,17 @@
-"""What the tools' verbs share: the options that find the envelope, and numbers in range. Knows no verb."""
+"""What the tools' verbs share: the options that find the envelope or a running router, numbers in range, progress.
+
+Knows no verb.
+"""
 
 from __future__ import annotations
 
 import argparse
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
 from router.cli import BAD_USAGE, DEFAULT_TABLE
@@ -15,6 +19,8 @@ from router.errors import TransportError
 from router.tools import UsageError
 
 if TYPE_CHECKING:
+    from rich.progress import ProgressColumn
+
     from router.table.model import RouteTable
     from router.tools.wire import Wire
 
@@ -33,6 +39,30 @@ def load_wire(args: argparse.Namespace) -> tuple[Wire, RouteTable | None]:
         table = read_table(args.table or DEFAULT_TABLE)
         return wire_of_table(table), table
     return wire_of_protos(args.protos or asset("protos")), None
+
+
+def add_router_options(parser: argparse.ArgumentParser) -> None:
+    """Which running router: that of a table, or at a URL."""
+    about = f"the table that it runs, for its metrics.address (default: {DEFAULT_TABLE})"
+    parser.add_argument("table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help=about)
+    add_url_option(parser)
+
+
+def add_url_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--url", metavar="URL", help="where the running router answers instead: http://127.0.0.1:9108")
+
+
+def running_url(args: argparse.Namespace) -> str:
+    """By what is sound of the table: it may have errors, and one address is all that is wanted. Raises UsageError."""
+    from router.table import load_table
+    from router.tools.running_router import url_of
+
+    if args.url:
+        return str(args.url)
+    table, findings = load_table(args.table or DEFAULT_TABLE)
+    if table is None:
+        raise UsageError(f"{findings[0]}; name the table that the router runs, or give --url")
+    return url_of(table)
 
 
 def explained(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
@@ -61,3 +91,26 @@ def whole(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
     return value
+
+
+@contextmanager
+def progress(
+    columns: Callable[[], Iterable[ProgressColumn]], total: int | None = None
+) -> Iterator[Callable[..., None]]:
+    """Shows `columns` of rich's on stderr, where somebody looks, and gives what updates them: `tell(completed=7)`."""
+    if not sys.stderr.isatty():
+        yield lambda **_: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(*columns(), console=Console(stderr=True), refresh_per_second=4, transient=True) as shown:
+        task, told = shown.add_task("", total=total), dict[str, Any]()
+
+        def tell(**news: Any) -> None:
+            nonlocal told
+            if news != told:  # mostly nothing: it is told with each datagram
+                told = news
+                shown.update(task, **news)
+
+        yield tell

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
-from router.cli import DEFAULT_TABLE, OK, VERBS
-from router.cli.tool_options import explained, positive
+from router.cli import OK, VERBS
+from router.cli.tool_options import add_router_options, explained, positive, running_url
 from router.errors import TransportError
 
 if TYPE_CHECKING:
@@ -26,10 +23,7 @@ terminal it is shown again and again, and keys sort it."""
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser("top", help=VERBS["top"], description=_DESCRIPTION)
-    where = parser.add_mutually_exclusive_group()
-    table = "the table that it runs, for its metrics.address (default: %(default)s)"
-    where.add_argument("table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help=table)
-    where.add_argument("--url", type=_url, help="where it answers instead, as http://10.0.0.5:9108")
+    add_router_options(parser)
     parser.add_argument(
         "--sort", choices=ORDERS, default=ORDERS[0], help="the largest first (default: as in the table)"
     )
@@ -37,25 +31,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--once", action="store_true", help="show it once and end, as where there is no terminal")
 
 
-def _url(text: str) -> str:
-    try:
-        parts = urlsplit(text if "://" in text else f"http://{text}")
-        is_right = parts.scheme == "http" and parts.hostname and not re.search(r"\s", text) and parts.port != 0
-    except ValueError:  # no number for a port, half an IPv6 address
-        is_right = False
-    if not is_right:
-        raise argparse.ArgumentTypeError(f"'{text}' is not like http://127.0.0.1:9108")
-    return text
-
-
 @explained
 def run(args: argparse.Namespace) -> int:
-    """Raises TableError for a table that cannot be read."""
-    from router.tools.running_router import url_of
     from router.tools.top import Order
-    from router.tools.wire import read_table
 
-    url = args.url or url_of(read_table(args.table))
+    url = running_url(args)
     if args.once or not sys.stdout.isatty():
         _show_once(url, Order(args.sort), args.interval)
     else:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import Any, NamedTuple
@@ -90,10 +91,14 @@ def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[Seen 
 
 
 def _connection(url: str, patience: float) -> http.client.HTTPConnection:
-    parts = urlsplit(url if "://" in url else f"http://{url}")
-    if parts.scheme != "http" or not parts.hostname:
+    try:
+        parts = urlsplit(url if "://" in url else f"http://{url}")
+        host, port = parts.hostname, parts.port
+    except ValueError:  # no number for a port, half an IPv6 address
+        host = port = None
+    if host is None or port == 0 or parts.scheme != "http" or re.search(r"\s", url):
         raise UsageError(f"'{url}' is not like http://127.0.0.1:9108")
-    return http.client.HTTPConnection(parts.hostname, parts.port or 80, timeout=patience)
+    return http.client.HTTPConnection(host, port or 80, timeout=patience)
 
 
 def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: str) -> http.client.HTTPResponse:
@@ -101,7 +106,8 @@ def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: 
         connection.request(method, path, headers={"Content-Length": "0"} if method == "POST" else {})
         return connection.getresponse()
     except (OSError, http.client.HTTPException) as error:
-        raise TransportError(f"no router answers at {url}: {error}; is it running?") from error
+        remedy = "is it running? another table, or --url, names another router"
+        raise TransportError(f"no router answers at {url}: {error}; {remedy}") from error
 
 
 def _read(response: http.client.HTTPResponse, url: str) -> bytes:

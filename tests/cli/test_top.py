@@ -71,6 +71,24 @@ def test_the_address_is_that_of_the_table(served: str, tmp_path: Path, capsys: p
     assert "imu_info" in capsys.readouterr().out
 
 
+def test_a_table_with_errors_has_an_address_all_the_same(
+    served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "table.yaml"
+    base = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
+    text = f"version: 1\nextends: {base}\nmetrics: {{address: {served.removeprefix('http://')}}}\n"
+    table.write_text(f"{text}endpoints: {{arm_board: {{kind: bord}}}}\n")
+    assert main(["top", str(table), "--once", "--interval", "0.01"]) == OK
+    assert "imu_info" in capsys.readouterr().out
+
+
+def test_where_there_is_no_table_its_name_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["top", str(tmp_path / "gone.yaml")]) == BAD_USAGE
+    said = capsys.readouterr().err
+    assert "gone.yaml" in said
+    assert said.endswith("; name the table that the router runs, or give --url\n")
+
+
 def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top", "--url", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"]) == 1
     assert re.fullmatch(r"router top: no router answers at 127\.0\.0\.1:\d+: .*\n", capsys.readouterr().err)
@@ -89,9 +107,7 @@ def test_what_is_no_router_is_said_in_a_line(
 
 @pytest.mark.parametrize("url", ["http://a:99999", "http://[::1", "ftp://a", "http://", "http://a b:1", "a:port"])
 def test_what_is_no_address_is_wrong_usage(url: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["top", "--url", url])
-    assert ended.value.code == BAD_USAGE
+    assert main(["top", "--url", url]) == BAD_USAGE
     assert f"'{url}' is not like http://127.0.0.1:9108" in capsys.readouterr().err
 
 

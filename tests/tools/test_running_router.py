@@ -43,7 +43,10 @@ def test_metrics_are_asked_for_at_the_router_and_no_proxy(url: str, monkeypatch:
 def test_where_nobody_answers_is_a_network_fault() -> None:
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
-        with pytest.raises(TransportError, match=r"no router answers at .*; is it running\?"):
+        with pytest.raises(
+            TransportError,
+            match=r"no router answers at .*; is it running\? another table, or --url, names another router",
+        ):
             metrics(f"http://127.0.0.1:{nobody.getsockname()[1]}")
 
 
@@ -63,7 +66,7 @@ def test_what_is_no_router_is_told_by_its_answer() -> None:
         thread.join()
 
 
-@pytest.mark.parametrize("url", ["https://127.0.0.1:9108", "http://", "ftp://rover"])
+@pytest.mark.parametrize("url", ["https://127.0.0.1:9108", "http://", "ftp://rover", "http://a:99999"])
 def test_what_is_no_address_of_a_router_is_a_wrong_use(url: str) -> None:
     with pytest.raises(UsageError, match="is not like http://127"):
         metrics(url)
