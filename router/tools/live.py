@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from router.compiler.books import METRICS
+from router.compiler.books import INTENDED_REASONS, METRICS
+from router.edges.status_numbers import DELIVERED
 
 Labels = tuple[str, ...]
 Counts = Mapping[Labels, float]
@@ -22,6 +23,9 @@ BUCKETS = "_bucket"
 
 _LABELS = {metric.name: metric.labels for metric in METRICS}
 _LABELS |= {f"{metric.name}{BUCKETS}": (*metric.labels, "le") for metric in METRICS if metric.kind == "histogram"}
+
+
+_DELIVERED = tuple(metric.removesuffix("_total") for metric in DELIVERED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,9 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class TargetRow:
-    """A destination or topic of a route: delivered messages in all and per second, lost and withheld ones."""
+    """A destination or topic of a route, or the clients of a gateway: delivered messages in all and per second, those
+    that were dropped, and withheld ones. Of the dropped, `lost` are those that the table does not want gone.
+    """
 
     name: str
     is_topic: bool
@@ -49,10 +55,14 @@ class TargetRow:
     dropped: Mapping[str, int]
     filtered: int
 
+    @property
+    def lost(self) -> dict[str, int]:
+        return unwanted(self.dropped)
+
 
 @dataclass(frozen=True, slots=True)
 class RouteRow:
-    """A route: messages taken in all and per second, and its targets."""
+    """A route or a gateway: messages taken in all and per second, and its targets."""
 
     route: str
     received: int
@@ -61,12 +71,16 @@ class RouteRow:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Lost messages of all targets by reason."""
+        """Dropped messages of all targets by reason."""
         total: dict[str, int] = defaultdict(int)
         for target in self.targets:
             for reason, count in target.dropped.items():
                 total[reason] += count
         return dict(total)
+
+    @property
+    def lost(self) -> dict[str, int]:
+        return unwanted(self.dropped)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +92,11 @@ class View:
     rate: float
     rejected: Mapping[str, int]
     kernel_drops: int
+
+
+def unwanted(reasons: Mapping[str, int]) -> dict[str, int]:
+    """Without what the table asks for, such as `max_rate`."""
+    return {reason: count for reason, count in reasons.items() if reason not in INTENDED_REASONS}
 
 
 def parse_metrics(text: str, at: float) -> Snapshot:
@@ -130,7 +149,7 @@ def _route_row(route: str, before: Snapshot, after: Snapshot) -> RouteRow:
         rate=_rate(received, _total(before, "messages_received", route), before, after),
         targets=tuple(
             _target_row(metric, labels, before, after)
-            for metric in ("datagrams_sent", "messages_published")
+            for metric in _DELIVERED
             for labels in after.counts(metric)
             if labels[0] == route
         ),

@@ -5,12 +5,13 @@ A terminal shows one line for each route, the troubled ones first when not all o
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 
 from rich.table import Table
 from rich.text import Text
 
-from router.tools.live import RouteRow, TargetRow, View
+from router.tools.live import RouteRow, TargetRow, View, unwanted
 from router.tools.show import rate_text
 
 Column = Callable[[RouteRow], Text]
@@ -27,15 +28,16 @@ def summary_line(view: View) -> str:
     """The whole router in one line."""
     delivered = sum(target.delivered for row in view.routes for target in row.targets)
     rate = sum(target.rate for row in view.routes for target in row.targets)
-    lost: dict[str, int] = dict(view.rejected)
+    gone = Counter(view.rejected)
     for row in view.routes:
-        for reason, count in row.dropped.items():
-            lost[reason] = lost.get(reason, 0) + count
+        gone.update(row.dropped)
+    lost = unwanted(gone)
+    wanted = {reason: count for reason, count in gone.items() if reason not in lost}
     if view.kernel_drops:
         lost["kernel_drops"] = view.kernel_drops
     return (
         f"in {view.received} ({rate_text(view.rate)}/s), delivered {delivered} ({rate_text(rate)}/s), "
-        f"lost {reasons_text(lost) or 'none'}"
+        f"lost {reasons_text(lost) or 'none'}{'; as the table wants ' if wanted else ''}{reasons_text(wanted)}"
     )
 
 
@@ -52,7 +54,7 @@ def route_table(view: View, height: int, columns: Mapping[str, Column] | None = 
     room = height - 1
     shown = list(view.routes)
     if len(shown) > room:
-        shown = sorted(shown, key=lambda row: (not row.dropped, -row.rate))[: max(room - 1, 0)]
+        shown = sorted(shown, key=lambda row: (not row.lost, -row.rate))[: max(room - 1, 0)]
     for row in shown:
         cells = [column(row) for column in columns.values()]
         table.add_row(row.route, _rate_cell(row.rate), _targets_cell(row), *cells, _drops_cell(row))
@@ -66,7 +68,7 @@ def _rate_cell(rate: float) -> Text:
 
 
 def _drops_cell(row: RouteRow) -> Text:
-    return Text(reasons_text(row.dropped) or "-", style="red" if row.dropped else "dim")
+    return Text(reasons_text(row.dropped) or "-", style="red" if row.lost else "dim")
 
 
 def _targets_cell(row: RouteRow) -> Text:
@@ -79,7 +81,7 @@ def _targets_cell(row: RouteRow) -> Text:
 
 
 def _style(target: TargetRow) -> str:
-    if target.dropped:
+    if target.lost:
         return "red"
     if not target.rate:
         return "dim"

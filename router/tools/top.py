@@ -93,7 +93,7 @@ def _weight(row: TopRow, order: Order) -> float:
     if order is Order.RATE:
         return row.row.rate
     if order is Order.DROPS:
-        return sum(row.row.dropped.values())
+        return sum(row.row.lost.values())
     value = row.age if order is Order.AGE else row.slowest
     return value if value is not None else -1.0
 

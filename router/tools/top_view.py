@@ -12,6 +12,8 @@ from dataclasses import replace
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from router.compiler.books import HISTOGRAM_BOUNDS_NS
+from router.table.quantities import duration
 from router.tools.live import RouteRow
 from router.tools.live_view import Column, route_table, summary_line
 from router.tools.top import Order, Top, TopRow
@@ -62,7 +64,7 @@ def latency_text(seconds: float | None) -> str:
     if seconds is None:
         return "-"
     if math.isinf(seconds):
-        return "> 50 ms"
+        return f"> {duration(HISTOGRAM_BOUNDS_NS[-1])}"
     return f"{seconds * 1e6:.0f} us" if seconds < 1e-3 else f"{seconds * 1e3:.1f} ms"
 
 

@@ -66,6 +66,30 @@ def test_a_window_gives_rates_over_its_last_seconds_only() -> None:
     assert rates == [0.0, 10.0, 10.0, 20.0, 40.0]
 
 
+def test_a_gateway_is_a_route_to_its_clients_and_to_topics() -> None:
+    text = """\
+router_messages_received_total{route="dashboard",source="ros"} %d
+router_messages_received_total{route="dashboard",source="clients"} 1
+router_messages_sent_total{route="dashboard",target="clients"} %d
+router_messages_published_total{route="dashboard",topic="/cmd_vel"} 1
+router_messages_dropped_total{route="dashboard",target="clients",reason="too_large"} 2
+"""
+    (row,) = view(parse_metrics(text % (0, 0), 0), parse_metrics(text % (20, 18), 2)).routes
+    assert [(each.name, each.is_topic, each.rate) for each in row.targets] == [
+        ("/cmd_vel", True, 0.0),
+        ("clients", False, 9.0),
+    ]
+    assert row.lost == {"too_large": 2}
+
+
+def test_what_the_table_wants_gone_is_not_lost() -> None:
+    more = 'router_messages_dropped_total{route="imu_info",target="imu_data",reason="rate_limited"} 9\n'
+    text = METRICS % {"received": 1, "imu": 1} + more
+    (row, _) = view(parse_metrics(text, 0), parse_metrics(text, 1)).routes
+    assert (row.dropped, row.lost) == ({"stale": 2, "rate_limited": 9}, {"stale": 2})
+    assert row.targets[1].lost == {"stale": 2}
+
+
 def test_which_table_ran_is_told_with_the_numbers() -> None:
     assert snapshot(0, 0).table_sha256 == "abc"
     assert parse_metrics("", 0).table_sha256 == ""

@@ -50,5 +50,12 @@ def test_the_summary_adds_everything_up() -> None:
     assert line == "in 20 (10/s), delivered 40 (20/s), lost 3 stale, 2 malformed"
 
 
+def test_what_the_table_wants_gone_is_told_apart_and_troubles_nobody() -> None:
+    line = summary_line(seen(row("imu", dropped={"stale": 3, "rate_limited": 8})))
+    assert line == "in 20 (10/s), delivered 20 (10/s), lost 3 stale, 2 malformed; as the table wants 8 rate_limited"
+    shown = lines(seen(row("a"), row("b", dropped={"rate_limited": 1}), row("c", dropped={"stale": 1})), height=3)
+    assert shown[1].startswith("c")
+
+
 def test_reasons_are_in_order_of_their_number() -> None:
     assert reasons_text({"stale": 1, "queue_full": 3, "loop": 1}) == "3 queue_full, 1 loop, 1 stale"
