@@ -19,8 +19,10 @@ from structlog.testing import capture_logs
 
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.edges.recorder import Recorder
 from router.errors import StartError
 from router.runtime import Router
+from tests.edges.recorder_rig import read
 
 ROOT = Path(__file__).parent.parent
 BOARD = "127.0.0.30"
@@ -149,6 +151,24 @@ def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> N
         "commands stopped coming: the deadman sends in their place",
         "commands come again: the deadman is released",
     ]
+
+
+def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[bytes] = []
+    close = Recorder.close
+
+    def close_late(recorder: Recorder) -> None:
+        said.extend(site.basestation.recv(1000) for _ in range(101))
+        close(recorder)
+
+    monkeypatch.setattr(Recorder, "close", close_late)
+    with Router(site.program(TURNS.replace("20ms", "1h") + "record: {directory: recordings}\n")):
+        site.send(*[DRIVE] * 100)
+    assert said == [*[DRIVE] * 100, BRAKE]
+    [recording] = (site.folder / "recordings").iterdir()
+    assert [each.data for each in read(recording)] == [DRIVE] * 100
 
 
 def test_metrics_are_served_while_it_runs(site: Site) -> None:

@@ -75,10 +75,12 @@ class Router:
         with ExitStack() as opening:
             opening.callback(self._reporter.close)
             self._edges.close_with(opening)
+            companions = opening.enter_context(ExitStack())  # they close when deadmen have had their last word
+            self._edges.end_with(opening)
             with background_threads():
                 change = self._edges.prepare(self._first)
                 opening.callback(change.undo.close)
-                self._open_companions(change, opening)
+                self._open_companions(change, companions)
             self._edges.start(change, opening)
             self._reloader.open()
             opening.callback(self._unwatch)
@@ -183,7 +185,7 @@ class Router:
         """Series that nobody counts in a slot."""
 
         def of_clients(value: Callable[[Subscriber], float]) -> Asked:
-            return lambda: self._edges.gateways.clients(value) if self._edges.gateways else ()
+            return lambda: gateways.clients(value) if (gateways := self._edges.gateways) else ()
 
         return {
             "mirror_dropped": lambda: [((), self.mirror.lost)],

@@ -70,11 +70,14 @@ class Edges:
         closing.callback(self._receiving.stop)
 
     def close_with(self, closing: ExitStack) -> None:
-        """Has `closing` close what is open then. What the router's surroundings need is closed after them."""
-        keepers = self._around.keepers
+        """Has `closing` close what is open then: what the router's surroundings need is closed after them."""
         closing.callback(self.sockets.close_listeners)
         closing.callback(self.sockets.close_senders)
         closing.callback(self._close_ros)
+
+    def end_with(self, closing: ExitStack) -> None:
+        """Has `closing` end what sends by itself: gateways, open frames, what waits, and deadmen last."""
+        keepers = self._around.keepers
         for keeper in (keepers.deadman, keepers.pacing, keepers.collecting):
             closing.callback(keeper.stop)
         closing.callback(self._stop_gateways)
