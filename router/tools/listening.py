@@ -70,10 +70,14 @@ class Tally:
 
 
 class Listening:
-    """Makes sense of what arrives. `wants` says whether a topic is to be shown."""
+    """Makes sense of what arrives. `wants` says whether a topic is to be shown, of "" whether all are.
+
+    The schema of a type that says of no topic what it is for is shown before the first message that is wanted.
+    """
 
     def __init__(self, wants: Callable[[str], bool]) -> None:
         self._wants = wants
+        self._held: dict[tuple[Hashable, str], Schema] = {}
         self._tally = Tally()
         self._reassembler = Reassembler()
         self._shapes: dict[tuple[Hashable, str], Mapping[str, Shape]] = {}
@@ -102,30 +106,38 @@ class Listening:
             return
         for packet in packets:
             try:
-                heard = self._counted(read(packet), arrival.sender)
+                heard = read(packet)
             except PacketError as error:
                 yield self._problem(error, packet)
             else:
-                if heard is not None:
-                    yield heard
+                yield from self._counted(heard, arrival.sender)
 
-    def _counted(self, heard: Message | Schema | Remark, sender: Hashable) -> Heard | None:
-        """None where nobody wants to see it."""
+    def _counted(self, heard: Message | Schema | Remark, sender: Hashable) -> Iterator[Heard]:
+        """What of it somebody wants to see."""
         if isinstance(heard, Remark):
-            return heard
-        if isinstance(heard, Schema):
-            self._tally.schemas += 1
-            if len(self._shapes) >= _MOST_SHAPES:
-                self._shapes.clear()
-            self._shapes[sender, heard.type_name] = heard.shape
-            return heard if not heard.topic or self._wants(heard.topic) else None
-        if not self._wants(heard.topic):
+            yield heard
+        elif isinstance(heard, Schema):
+            yield from self._schema(heard, sender)
+        elif not self._wants(heard.topic):
             self._tally.unwanted += 1
-            return None
-        shape = self._shapes.get((sender, heard.type_name))
-        self._tally.messages += 1
-        self._tally.early += shape is None
-        return heard._replace(shape=shape)
+        else:
+            if (held := self._held.pop((sender, heard.type_name), None)) is not None:
+                yield held
+            shape = self._shapes.get((sender, heard.type_name))
+            self._tally.messages += 1
+            self._tally.early += shape is None
+            yield heard._replace(shape=shape)
+
+    def _schema(self, schema: Schema, sender: Hashable) -> Iterator[Schema]:
+        self._tally.schemas += 1
+        if len(self._shapes) >= _MOST_SHAPES:
+            self._shapes.clear()
+            self._held.clear()
+        self._shapes[sender, schema.type_name] = schema.shape
+        if self._wants(schema.topic):
+            yield schema
+        elif not schema.topic:
+            self._held[sender, schema.type_name] = schema
 
     def _problem(self, error: PacketError, data: bytes) -> Problem:
         self._tally.undecodable += 1

@@ -97,6 +97,17 @@ def test_other_topics_are_counted_and_not_shown() -> None:
     assert str(listening.tally(source)) == "1 messages, 2 schemas, 0 undecodable, 0 lost, 1 of other topics"
 
 
+def test_schemas_of_other_topics_are_not_shown() -> None:
+    schemas = [schema_document(name, 5.0, SCHEMA) for name in ("p/msg/S", "p/msg/T", "p/msg/U")]
+    values = [data_document(topic, name, 5.0, '{"x":1}') for topic, name in (("/a", "p/msg/S"), ("/b", "p/msg/T"))]
+    listening, source = Listening(lambda topic: topic == "/b"), Played(arrivals(*schemas, *values, values[1]))
+    schema, *messages = heard(listening, source)
+    assert isinstance(schema, Schema)
+    assert schema.type_name == "p/msg/T"
+    assert [type(one) for one in messages] == [Message, Message]
+    assert str(listening.tally(source)) == "2 messages, 3 schemas, 0 undecodable, 0 lost, 1 of other topics"
+
+
 def test_what_means_nothing_is_shown_with_its_bytes_and_ends_nothing() -> None:
     batch = b"".join(datagrams([packet("no JSON"), packet('{"x":[1]}')], 1400, 5.0, count()))
     listening, source = Listening(EVERY), Played(arrivals(b"", b"garbage and more", batch))
