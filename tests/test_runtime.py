@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,10 @@ from structlog.testing import capture_logs
 
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.edges.intake import Receive
+from router.edges.receiver import ReceiveThread
 from router.edges.recorder import Recorder
+from router.edges.udp import Listener
 from router.errors import StartError
 from router.runtime import Router
 from tests.edges.recorder_rig import read
@@ -169,6 +172,23 @@ def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
     assert said == [*[DRIVE] * 100, BRAKE]
     [recording] = (site.folder / "recordings").iterdir()
     assert [each.data for each in read(recording)] == [DRIVE] * 100
+
+
+def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    router = Router(site.program())
+    seen: list[bytes] = []
+    serve = ReceiveThread.serve
+
+    def serve_late(thread: ReceiveThread, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
+        if listeners:
+            router.mirror.attach(lambda batch: seen.extend(data for _, _, _, data in batch))
+        serve(thread, listeners, receive)
+
+    monkeypatch.setattr(ReceiveThread, "serve", serve_late)
+    with router:
+        site.send(PH)
+        assert site.basestation.recv(1000) == PH
+    assert seen == [PH]
 
 
 def test_metrics_are_served_while_it_runs(site: Site) -> None:

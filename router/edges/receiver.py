@@ -52,6 +52,7 @@ class ReceiveThread:
         self._ended = False
         self._turns = 0
         self._tasks: deque[Callable[[], None]] = deque()
+        self._first: Callable[[], None] | None = None
         self._thread = threading.Thread(target=self._run, name="receive")
 
     @property
@@ -59,7 +60,9 @@ class ReceiveThread:
         """Grows at least every 250 ms, unless datagrams keep the thread busy or it is stuck."""
         return self._turns
 
-    def start(self) -> None:
+    def start(self, first: Callable[[], None] | None = None) -> None:
+        """The thread begins with `first`, which may say again what somebody said while the thread did not run yet."""
+        self._first = first
         self._thread.start()
 
     def serve(self, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
@@ -132,6 +135,9 @@ class ReceiveThread:
     def _run(self) -> None:
         while not self._ended:
             try:
+                if self._first is not None:
+                    first, self._first = self._first, None
+                    first()
                 if len(self._intakes) == 1:
                     self._from_one()
                 else:

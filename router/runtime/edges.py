@@ -66,7 +66,7 @@ class Edges:
         self._swap(change)
         with background_threads():
             self._finish(change, None)
-        self._receiving.start()
+        self._receiving.start(self._give)  # somebody may have begun to watch during the swap
         closing.callback(self._receiving.stop)
 
     def close_with(self, closing: ExitStack) -> None:
