@@ -53,7 +53,9 @@ def tapped(subject: Subject, is_wanted: bool) -> Iterator[None]:
         yield
         return
     url = f"http://127.0.0.1:{subject.ports.metrics}/tap"
+    deadline = time.monotonic() + 30
     while not answers(subject.ports.metrics):  # it is the last thing that a router opens
+        subject.check(deadline)
         time.sleep(0.1)
     reader = spawn(["curl", "--silent", "--no-buffer", url], cores().helpers, stdout=subprocess.DEVNULL)
     try:
