@@ -40,6 +40,13 @@ TOPIC = """\
     destinations: [basestation]
     topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}]
 """
+FROM_ROS = """\
+  rock_measure_result:
+    source: ros
+    topics: [{topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}]
+    fields: auto
+    destinations: [basestation]
+"""
 DRIVE, BRAKE = bytes.fromhex("c201021005"), bytes.fromhex("ca01020801")
 
 
@@ -403,6 +410,35 @@ gateways:
         site.write(PH)
         assert router.reload().ok
         assert router.total("deadman_datagrams_sent") == 1
+
+
+def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    from router.edges.ros_threads import MessageThread
+
+    go_on, do_tasks = threading.Event(), MessageThread._do_tasks
+
+    def stand_still(thread: MessageThread) -> None:
+        go_on.wait(10)
+        do_tasks(thread)
+
+    with site.router(PH + FROM_ROS) as router:
+        site.write(PH + FROM_ROS + turns("1h"))
+        with monkeypatch.context() as stuck:
+            stuck.setattr("router.edges.parking.PATIENCE_S", 0.05)
+            stuck.setattr(MessageThread, "_do_tasks", stand_still)
+            result = router.reload()
+        assert (result.ok, "is stuck" in result.text) == (False, True)
+        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        assert [route.name for route in router.program.table.routes] == ["ph_info", "rock_measure_result"]
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)
+        go_on.set()
+        assert router.reload().text == "route manual_drive added"
+        site.send(numbered(2), DRIVE)
+        assert [site.basestation.recv(1000) for _ in range(2)] == [numbered(2), DRIVE]
 
 
 def test_files_that_go_while_they_are_read_change_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

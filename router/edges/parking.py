@@ -6,8 +6,9 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-PATIENCE_S = 10.0
-"""How long a thread may take to come by. It is stuck if it takes longer."""
+PATIENCE_S = 1.0
+"""How long a thread may take to come by; it is stuck if it takes longer. Nothing that comes by UDP is routed meanwhile,
+and a service manager's watchdog is not fed."""
 
 
 class StuckError(RuntimeError):
@@ -26,7 +27,7 @@ def parked(ask: Callable[[Callable[[], None]], None]) -> Iterator[None]:
     try:
         ask(stay)
         if not here.wait(PATIENCE_S):
-            raise StuckError("a thread of the router is stuck")
+            raise StuckError("a thread of the router is stuck, or has too much to do: try again")
         yield
     finally:
         go_on.set()
