@@ -15,7 +15,6 @@ from router.tools.table_tests_names import Names, unsound
 from router.tools.table_tests_values import ANY, FieldReader
 from router.types.model import MessageType
 
-NOTHING = "nothing"
 UNCHANGED = "unchanged"
 _MOST = 100_000
 

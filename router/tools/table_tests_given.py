@@ -5,8 +5,8 @@ from __future__ import annotations
 from router.compiler import reference_cdr
 from router.errors import Code, SourceSpan
 from router.table.model import Located
-from router.table.nodes import MappingNode, Node, ScalarNode
-from router.table.reading import UnsoundError
+from router.table.nodes import MappingNode, Node
+from router.table.reading import UnsoundError, boolean, integer, optional_text
 from router.table.units import parse_duration
 from router.tools import UsageError
 from router.tools.table_tests_matching import MessageMatch, Moments
@@ -35,23 +35,23 @@ class GivenReader:
         return self._message(span, node) if is_message else self._datagram(span, node)
 
     def _datagram(self, span: SourceSpan, node: MappingNode) -> GivenDatagram:
-        sender = _text(node, "from")
+        sender = optional_text(node, "from")
         if sender is None:
             raise unsound(span, Code.MISSING_KEY, "it is not said who sends this", "add 'from: ENDPOINT'")
-        case, data = _text(node, "case"), _hex(node)
+        case, data = optional_text(node, "case"), _hex(node)
         if (case is None) == (data is None):
             message = "a datagram is given as 'case' with 'fields', or as 'hex'; a ROS message has a 'topic'"
             raise unsound(span, Code.BAD_VALUE, message)
         if case is None and (fields := node.entries.get("fields")):
             raise unsound(fields.key.span, Code.UNKNOWN_KEY, "'fields' belongs to 'case'")
-        pad = node.get("pad")
+        pad = integer(node, "pad")
         return GivenDatagram(
             span=span,
             peer=self._names.peer(sender.value, sender.span),
             listener=self._listener(span, node),
             content=data if data is not None else self._payload(node, case),
-            trim=_is_true(node.get("trim")),
-            pad=int(pad.text) if isinstance(pad, ScalarNode) else 0,
+            trim=boolean(node, "trim"),
+            pad=pad.value if pad else 0,
             repetition=_repetition(node),
         )
 
@@ -62,7 +62,7 @@ class GivenReader:
         return case, self._fields.message(case.type, fields) if fields else MessageMatch({}, named.span)
 
     def _listener(self, span: SourceSpan, node: MappingNode) -> str:
-        named = _text(node, "listener")
+        named = optional_text(node, "listener")
         if named is not None:
             return self._names.listener(named.value, named.span)
         if len(self._names.listeners) > 1:
@@ -70,7 +70,7 @@ class GivenReader:
         return self._names.listeners[0]
 
     def _message(self, span: SourceSpan, node: MappingNode) -> GivenMessage:
-        topic = _text(node, "topic")
+        topic = optional_text(node, "topic")
         assert topic is not None  # noqa: S101 - the caller has seen to it
         kind = self._names.subscribed(topic.value, topic.span)
         data, fields = _hex(node), node.get("message")
@@ -112,25 +112,16 @@ def _only(node: MappingNode, others: tuple[str, ...], is_message: bool) -> None:
 
 
 def _repetition(node: MappingNode) -> Repetition:
-    times, every, age = node.get("times"), _text(node, "every"), _text(node, "age")
+    times, every, age = integer(node, "times"), optional_text(node, "every"), optional_text(node, "age")
     if every is not None and times is None:
         raise unsound(every.span, Code.MISSING_KEY, "'every' without 'times'", "say how often it is given")
     return Repetition(
-        times=int(times.text) if isinstance(times, ScalarNode) else 1,
+        times=times.value if times else 1,
         every=UnsoundError.guard(parse_duration, every) if every else 0,
         age=UnsoundError.guard(parse_duration, age) if age else 0,
     )
 
 
 def _hex(node: MappingNode) -> bytes | None:
-    text = _text(node, "hex")
+    text = optional_text(node, "hex")
     return bytes.fromhex(text.value) if text else None
-
-
-def _text(node: MappingNode, key: str) -> Located[str] | None:
-    found = node.get(key)
-    return Located(found.text, found.span) if isinstance(found, ScalarNode) else None
-
-
-def _is_true(node: Node | None) -> bool:
-    return isinstance(node, ScalarNode) and node.value is True

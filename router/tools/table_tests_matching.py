@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Union
 
 from router.errors import SourceSpan
-from router.tools.table_tests_shown import elements, is_unset, same_value, shown, time_of
+from router.tools.table_tests_shown import elements, is_unset, offset, same_value, shown, time_of
 from router.types.model import List, MessageType, Type
 
 Path = tuple[Union[str, int], ...]
@@ -88,8 +88,8 @@ class Moment:
     def differences(self, path: Path, kind: Type, actual: Any, moments: Moments) -> Iterator[Difference]:
         found = time_of(_message(kind), actual)
         if found != self.time(moments):
-            expected = self.time(moments) - moments.start
-            yield Difference(path, f"{expected / 1e6:g} ms", f"{(found - moments.start) / 1e6:g} ms", self.span)
+            expected = offset(self.time(moments) - moments.start)
+            yield Difference(path, expected, offset(found - moments.start), self.span)
 
 
 @dataclass(frozen=True, slots=True)

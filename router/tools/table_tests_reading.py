@@ -22,6 +22,7 @@ from router.tools.table_tests_given import GivenReader
 from router.tools.table_tests_model import Expected, Step, TableTest, TableTestFile
 from router.tools.table_tests_names import Names
 from router.tools.table_tests_shape import read_shape
+from router.tools.table_tests_shown import offset
 
 R = TypeVar("R")
 ENDINGS = (".test.yaml", ".test.yml")
@@ -104,7 +105,7 @@ class _Reader:
     def _in_time(self, key: str, time: int | None, latest: int, node: Node) -> int:
         """The time of a key of a step, ns, which is not before the `latest` of what stands above."""
         if time is not None and time < latest and isinstance(node, MappingNode):
-            what = f"this is {time / 1e6:g} ms, before the {latest / 1e6:g} ms of what stands above"
+            what = f"this is {offset(time)}, before the {offset(latest)} of what stands above"
             hint = "steps are in the order of time"
             self._findings.append(Diagnostic(node.entries[key].value.span, Code.BAD_VALUE, what, hint))
         return max(latest, time or 0)

@@ -13,6 +13,7 @@ from typing import Any
 from google.protobuf.message import Message
 
 from router.compiler.implementations import NS_PER_SECOND, entries
+from router.table.quantities import duration
 from router.tools.rehearsal import START
 from router.tools.show import float_text
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
@@ -24,7 +25,7 @@ def shown(kind: Type, value: Any) -> str:
     """A value as a test would write it, on one line."""
     match kind:
         case MessageType() if kind.name in TIMES:
-            return f"{(time_of(kind, value) - START) / 1e6:g} ms"
+            return offset(time_of(kind, value) - START)
         case MessageType():
             inner = ", ".join(words(kind, value))
             return f"{{{inner}}}"
@@ -42,6 +43,11 @@ def shown(kind: Type, value: Any) -> str:
             return repr(value)
         case _:
             return str(value)
+
+
+def offset(ns: int) -> str:
+    """A time after the beginning of the test, as a test would write it; negative before."""
+    return f"{'-' if ns < 0 else ''}{duration(abs(ns)) if ns else '0 ms'}"
 
 
 def elements(kind: List, value: Any) -> Sequence[Any]:

@@ -9,13 +9,13 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 
-from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.errors import Code, SourceSpan, did_you_mean
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
-from router.table.reading import UnsoundError
 from router.table.units import parse_duration
 from router.tools import UsageError
 from router.tools.fields import parse
 from router.tools.table_tests_matching import AnyValue, Exactly, ListMatch, Match, MessageMatch, Moment, Near
+from router.tools.table_tests_names import unsound
 from router.tools.table_tests_shown import TIMES
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, Type
 
@@ -38,7 +38,7 @@ class FieldReader:
 
     def message(self, kind: MessageType, node: Node) -> MessageMatch:
         if not isinstance(node, MappingNode):
-            raise _unsound(node.span, Code.WRONG_TYPE, f"{kind} is a message: write its fields, {{name: value}}")
+            raise unsound(node.span, Code.WRONG_TYPE, f"{kind} is a message: write its fields, {{name: value}}")
         members: dict[str, Match] = {}
         for path, span, value in _flat(node):
             self._put(members, kind, path, span, value)
@@ -49,17 +49,17 @@ class FieldReader:
         field = kind.field(name)
         if field is None:
             hint = did_you_mean(name, [member.name for member in kind.fields])
-            raise _unsound(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
+            raise unsound(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
         if not dot:
             if name in members:
-                raise _unsound(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
+                raise unsound(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
             members[name] = self.value(field.type, value, kind)
             return
         if not isinstance(field.type, MessageType):
-            raise _unsound(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields")
+            raise unsound(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields")
         inner = members.get(name)
         if inner is not None and not isinstance(inner, MessageMatch):
-            raise _unsound(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
+            raise unsound(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
         below = dict(inner.members) if inner else {}
         self._put(below, field.type, rest, span, value)
         members[name] = MessageMatch(below, span)
@@ -72,7 +72,7 @@ class FieldReader:
         if isinstance(kind, List):
             return self._list(kind, node, holder)
         if not isinstance(node, ScalarNode):
-            raise _unsound(node.span, Code.WRONG_TYPE, f"a {kind} takes one value")
+            raise unsound(node.span, Code.WRONG_TYPE, f"a {kind} takes one value")
         return self._scalar(kind, node, holder)
 
     def _submessage(self, kind: MessageType, node: Node) -> Match:
@@ -85,10 +85,10 @@ class FieldReader:
 
     def _list(self, kind: List, node: Node, holder: MessageType) -> Match:
         if not isinstance(node, SequenceNode):
-            raise _unsound(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
+            raise unsound(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
         if kind.length is not None and len(node.items) != kind.length:
             message = f"{kind} has {kind.length} elements, not {len(node.items)}"
-            raise _unsound(node.span, Code.TYPE_MISMATCH, message)
+            raise unsound(node.span, Code.TYPE_MISMATCH, message)
         return ListMatch(tuple(self.value(kind.element, item, holder) for item in node.items), node.span)
 
     def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Match:
@@ -102,7 +102,7 @@ class FieldReader:
         try:
             return Exactly(parse(kind, text, ""), node.span)
         except UsageError as error:
-            raise _unsound(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
+            raise unsound(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
 
     def _named(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
         """The value of a ROS constant of the message, or of a protobuf enum: `STATUS_FIX`, `GPSFixQuality.RTK_FIX`."""
@@ -112,7 +112,7 @@ class FieldReader:
         numbers = self._numbers.get(text, set())
         if len(numbers) > 1:
             message = f"several enums have a value '{text}', with different numbers"
-            raise _unsound(span, Code.BAD_VALUE, message, f"say of which enum, as in State.{text}")
+            raise unsound(span, Code.BAD_VALUE, message, f"say of which enum, as in State.{text}")
         return next(iter(numbers), None)
 
 
@@ -131,7 +131,7 @@ def _near(text: str, span: SourceSpan) -> Near | None:
         value = _finite(found[1], "number to be near", span)
         tolerance = _finite(found[2], "tolerance", span)
         if tolerance < 0:
-            raise _unsound(span, Code.BAD_VALUE, f"'{found[2]}' is no tolerance, which is not negative")
+            raise unsound(span, Code.BAD_VALUE, f"'{found[2]}' is no tolerance, which is not negative")
         return Near(value, tolerance, text, span)
     return None
 
@@ -142,7 +142,7 @@ def _finite(text: str, what: str, span: SourceSpan) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise _unsound(span, Code.BAD_VALUE, f"'{text}' is no {what}", "write a number, as in 1.57 +- 0.01")
+        raise unsound(span, Code.BAD_VALUE, f"'{text}' is no {what}", "write a number, as in 1.57 +- 0.01")
     return value
 
 
@@ -155,13 +155,9 @@ def _offset(node: ScalarNode) -> int | None:
         return parse_duration(node.text)
     except ValueError as error:
         hint = f"a time is '{RECEIVED_AT}', or so long after the beginning of the test, such as 300ms"
-        raise _unsound(node.span, Code.BAD_VALUE, str(error), hint) from error
+        raise unsound(node.span, Code.BAD_VALUE, str(error), hint) from error
 
 
 def _is_word(node: Node, word: str) -> bool:
     """The word without quotes: with them it is text."""
     return isinstance(node, ScalarNode) and node.text == word and node.place.is_whole_line
-
-
-def _unsound(span: SourceSpan, code: Code, message: str, hint: str = "") -> UnsoundError:
-    return UnsoundError(Diagnostic(span, code, message, hint))

@@ -11,7 +11,7 @@ from router.tools.rehearsal_events import Dropped, Event, Filtered, Published, S
 from router.tools.table_tests_matching import Moments
 from router.tools.table_tests_model import Step
 from router.tools.table_tests_places import Place, Places
-from router.tools.table_tests_shown import shown
+from router.tools.table_tests_shown import offset, shown
 from router.tools.wire import Wire
 
 
@@ -32,7 +32,7 @@ class Happened:
 
     def time(self, event: Event) -> str:
         """`at 500 ms `, nothing at the beginning of the test."""
-        return f"at {(event.at - self.start) / 1e6:g} ms " if event.at != self.start else ""
+        return f"at {offset(event.at - self.start)} " if event.at != self.start else ""
 
 
 class Words:

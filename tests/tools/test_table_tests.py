@@ -15,6 +15,7 @@ from router.tools.table_tests_comparing import Failure
 from router.tools.table_tests_coverage import Coverage
 from router.tools.table_tests_model import TableTestFile
 from router.tools.table_tests_reading import read_test_file
+from router.tools.table_tests_shown import offset
 from tests.engine.rig import HEAD
 
 DEFINITIONS = Definitions()
@@ -475,14 +476,14 @@ def test_what_happens_between_two_steps_fails(tmp_path: Path, expect: str) -> No
         ("{expect: {filtered: nobody}}", Code.BAD_VALUE, "no route to 'nobody'"),
         ("{expects: nothing}", Code.UNKNOWN_KEY, "no key 'expects'"),
         ("{given: {hex: '00', from: sensor_board, listener: exact}}", Code.MISSING_KEY, "nothing of what is expected"),
-        ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1000 ms, before the 2000"),
+        ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1 s, before the 2 s"),
         ("{steps: [{expect: nothing}], expect: nothing}", Code.UNKNOWN_KEY, "'expect' stands beside 'steps'"),
         (
             f"{{steps: [{{given: {given('{}', ', times: 3, every: 1s')}, until: 1999 ms, expect: any}}]}}",
             Code.BAD_VALUE,
-            "1999 ms, before the 2000 ms",
+            "1.999 s, before the 2 s",
         ),
-        ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, before the 1000"),
+        ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, before the 1 s"),
         ("{steps: [{stop: true, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "router is stopped"),
         (f"{{given: {given('{}')}, expect: {{sent: [basestation, basestation]}}}}", Code.BAD_VALUE, "named twice"),
         ("{expect: {published: {imu_data: {accel_x: 1 +- inf}}}}", Code.BAD_VALUE, "'inf' is no tolerance"),
@@ -633,3 +634,10 @@ def test_files_of_one_table_cover_it_together(tmp_path: Path) -> None:
         assert not coverage.is_complete
     covered[0].add(covered[1])
     assert covered[0].is_complete
+
+
+@pytest.mark.parametrize(
+    ("ns", "text"), [(0, "0 ms"), (300_000_000, "300 ms"), (1_999_000_000, "1.999 s"), (-250_000_000, "-250 ms")]
+)
+def test_times_are_told_as_a_test_writes_them(ns: int, text: str) -> None:
+    assert offset(ns) == text
