@@ -6,6 +6,7 @@ Knows no verb's work. A verb's module offers `add_parser(subparsers)` and `run(a
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import io
 import os
@@ -81,7 +82,11 @@ def _open_what_is_closed() -> None:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
+    parser = argparse.ArgumentParser(
+        prog="router",
+        description="Route messages between protobuf over UDP and ROS 2.",
+        formatter_class=functools.partial(argparse.HelpFormatter, indent_increment=1),  # with 2, long verbs break
+    )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)

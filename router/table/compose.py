@@ -115,7 +115,7 @@ class _Composer:
         parent.children.append(node)
         parent.size += size
         if parent.size > MAX_NODES:
-            raise self._fatal(node.span, f"the table has more than {MAX_NODES} values, aliases written out", "")
+            raise self._fatal(node.span, f"this file has more than {MAX_NODES} values, aliases written out", "")
 
     def _scalar(self, event: yaml.ScalarEvent) -> ScalarNode:
         span = self._span(event)
