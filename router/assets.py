@@ -20,3 +20,8 @@ def asset(relative: str) -> Path:
         if (path := place / relative).exists():
             return path
     raise FileNotFoundError(f"this installation of the router has no '{relative}'; install it again")
+
+
+def are_installed() -> bool:
+    """Whether they lie within the package, as a wheel has them: who changes them there loses it with the next one."""
+    return asset("schemas").is_relative_to(_PACKAGE)

@@ -40,9 +40,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 @explained
 def run(args: argparse.Namespace) -> int:
+    from router.assets import are_installed
+    from router.tools import UsageError
     from router.tools.new_message import new_message
     from router.tools.new_message_files import Written, changes
 
+    if are_installed():
+        raise UsageError("this router is installed, and our ROS messages with it; use the one of a checkout")
     before = _check(args.table)
     errors = [finding for checked in before for finding in checked.diagnostics if checked.has_errors]
     if errors:
@@ -55,11 +59,10 @@ def run(args: argparse.Namespace) -> int:
     written = Written(planned.texts)
     try:
         after = _check(args.table)
+        print_findings(_news(before, after), sys.stderr)
     except BaseException:  # somebody pressed Ctrl-C
         written.undo()
         raise
-    findings = _news(before, after)
-    print_findings(findings, sys.stderr)
     if any(checked.has_errors for checked in after):
         written.undo()
         print("router new: the message would be wrong like this; nothing was written", file=sys.stderr)

@@ -58,7 +58,9 @@ def _test(message: NewMessage, site: Site) -> Iterator[str]:
 def _wrapped(text: str, indent: str) -> Iterator[str]:
     """On several lines if it is long; a name and its value stay on one."""
     together = text.replace(": ", ":\0")
-    for line in textwrap.wrap(together, WIDEST - 2, subsequent_indent=indent, break_on_hyphens=False):
+    for line in textwrap.wrap(
+        together, WIDEST - 2, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    ):
         yield line.replace("\0", " ")
 
 

@@ -55,8 +55,8 @@ def test_the_socket_has_the_addresses_of_the_rovers_table() -> None:
 def test_a_place_that_units_or_settings_would_garble_is_refused(tmp_path: Path, name: str) -> None:
     script = tmp_path / name / "deploy" / "install-service.sh"
     script.parent.mkdir(parents=True)
-    script.write_text((ROOT / "deploy" / "install-service.sh").read_text())
-    finished = subprocess.run(["bash", script], capture_output=True, text=True, check=False)
+    shutil.copy(ROOT / "deploy" / "install-service.sh", script)
+    finished = subprocess.run([script], capture_output=True, text=True, check=False)
     assert finished.returncode == 1
     assert finished.stderr == (
         f"install-service: '{tmp_path / name}' has characters that systemd or a shell would misread: move it\n"

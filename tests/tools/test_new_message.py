@@ -285,9 +285,10 @@ def test_files_keep_their_ends_of_lines(site: Path) -> None:
     assert main(["test", "routes"]) == OK
 
 
-def test_a_name_and_its_value_stay_on_one_line_of_the_test(site: Path) -> None:
+@pytest.mark.parametrize("kind", ["SensorState", "MotorInformation"])
+def test_a_name_and_its_value_stay_on_one_line_of_the_test(site: Path, kind: str) -> None:
     before = contents(site)
-    fields = " ".join(f"a_quite_long_name_{number}:SensorState" for number in range(6))
+    fields = " ".join(f"a_quite_long_name_{number}:{kind}" for number in range(6))
     assert main(["new", *RADIATION, "--fields", fields]) == OK
     lines = [line for line in added(before, contents(site))["routes/rover.test.yaml"] if "quite" in line]
     assert len(lines) > 1
@@ -370,6 +371,16 @@ def test_a_table_with_errors_is_repaired_first(site: Path, capsys: pytest.Captur
     before = contents(site)
     assert main(["new", *RADIATION]) == BAD_TABLE
     assert "repair that first" in capsys.readouterr().err
+    assert contents(site) == before
+
+
+def test_an_installation_is_not_the_place_for_a_new_message(
+    site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(router.assets, "_PACKAGE", site)
+    before = contents(site)
+    assert main(["new", *RADIATION]) == BAD_USAGE
+    assert "use the one of a checkout" in capsys.readouterr().err
     assert contents(site) == before
 
 
