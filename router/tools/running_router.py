@@ -94,7 +94,8 @@ def _connection(url: str, patience: float) -> http.client.HTTPConnection:
     try:
         parts = urlsplit(url if "://" in url else f"http://{url}")
         host, port = parts.hostname, parts.port
-    except ValueError:  # no number for a port, half an IPv6 address
+        (host or "").encode("idna")
+    except ValueError:  # no number for a port, half an IPv6 address, a name with two dots in a row
         host = port = None
     if host is None or port == 0 or parts.scheme != "http" or re.search(r"\s", url):
         raise UsageError(f"'{url}' is not like http://127.0.0.1:9108")

@@ -66,7 +66,19 @@ def test_what_is_no_router_is_told_by_its_answer() -> None:
         thread.join()
 
 
-@pytest.mark.parametrize("url", ["https://127.0.0.1:9108", "http://", "ftp://rover", "http://a:99999"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "https://127.0.0.1:9108",
+        "http://",
+        "ftp://rover",
+        "http://a:99999",
+        "http://a:b",
+        "http://[::1",
+        "http://rover..local",
+        f"http://{'a' * 64}:9108",
+    ],
+)
 def test_what_is_no_address_of_a_router_is_a_wrong_use(url: str) -> None:
     with pytest.raises(UsageError, match="is not like http://127"):
         metrics(url)
