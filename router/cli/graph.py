@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drawn(table: RouteTable, suffix: str) -> str:
-    from router.edges.route_map import route_map
+    from router.compiler.route_map import route_map
     from router.tools.graph_svg import svg
     from router.tools.graph_text import dot, mermaid
 

@@ -9,9 +9,9 @@ import threading
 from time import monotonic
 from typing import Any
 
+from router.compiler.route_map import NARROW, WIDE, Measures, RouteMap, route_map
 from router.edges.clock import wall_ns
 from router.edges.last_values import LastValues
-from router.edges.route_map import NARROW, WIDE, Measures, RouteMap, route_map
 from router.edges.running import Running
 from router.edges.status_numbers import numbers
 from router.errors import shown_path

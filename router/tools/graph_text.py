@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from xml.sax.saxutils import escape
 
-from router.edges.route_map import COLUMNS
-from router.edges.route_map_parts import Part, PartKind, Tie, map_parts
+from router.compiler.route_map import COLUMNS
+from router.compiler.route_map_parts import Part, PartKind, Tie, map_parts
 from router.table.model import RouteTable
 
 _MERMAID_SHAPES = {PartKind.TOPIC: ("([", "])"), PartKind.CLIENTS: ("([", "])"), PartKind.ANYONE: ("((", "))")}

@@ -9,7 +9,7 @@ import pytest
 
 from router.assets import asset
 from router.compiler import check_table
-from router.edges.route_map import route_map
+from router.compiler.route_map import route_map
 from router.table.model import RouteTable
 from router.tools.graph_svg import svg
 

@@ -11,7 +11,7 @@ import pytest
 
 from router.assets import asset
 from router.compiler import check_table
-from router.edges.route_map_parts import map_parts
+from router.compiler.route_map_parts import map_parts
 from router.table.model import RouteTable
 from router.tools.graph_text import dot, mermaid
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from router.assets import asset
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.edges.route_map import NARROW, WIDE, Measures, route_map, shortened, spread
-from router.edges.route_map_parts import PartKind, map_parts
+from router.compiler.route_map import NARROW, WIDE, Measures, route_map, shortened, spread
+from router.compiler.route_map_parts import PartKind, map_parts
 from router.table.model import ANY, RouteTable
 
 TABLES = ("rover.yaml", "legacy.yaml", "sim.yaml")

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from router.edges.route_map_parts import Part, Tie, map_parts
+from router.compiler.route_map_parts import Part, Tie, map_parts
 from router.table.model import RouteTable
 
 COLUMNS = ("from", "payload case", "to")
