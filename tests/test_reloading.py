@@ -11,8 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import ANY
 
 import pytest
+from structlog.testing import capture_logs
 
 from router.compiler import check_table
 from router.compiler.books import Books
@@ -195,6 +197,7 @@ def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
         result = router.reload()
         assert not result.ok
         assert "has the port" in result.text
+        assert "no route for the payload cases" in str(result.findings[0])  # warnings are told all the same
         assert settled(router)["router_config_reloads_total['failed']"] == 1
         assert list(router.listeners) == ["rover"]
 
@@ -202,10 +205,14 @@ def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
 def test_what_only_a_start_can_change_is_refused(site: Site) -> None:
     with site.router(PH) as router:
         path = site.write(PH)
-        path.write_text(path.read_text() + "node: {name: another}\n")
-        result = router.reload()
-        assert not result.ok
-        assert "'node' cannot change while the router runs; restart it" in str(result.findings[-1])
+        unchanged = path.read_text()
+        for node in ("name: another", "diagnostics: true"):
+            path.write_text(f"{unchanged}node: {{{node}}}\n")
+            result = router.reload()
+            assert not result.ok
+            assert "table.yaml:10:1: error[bad-value]: 'node' cannot change while the router runs; restart it" in str(
+                result.findings[-1]
+            )
 
 
 def test_what_has_arrived_on_a_listener_that_goes_is_routed_before_it_goes(
@@ -439,6 +446,23 @@ def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
         assert router.reload().text == "route manual_drive added"
         site.send(numbered(2), DRIVE)
         assert [site.basestation.recv(1000) for _ in range(2)] == [numbered(2), DRIVE]
+
+
+@pytest.mark.parametrize("late", ["router.runtime.accounts.Books.settle", "router.runtime.BooksCollector"])
+def test_what_fails_when_the_table_runs_already_is_not_told_as_if_nothing_had_changed(
+    site: Site, monkeypatch: pytest.MonkeyPatch, late: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise LookupError("a bug")
+
+    with capture_logs() as logged, site.router(PH) as router:
+        site.write(PH + turns("1h"))
+        monkeypatch.setattr(late, fail)
+        assert router.reload() == (True, ANY, "route manual_drive added")
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+    told = [entry["event"] for entry in logged if entry["log_level"] == "critical"]
+    assert [event.split(";")[-1] for event in told] == [" please report it"]
 
 
 def test_files_that_go_while_they_are_read_change_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

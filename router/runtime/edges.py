@@ -14,6 +14,7 @@ from router.compiler.program import Program
 from router.edges.background import background_threads
 from router.edges.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
 from router.edges.intake import Receive
+from router.edges.log import logger
 from router.edges.receiver import ReceiveThread
 from router.engine import MAX_DATAGRAM
 from router.engine.state import State
@@ -102,7 +103,10 @@ class Edges:
             return Change(sockets, topics, wiring, gateways, undo.pop_all())
 
     def take_over(self, change: Change) -> None:
-        """Has the prepared program run, from one message to the next. Raises StuckError, and then nothing changed."""
+        """Has the prepared program run, from one message to the next.
+
+        Raises StuckError or StartError, and then nothing changed. What fails after that is a fault of ours, and logged.
+        """
         earlier = self.wiring
         try:
             if self.gateways is not None and change.gateways is not None:
@@ -111,7 +115,13 @@ class Edges:
         except BaseException:
             change.undo.close()
             raise
-        self._finish(change, earlier)
+        try:
+            self._finish(change, earlier)
+        except Exception as error:  # noqa: BLE001 told loudly: the program runs all the same
+            logger.critical(
+                "a fault in the router itself kept it from closing what it does not use; please report it",
+                exc_info=error,
+            )
 
     def _swap(self, change: Change) -> None:
         """While nothing is received: on the receive thread, and with that of ROS standing still."""
@@ -126,18 +136,19 @@ class Edges:
             self._receiving.serve(list(self.sockets.listeners.values()), self._teed())
 
     def _finish(self, change: Change, earlier: Wiring | None) -> None:
-        """Closes what only the earlier program used."""
-        if self.gateways is not None and change.gateways is not None:
-            self._follow_drops(self.gateways, change.gateways)
-            self.gateways.finish(change.gateways)
-        change.wiring.state.settle()
-        if self._ros is not None and change.topics is not None:
-            self._ros.finish(change.topics)
-        change.sockets.left.close()
-        self._around.accounts.settle(change.wiring.program.books)
-        if earlier is not None:
-            earlier.forget()
+        """Closes what only the earlier program used: all that, whatever one step raises."""
         change.undo.pop_all()  # and not done
+        with ExitStack() as last_first:
+            if earlier is not None:
+                last_first.callback(earlier.forget)
+            last_first.callback(self._around.accounts.settle, change.wiring.program.books)
+            last_first.callback(change.sockets.left.close)
+            if self._ros is not None and change.topics is not None:
+                last_first.callback(self._ros.finish, change.topics)
+            last_first.callback(change.wiring.state.settle)
+            if self.gateways is not None and change.gateways is not None:
+                last_first.callback(self.gateways.finish, change.gateways)
+                last_first.callback(self._follow_drops, self.gateways, change.gateways)
 
     # -- parts ---------------------------------------------------------------------------------------------------
 

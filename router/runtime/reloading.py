@@ -19,7 +19,7 @@ from router.edges.running import ReloadResult
 from router.edges.supervision import reloading
 from router.errors import Diagnostic, Severity, StartError
 from router.runtime.accounts import Accounts
-from router.runtime.differences import changes, unchangeable
+from router.runtime.changes import changes, unchangeable
 from router.runtime.edges import Edges
 from router.runtime.interpreter import beside_traffic
 
@@ -57,7 +57,7 @@ class Reloader:
                 return ReloadResult(False, (), "the router is not running")
             began = monotonic_ns()
             with background_threads(), beside_traffic(), reloading():
-                kind, result = self._guarded(self._edges.wiring.program)
+                kind, result = self._attempt(self._edges.wiring.program)
             self._count(kind)
             self._remember(is_good=result.ok)
             seconds = round((monotonic_ns() - began) / 1e9, 3)
@@ -66,29 +66,36 @@ class Reloader:
         log(event, result=result.text, findings=[str(finding) for finding in result.findings], seconds=seconds)
         return result
 
-    def _guarded(self, now: Program) -> tuple[str, ReloadResult]:
+    def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
+        """As what it is counted, and what came of it."""
+        findings: Sequence[Diagnostic] = ()
         try:
-            return self._reload(now)
+            checked = check_table(now.table.path, self._environ, Definitions(now.protos))
+            findings = checked.diagnostics
+            then = checked.program_in(now.books.continued())
+            if then is None:
+                return "invalid", _refused(findings)
+            if refused := unchangeable(now.table, then.table):
+                return "invalid", _refused([*findings, *refused])
+            text = changes(now, then)
+            self._edges.take_over(self._edges.prepare(then))
         except (StartError, StuckError) as error:
-            return "failed", ReloadResult(False, (), str(error))
+            why = str(error)
         except OSError as error:  # files come and go while they are read, and descriptors may be short
-            return "failed", ReloadResult(False, (), f"the table cannot be read or opened now: {error}")
+            why = f"the table cannot be read or opened now: {error}"
         except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, must not end who asked
             logger.critical("a fault in the router itself kept it from reloading; please report it", exc_info=error)
-            return "failed", ReloadResult(False, (), f"a fault in the router itself: {error!r}")
+            why = f"a fault in the router itself: {error!r}"
+        else:
+            self._settle()
+            return "ok", ReloadResult(True, tuple(findings), text)
+        return "failed", ReloadResult(False, tuple(findings), why)
 
-    def _reload(self, now: Program) -> tuple[str, ReloadResult]:
-        """Raises StartError, StuckError, and OSError for files that change meanwhile."""
-        checked = check_table(now.table.path, self._environ, Definitions(now.protos))
-        findings = checked.diagnostics
-        then = checked.program_in(now.books.continued())
-        if then is None:
-            return "invalid", _refused(findings)
-        if refused := unchangeable(now.table, then.table):
-            return "invalid", _refused([*findings, *refused])
-        self._edges.take_over(self._edges.prepare(then))
-        self._settled()
-        return "ok", ReloadResult(True, tuple(findings), changes(now, then))
+    def _settle(self) -> None:
+        try:
+            self._settled()
+        except Exception as error:  # noqa: BLE001 as above; the table runs already
+            logger.critical("a fault in the router itself after a reload; please report it", exc_info=error)
 
     def _count(self, kind: str) -> None:
         self._accounts.own[self._accounts.books.slot("config_reloads", kind)] += 1

@@ -162,6 +162,7 @@ def _node(entry: Entry) -> NodeSettings:
         text_or(settings, "name", DEFAULT_NODE.name),
         text_or(settings, "namespace", DEFAULT_NODE.namespace),
         settings.entries["diagnostics"].key.span if boolean(settings, "diagnostics") else None,
+        entry.key.span,
     )
 
 

@@ -73,11 +73,12 @@ class EnvelopeSettings:
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """`diagnostics` is where the table asks for /diagnostics, None where it does not."""
+    """`diagnostics` is where the table asks for /diagnostics, None where it does not; `span` is the key `node`."""
 
     name: str
     namespace: str
     diagnostics: SourceSpan | None = None
+    span: SourceSpan | None = None
 
 
 @dataclass(frozen=True, slots=True)

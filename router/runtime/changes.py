@@ -1,4 +1,8 @@
-"""What another table changes, in a line, and what of it a running router cannot take over."""
+"""What a reload changes, in a line, and what of it a running router cannot take over.
+
+Names what is written in another way, which is what is wired anew; `compiler/differences` tells what a table does in
+another way, and how.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ from collections.abc import Iterator, Mapping
 
 from router.compiler.program import Program
 from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import RouteTable
+from router.table.model import NodeSettings, RouteTable
 from router.table.sameness import are_same
 
 _MOST_NAMED = 12
@@ -16,18 +20,22 @@ def unchangeable(now: RouteTable, then: RouteTable) -> list[Diagnostic]:
     """A finding for each setting of `then` that only a start can take over."""
     top = SourceSpan(str(then.path))
     settings = {
-        "node": (now.node, then.node, top),
-        "metrics": (now.metrics, then.metrics, then.metrics.span if then.metrics else top),
-        "record": (now.record, then.record, then.record.span if then.record else top),
-        "foxglove": (now.foxglove, then.foxglove, then.foxglove.span if then.foxglove else top),
+        "node": (_node(now.node), _node(then.node), then.node.span),
+        "metrics": (now.metrics, then.metrics, then.metrics and then.metrics.span),
+        "record": (now.record, then.record, then.record and then.record.span),
+        "foxglove": (now.foxglove, then.foxglove, then.foxglove and then.foxglove.span),
     }
     return [
         Diagnostic(
-            span, Code.BAD_VALUE, f"'{key}' cannot change while the router runs", "restart it, or change it back"
+            span or top, Code.BAD_VALUE, f"'{key}' cannot change while the router runs", "restart it, or change it back"
         )
         for key, (before, after, span) in settings.items()
         if not are_same(before, after)
     ]
+
+
+def _node(node: NodeSettings) -> object:
+    return node.name, node.namespace, node.diagnostics is not None
 
 
 def changes(before: Program, after: Program) -> str:
