@@ -18,7 +18,8 @@ from demo.screen import open_screen
 from demo.verdict import Finding, judge
 from router.errors import RouterError, TransportError
 from router.table.model import RouteTable
-from router.tools.live import Snapshot, Window, parse_metrics
+from router.tools.live import Snapshot, parse_metrics, view
+from router.tools.live_window import Window
 from router.tools.running_router import metrics, url_of
 
 TABLE = Path("routes/sim.yaml")
@@ -79,14 +80,16 @@ class Demo:
         with open_screen(console, self._table, DURATION) as screen:
             while simulator.latest["seconds"] < DURATION:
                 time.sleep(REFRESH)
-                screen.show(window.add(self._snapshot()), listener.latest, simulator.latest)
+                window.add(self._snapshot())
+                screen.show(view(*window.ends), listener.latest, simulator.latest)
         shown = self._look_at_page()
         self._finish(talker)
         time.sleep(DRAINING)
         self._finish(simulator)
         time.sleep(SETTLING)
         recorded = first_of(recordings(self._table) - before)
-        return judge(self._table, listener.latest, simulator.latest, window.add(self._snapshot()), shown, recorded)
+        window.add(self._snapshot())
+        return judge(self._table, listener.latest, simulator.latest, view(*window.ends), shown, recorded)
 
     def _look_at_page(self) -> Shown | None:
         """None where the table has no page."""

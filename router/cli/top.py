@@ -79,22 +79,29 @@ def _show(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from router.tools.top import Order, recent, top
+    from router.tools.live_window import Window
+    from router.tools.top import Order, top
     from router.tools.top_keys import Keys
     from router.tools.top_view import screen
 
     console, orders = Console(), {each.key: each for each in Order}
-    looks, note = [_look(url)], ""
+    looks, note = Window(), ""
+    looks.add(_look(url))
     with Live(console=console, screen=True, auto_refresh=False) as live, Keys() as keys:
         key, due = "", 0.0
         while key != "q":
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 try:
-                    looks, note = recent([] if note else looks, _look(url)), ""
+                    look = _look(url)
                 except TransportError as error:
                     note = str(error)
-            shown = top(looks[0], looks[-1], time.time(), order)
+                else:
+                    if note:
+                        looks.clear()
+                    looks.add(look)
+                    note = ""
+            shown = top(*looks.ends, time.time(), order)
             live.update(screen(shown, f"router top {url}", order, console.height, note), refresh=True)
             try:
                 key = keys.wait(max(due - time.monotonic(), 0.0))

@@ -6,7 +6,7 @@ Knows the metrics' names from the books; not where the text comes from (`running
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -124,21 +124,6 @@ def view(before: Snapshot, after: Snapshot) -> View:
         rejected=_by_last_label(after.counts("datagrams_rejected")),
         kernel_drops=_total(after, "kernel_drops"),
     )
-
-
-class Window:
-    """Snapshots of the last seconds: over a short time, one message in two seconds is no rate but a flicker."""
-
-    def __init__(self, seconds: float = 3.0) -> None:
-        self._seconds = seconds
-        self._snapshots: deque[Snapshot] = deque()
-
-    def add(self, newest: Snapshot) -> View:
-        """Totals as of `newest`, rates over the window; the first snapshot alone has rates of 0."""
-        while len(self._snapshots) > 1 and newest.at - self._snapshots[1].at >= self._seconds:
-            self._snapshots.popleft()
-        self._snapshots.append(newest)
-        return view(self._snapshots[0], newest)
 
 
 def _route_row(route: str, before: Snapshot, after: Snapshot) -> RouteRow:

@@ -15,10 +15,6 @@ from router.tools.live import BUCKETS, Counts, RouteRow, Snapshot, View, view
 _HISTOGRAM = f"route_seconds{BUCKETS}"
 
 
-WINDOW = 3.0
-"""Seconds over which rates and latencies are told: over less, one message in two seconds is a flicker."""
-
-
 class Order(enum.Enum):
     """By what rows are sorted, and the key that chooses it. All but TABLE have the largest first."""
 
@@ -63,23 +59,6 @@ def top(before: Snapshot, after: Snapshot, now: float, order: Order = Order.TABL
     stamps = after.counts("endpoint_last_seen_timestamp_seconds")
     silence = {labels[0]: _since(stamp, now) for labels, stamp in stamps.items()}
     return Top(seen, ordered(rows, order), silence)
-
-
-def recent(looks: Sequence[Snapshot], look: Snapshot) -> list[Snapshot]:
-    """The looks from whose first to last rates are told, with one more: of one run of the router, and of WINDOW."""
-    kept = [*looks, look] if looks and not _is_of_another_run(looks[-1], look) else [look]
-    while len(kept) > 2 and kept[-1].at - kept[1].at >= WINDOW:
-        kept = kept[1:]
-    return kept
-
-
-def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
-    """What was counted once stays counted until the router starts anew."""
-    return any(
-        after.counts(metric).get(labels, 0.0) < count
-        for metric in ("datagrams_received", "messages_received")
-        for labels, count in before.counts(metric).items()
-    )
 
 
 def ordered(rows: Sequence[TopRow], order: Order) -> tuple[TopRow, ...]:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
-from router.tools.live import Snapshot, Window, parse_metrics, view
+from router.tools.live import Snapshot, parse_metrics, view
+from router.tools.live_window import WINDOW, Window
 
 METRICS = """\
 # HELP router_datagrams_received_total Datagrams taken from the listener's socket.
@@ -61,9 +62,25 @@ def test_a_router_that_was_started_anew_has_no_negative_rate() -> None:
 
 
 def test_a_window_gives_rates_over_its_last_seconds_only() -> None:
-    window = Window(seconds=3.0)
-    rates = [window.add(snapshot(at, imu)).routes[0].rate for at, imu in ((0, 0), (1, 10), (2, 20), (3, 60), (5, 140))]
+    window, rates = Window(seconds=3.0), []
+    for at, imu in ((0, 0), (1, 10), (2, 20), (3, 60), (5, 140)):
+        window.add(snapshot(at, imu))
+        rates.append(view(*window.ends).routes[0].rate)
     assert rates == [0.0, 10.0, 10.0, 20.0, 40.0]
+
+
+def test_a_window_is_of_one_run_of_the_router() -> None:
+    window = Window()
+    for second in range(10):
+        window.add(snapshot(second, 10 * second))
+    assert [end.at for end in window.ends] == [9 - WINDOW, 9]
+    window.add(snapshot(10, 5))
+    assert [end.at for end in window.ends] == [10, 10]
+    window.add(snapshot(11, 15))
+    assert view(*window.ends).routes[0].rate == 10
+    window.clear()
+    window.add(snapshot(12, 20))
+    assert [end.at for end in window.ends] == [12, 12]
 
 
 def test_a_gateway_is_a_route_to_its_clients_and_to_topics() -> None:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from router.compiler.books import HISTOGRAM_BOUNDS_NS
 from router.tools.live import Snapshot
-from router.tools.top import WINDOW, Order, Top, quantile, recent, top
+from router.tools.top import Order, Top, quantile, top
 from router.tools.top_view import age_text, latency_text, page, screen
 
 BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
@@ -54,17 +54,6 @@ def test_latencies_are_those_between_the_snapshots() -> None:
     imu, gps = seen().rows
     assert [imu.median, imu.slowest] == pytest.approx([15e-6, 19.9e-6])
     assert [gps.median, gps.slowest] == pytest.approx([150e-6, 199e-6])
-
-
-def test_rates_are_told_over_a_window_of_one_run() -> None:
-    looks: list[Snapshot] = []
-    for second in range(10):
-        looks = recent(looks, snapshot(second, 10 * second, 0))
-    assert [looks[0].at, looks[-1].at] == [9 - WINDOW, 9]
-    looks = recent(looks, snapshot(10, 5, 0))
-    assert [look.at for look in looks] == [10]
-    looks = recent(looks, snapshot(11, 15, 0))
-    assert top(looks[0], looks[-1], NOW).rows[0].row.rate == 10
 
 
 def test_a_router_that_was_started_anew_has_no_latency_of_the_one_before() -> None:
