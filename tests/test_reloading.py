@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import random
 import socket
 import struct
@@ -200,6 +201,8 @@ def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
         assert "no route for the payload cases" in str(result.findings[0])  # warnings are told all the same
         assert settled(router)["router_config_reloads_total['failed']"] == 1
         assert list(router.listeners) == ["rover"]
+        site.write(PH, listen=f'  rover: {{address: "0.0.0.0:{site.listen}"}}')
+        assert f"the router itself (pid {os.getpid()}) has the port; restart it" in router.reload().text
 
 
 def test_what_only_a_start_can_change_is_refused(site: Site) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
 from router.edges.log import logger
-from router.edges.port_holder import port_holder
+from router.edges.port_holder import port_taken
 from router.errors import StartError
 from router.table.model import Address
 
@@ -72,8 +72,7 @@ class Binding:
     def _why_not(self, error: OSError) -> str:
         what = f"{self._address} cannot be used"
         if error.errno == errno.EADDRINUSE:
-            holder = port_holder(self._protocol, self._address.port)
-            return f"{what}: {holder} has the port; stop it, or choose another port"
+            return f"{what}: {port_taken(self._protocol, self._address.port)}"
         if error.errno == errno.EACCES:
             return f"{what}: ports below 1024 need a privilege; choose a higher port, or grant CAP_NET_BIND_SERVICE"
         return f"{what}: {error.strerror}"

@@ -7,7 +7,7 @@ import re
 
 import zenoh
 
-from router.edges.port_holder import port_holder
+from router.edges.port_holder import port_taken
 from router.errors import StartError
 from router.table.model import ZenohSettings
 
@@ -49,8 +49,7 @@ def why_in_vain(settings: ZenohSettings, error: str) -> str:
     for locator in settings.listen:
         port = re.search(r":(\d+)$", locator)
         if port and locator in error:
-            holder = port_holder("tcp", int(port[1]))
-            return f"{locator} cannot be used: {holder} has the port; stop it, or choose another port"
+            return f"{locator} cannot be used: {port_taken('tcp', int(port[1]))}"
     return f"Zenoh cannot listen: {short(error)}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -10,13 +11,27 @@ _LISTENING = {"udp": "07", "tcp": "0A"}
 """The state of a socket that waits for anybody, as /proc/net writes it."""
 
 
+def port_taken(protocol: str, port: int) -> str:
+    """Who has it, and what to do about that. `protocol` is udp or tcp."""
+    process = _process(protocol, port)
+    if process is not None and process.name == str(os.getpid()):
+        return f"the router itself (pid {process.name}) has the port; restart it, or choose another port"
+    return f"{_shown(process)} has the port; stop it, or choose another port"
+
+
 def port_holder(protocol: str, port: int) -> str:
     """`python (pid 4711)`, or "another process" where /proc does not tell. `protocol` is udp or tcp."""
+    return _shown(_process(protocol, port))
+
+
+def _shown(process: Path | None) -> str:
+    return f"{_name(process)} (pid {process.name})" if process is not None else "another process"
+
+
+def _process(protocol: str, port: int) -> Path | None:
     wanted = {f"socket:[{inode}]" for inode in _inodes(protocol, port)}
-    for process in Path("/proc").glob("[0-9]*"):
-        if not wanted.isdisjoint(_open_files(process)):
-            return f"{_name(process)} (pid {process.name})"
-    return "another process"
+    every = Path("/proc").glob("[0-9]*")
+    return next((each for each in every if not wanted.isdisjoint(_open_files(each))), None)
 
 
 def _inodes(protocol: str, port: int) -> Iterator[str]:

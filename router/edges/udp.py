@@ -14,7 +14,7 @@ from contextlib import suppress
 from router.compiler.program import ListenerPlan, SenderPlan
 from router.edges.inherited import inherited
 from router.edges.log import logger
-from router.edges.port_holder import port_holder
+from router.edges.port_holder import port_taken
 from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops, receive_buffer
 from router.errors import SourceSpan, StartError
 from router.table.model import Address
@@ -107,7 +107,7 @@ class Listener:
 def _why_not_bound(plan: ListenerPlan, error: OSError) -> str:
     what = f"listener '{plan.name}' cannot use {plan.address}"
     if error.errno == errno.EADDRINUSE:
-        return f"{what}: {port_holder('udp', plan.address.port)} has the port; stop it, or choose another port"
+        return f"{what}: {port_taken('udp', plan.address.port)}"
     if error.errno == errno.EADDRNOTAVAIL:
         return f"{what}: no network interface of this computer has that address; 0.0.0.0 listens on all of them"
     if error.errno == errno.EACCES:

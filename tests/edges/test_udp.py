@@ -356,10 +356,9 @@ def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
     taken = listen(stack).address
     with pytest.raises(StartError) as refused:
         Listener(plan(port=taken.port), SPAN)
-    name = Path("/proc/self/comm").read_text().strip()
     assert str(refused.value) == (
         f"routes/rover.yaml:12:20: listener 'rover' cannot use {taken}: "
-        f"{name} (pid {os.getpid()}) has the port; stop it, or choose another port"
+        f"the router itself (pid {os.getpid()}) has the port; restart it, or choose another port"
     )
 
 
