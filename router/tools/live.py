@@ -7,7 +7,7 @@ Knows the metrics' names from the books; not where the text comes from (`running
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from prometheus_client.parser import text_string_to_metric_families
@@ -132,13 +132,17 @@ def _route_row(route: str, before: Snapshot, after: Snapshot) -> RouteRow:
         route=route,
         received=received,
         rate=_rate(received, _total(before, "messages_received", route), before, after),
-        targets=tuple(
-            _target_row(metric, labels, before, after)
-            for metric in _DELIVERED
-            for labels in after.counts(metric)
-            if labels[0] == route
-        ),
+        targets=tuple(_target_row(metric, labels, before, after) for metric, labels in _targets(route, after)),
     )
+
+
+def _targets(route: str, after: Snapshot) -> Iterator[tuple[str, Labels]]:
+    """By the metric that counts what each got. Of a gateway these are messages, and not the packets they went in."""
+    is_gateway = any(labels[0] == route for labels in after.counts("messages_sent"))
+    for metric in _DELIVERED:
+        for labels in after.counts(metric):
+            if labels[0] == route and not (is_gateway and metric == "datagrams_sent"):
+                yield metric, labels
 
 
 def _target_row(metric: str, labels: Labels, before: Snapshot, after: Snapshot) -> TargetRow:

@@ -88,6 +88,7 @@ def test_a_gateway_is_a_route_to_its_clients_and_to_topics() -> None:
 router_messages_received_total{route="dashboard",source="ros"} %d
 router_messages_received_total{route="dashboard",source="clients"} 1
 router_messages_sent_total{route="dashboard",target="clients"} %d
+router_datagrams_sent_total{route="dashboard",destination="websocket"} 3
 router_messages_published_total{route="dashboard",topic="/cmd_vel"} 1
 router_messages_dropped_total{route="dashboard",target="clients",reason="too_large"} 2
 """
