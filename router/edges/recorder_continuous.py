@@ -59,6 +59,9 @@ class Continuous:
         except OSError as error:
             self._failed(error, chunk, now)
             return
+        except Exception:  # a fault of the router, for the caller to tell
+            self.lost += chunk.datagrams
+            raise
         if self._retry_at is not None:
             self._retry_at = None
             logger.info("recording again", file=str(file.path), lost=self.lost)

@@ -97,6 +97,7 @@ class Encoder:
         """`wall` and `monotonic` are what the two clocks said when the batch was seen (ns)."""
         if not batch:
             return
+        self._datagrams += len(batch)
         times, listeners, peers, data = zip(*batch, strict=True)
         steady = self._steady_times(times, wall, monotonic)
         shapes = self._shapes_of(listeners, peers, data)
@@ -108,7 +109,6 @@ class Encoder:
                     self._add_unusual(each, came)
         else:
             self._add_usual(times, steady, cast("Sequence[_Shape]", shapes), data)
-        self._datagrams += len(batch)
         self._bytes += sum(map(len, data))
 
     def take(self) -> Chunk | None:
@@ -116,6 +116,13 @@ class Encoder:
         chunk = self._chunk.take(self._datagrams, self._bytes, self._steady)
         self._datagrams = self._bytes = 0
         return chunk
+
+    def drop(self) -> int:
+        """Forgets what was added since the last time, which a fault may have left half done. How many that were."""
+        dropped, self._datagrams, self._bytes = self._datagrams, 0, 0
+        self._chunk = ChunkBuilder()
+        self._shapes.clear()  # they know the old chunk
+        return dropped
 
     def _steady_times(self, times: Sequence[int], wall: int, monotonic: int) -> Sequence[int]:
         """What the clock that nobody sets said when each datagram came; as `times` while nobody sets the other."""

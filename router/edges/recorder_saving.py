@@ -52,10 +52,14 @@ class Saving:
         """Any thread may."""
         self._ring.add(batch)
 
-    def save(self, reason: str, writing: Path | None) -> Path:
-        """`writing` is the file that all goes to, where there is one. Raises RecordError."""
+    def save(self, reason: str, writing: Callable[[], Path | None], meanwhile: Callable[[], None] | None) -> Path:
+        """`writing` tells the file that all goes to, where there is one. Raises RecordError.
+
+        It takes its time, and calls `meanwhile` between two pieces of work; None is without rests, because nobody
+        routes any more.
+        """
         try:
-            path = self._write(reason, writing)
+            path = self._write(reason, writing, meanwhile)
         except OSError as error:
             logger.error("the last datagrams could not be saved", reason=reason, problem=error.strerror)
             raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
@@ -69,14 +73,17 @@ class Saving:
         self._trips_saved_at = now
         return True
 
-    def _write(self, reason: str, writing: Path | None) -> Path:
-        chunks = _chunks(self._ring.batches(), self._channels)
+    def _write(self, reason: str, writing: Callable[[], Path | None], meanwhile: Callable[[], None] | None) -> Path:
+        chunks = _chunks(self._ring.batches(), self._channels, meanwhile)
         coming = sum(chunk.size_in_file for chunk in chunks)
-        self._directory.make_room(coming + (self._max_size if writing is not None else 0), writing)
+        also = writing()
+        self._directory.make_room(coming + (self._max_size if also is not None else 0), also)
         file = self._directory.new(wall_ns(), reason, self._channels, self._about(reason))
         try:
             for chunk in chunks:
                 file.write(chunk)
+                if meanwhile is not None:
+                    meanwhile()
         except OSError:
             if file.is_empty:
                 file.path.unlink(missing_ok=True)
@@ -86,8 +93,8 @@ class Saving:
         return file.path
 
 
-def _chunks(batches: Sequence[Packed], channels: Channels) -> list[Chunk]:
-    """Takes its time: what is received meanwhile goes first."""
+def _chunks(batches: Sequence[Packed], channels: Channels, meanwhile: Callable[[], None] | None) -> list[Chunk]:
+    """With `meanwhile` it takes its time: what is received goes first."""
     encoder, known = Encoder(channels, batches[0].before if batches else 0), None
     chunks: list[Chunk] = []
     for batch in batches:
@@ -99,5 +106,7 @@ def _chunks(batches: Sequence[Packed], channels: Channels) -> list[Chunk]:
         if encoder.offset > LONGEST_CHUNK or batch is batches[-1]:
             chunk = encoder.take()
             chunks += [chunk] if chunk is not None else []
-        sleep(_REST * (monotonic() - since))
+        if meanwhile is not None:
+            sleep(_REST * (monotonic() - since))
+            meanwhile()
     return chunks

@@ -10,13 +10,11 @@ from router.edges.mirror import Seen
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_encoding import Encoder, Known
 from router.edges.recorder_file import RecordingFile
+from router.edges.recorder_intake import PERIOD
 from router.edges.tap_stream import Lost
 from router.table.model import RouteTable
 from router.tools import UsageError
 from router.types.protobuf import Envelope
-
-PERIOD = 500_000_000
-"""ns from chunk to chunk: what a kill costs at most."""
 
 
 class TapRecording:

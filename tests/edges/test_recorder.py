@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from threading import Thread
 from time import monotonic, sleep, time_ns
 from types import SimpleNamespace
 from typing import Any
@@ -14,9 +15,12 @@ from typing import Any
 import pytest
 
 from router.edges import recorder as recorder_module
-from router.edges import recorder_continuous
+from router.edges import recorder_continuous, recorder_intake, recorder_saving
 from router.edges.mirror import Seen
-from router.edges.recorder import MOST_WAITING, Recorder, RecordError
+from router.edges.recorder import Recorder, RecordError
+from router.edges.recorder_encoding import Encoder
+from router.edges.recorder_file import RecordingFile
+from router.edges.recorder_saving import Saving
 from router.errors import StartError
 from router.tools.recording import Recording
 from tests.edges.recorder_rig import FakeMirror, again, imu, read, running, seen, settings, wire
@@ -27,6 +31,7 @@ PATIENCE = 20.0
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "PERIOD", 10_000_000)
+    monkeypatch.setattr(recorder_intake, "PERIOD", 10_000_000)
 
 
 @contextmanager
@@ -189,7 +194,7 @@ def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:
 @pytest.mark.parametrize("last", [None, 10**9])
 def test_a_directory_that_cannot_be_is_an_error_of_the_start(last: int | None, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(StartError, match=r"table.yaml:3:1: cannot record to .*: Not a directory|File exists"):
+    with pytest.raises(StartError, match=r"table.yaml:3:1: cannot record to .*: (Not a directory|File exists)"):
         Recorder(running(FakeMirror()), settings(tmp_path / "file", last=last))
 
 
@@ -274,11 +279,101 @@ def _full(descriptor: int, data: bytes) -> int:
 
 def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with recorder(tmp_path) as (made, mirror):
-        held = made._alarm
-        monkeypatch.setattr(made, "_taken_in", MOST_WAITING)  # as if the disk stood still
+        monkeypatch.setattr(recorder_intake, "MOST_WAITING", 0)
         mirror.show(now(imu(1), imu(2)))
         assert counted(made)["record_dropped overflow"] == 2
-        monkeypatch.setattr(made, "_taken_in", made._taken_out)
-        held.ring()
+        monkeypatch.undo()
         show(made, mirror, now(imu(3)))
     assert len(read(files(tmp_path)[0])) == 1
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"), [(Encoder, "_shapes_of"), (Encoder, "take"), (RecordingFile, "write")], ids=str
+)
+def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
+    owner: type, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where memory is short. Nothing of it waits for ever, as if the disk were slow."""
+    with recorder(tmp_path) as (made, mirror):
+        show(made, mirror, first := now(imu(1)))
+        with monkeypatch.context() as faulty:
+            faulty.setattr(owner, name, _fault)
+            for _ in range(3):
+                show(made, mirror, now(imu(2), imu(3)))
+        assert counted(made)["record_dropped write_error"] == 6
+        show(made, mirror, last := now(imu(4)))
+        assert made._intake is not None
+        assert made._intake._taken_in == made._intake._taken_out
+    assert capsys.readouterr().err.count("please report it") == 1
+    assert [again(each) for path in files(tmp_path) for each in read(path)] == first + last
+
+
+def test_a_fault_in_saving_is_told_to_who_asked_and_the_next_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with recorder(tmp_path, last=10**11) as (made, mirror):
+        mirror.show(batch := now(imu(1)))
+        with monkeypatch.context() as faulty:
+            faulty.setattr(Saving, "_write", _fault)
+            with pytest.raises(RecordError, match="fault in the router itself: MemoryError"):
+                made.save("http")
+            made.deadman_tripped("drive_motor")
+        assert [again(each) for each in read(made.save("http"))] == batch
+
+
+def _fault(*_: object) -> None:
+    raise MemoryError
+
+
+def test_what_comes_while_saving_takes_its_time_is_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with recorder(tmp_path, last=10**11) as (made, mirror):
+        show(made, mirror, now(imu(1)))
+        show(made, mirror, now(imu(2)))
+        written: list[float] = []
+
+        def rest(_: float) -> None:
+            """Called by the recorder's thread, once for each batch that it saves."""
+            written.append(counted(made)["recorded_datagrams"])
+            mirror.show(now(imu(3)))
+            sleep(0.02)
+
+        monkeypatch.setattr(recorder_saving, "sleep", rest)
+        made.save("http")
+    assert written == [2, 3]
+
+
+def test_what_is_saved_at_the_end_is_saved_without_rests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rests: list[float] = []
+    monkeypatch.setattr(recorder_saving, "sleep", rests.append)
+    with recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
+        mirror.show(now(imu(1)))
+        made.deadman_tripped("drive_motor")
+        made.save("first")  # the trip is saved by then, or with it
+        rests.clear()
+        made.deadman_tripped("drive_motor")  # too soon: kept for the end
+    assert rests == []
+    assert len(files(tmp_path)) == 3
+
+
+def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
+    answers: list[object] = []
+
+    def ask(made: Recorder) -> None:
+        try:
+            while True:
+                answers.append(made.save("http"))
+        except RecordError as error:
+            answers.append(str(error))
+
+    with recorder(tmp_path, continuous=False, last=10**9) as (made, mirror):
+        mirror.show(now(imu(1)))
+        asking = [Thread(target=ask, args=(made,)) for _ in range(4)]
+        for thread in asking:
+            thread.start()
+        while not answers:
+            sleep(0.001)
+    for thread in asking:
+        thread.join(PATIENCE)
+    assert [answer for answer in answers if not isinstance(answer, Path)] == ["the router is stopping"] * 4
