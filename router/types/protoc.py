@@ -13,7 +13,7 @@ import grpc_tools
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from grpc_tools import _protoc_compiler
 
-from router.errors import TableError
+from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 from router.types.protoc_errors import EVERYTHING, Complaint, findings_of
 
 WELL_KNOWN = Path(grpc_tools.__file__).parent / "_proto"
@@ -42,7 +42,9 @@ def compile_protos(root: Path, names: Sequence[str], homes: Mapping[str, str]) -
         options = ["--include_imports", "--include_source_info", f"--descriptor_set_out={output}"]
         arguments = ["protoc", *(f"--proto_path={path}" for path in include), *options, EVERYTHING]
         if status := _protoc_compiler.run_main([argument.encode() for argument in arguments]):
-            raise RuntimeError(f"protoc accepted {root} at first, then failed with status {status}")
+            message = f"protoc accepted these files at first, and then failed with status {status}"
+            hint = "perhaps they changed meanwhile: try again"
+            raise TableError([Diagnostic(SourceSpan(shown_path(root)), Code.BAD_PROTO, message, hint)])
         compiled = FileDescriptorSet.FromString(output.read_bytes())
     del compiled.file[-1]
     return compiled

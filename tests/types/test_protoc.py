@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from router.errors import TableError
 from router.types.protobuf import load_protos
 
 Write = Callable[[Mapping[str, str]], Path]
@@ -25,3 +26,14 @@ def test_nothing_is_printed(write: Write, capfd: pytest.CaptureFixture[str]) -> 
 def test_a_folder_may_have_a_name_at_which_protoc_would_split(write: Write) -> None:
     root = write({"a:b=c/a.proto": proto("message A {}")}) / "a:b=c"
     assert list(load_protos(root).messages) == ["A"]
+
+
+def test_files_that_change_while_they_are_compiled_are_a_finding(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = write({"a.proto": proto("message A {}")})
+
+    def break_off(*_: object) -> None:
+        (root / "a.proto").write_text("message")
+
+    monkeypatch.setattr("router.types.protoc._protoc_compiler.get_protos", break_off)  # the first look
+    with pytest.raises(TableError, match=r"perhaps they changed meanwhile: try again"):
+        load_protos(root)
