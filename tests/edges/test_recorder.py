@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from structlog.testing import capture_logs
 
 from router.edges import recorder as recorder_module
 from router.edges import recorder_continuous, recorder_intake, recorder_saving
@@ -291,10 +292,10 @@ def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch
     ("owner", "name"), [(Encoder, "_shapes_of"), (Encoder, "take"), (RecordingFile, "write")], ids=str
 )
 def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
-    owner: type, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    owner: type, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As where memory is short. Nothing of it waits for ever, as if the disk were slow."""
-    with recorder(tmp_path) as (made, mirror):
+    with capture_logs() as logs, recorder(tmp_path) as (made, mirror):
         show(made, mirror, first := now(imu(1)))
         with monkeypatch.context() as faulty:
             faulty.setattr(owner, name, _fault)
@@ -304,7 +305,7 @@ def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
         show(made, mirror, last := now(imu(4)))
         assert made._intake is not None
         assert made._intake._taken_in == made._intake._taken_out
-    assert capsys.readouterr().err.count("please report it") == 1
+    assert [each["log_level"] for each in logs if "please report it" in each["event"]] == ["critical"]
     assert [again(each) for path in files(tmp_path) for each in read(path)] == first + last
 
 
