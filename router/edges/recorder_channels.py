@@ -7,6 +7,7 @@ is all there is to the datagram (see `Holds`). Knows no file.
 from __future__ import annotations
 
 import enum
+from collections.abc import Mapping
 
 from google.protobuf.descriptor import Descriptor
 from mcap.records import Channel, Schema
@@ -47,29 +48,27 @@ class Channels:
 
     def payload(self, case: PayloadCase, listener: str, peer: Peer, endpoint: str) -> int | None:
         """`endpoint` is what the table calls the sender, empty for a stranger. None where there are too many."""
-        if len(self.channels) >= MOST:
+        told = _told(case, Holds.PAYLOAD, listener=listener, peer=f"{peer[0]}:{peer[1]}", endpoint=endpoint)
+        if len(self.channels) >= MOST and self._same(case.name, _payload(case), told) not in self._channel_ids:
             return None
-        sender = {"listener": listener, "peer": f"{peer[0]}:{peer[1]}", "endpoint": endpoint}
-        return self._case(case, Holds.PAYLOAD, sender)
+        return self._channel(case.name, _payload(case), told)
 
     def view(self, case: PayloadCase) -> int:
-        return self._case(case, Holds.VIEW, {})
+        return self._channel(case.name, _payload(case), _told(case, Holds.VIEW))
 
     def datagrams(self) -> int:
         return self._channel(DATAGRAMS, DATAGRAM, {"holds": Holds.DATAGRAM.value})
 
-    def _case(self, case: PayloadCase, holds: Holds, sender: dict[str, str]) -> int:
-        metadata = {"holds": holds.value, "number": str(case.number), **sender}
-        payload: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
-        return self._channel(case.name, payload, metadata)
-
     def _channel(self, topic: str, message: Descriptor, metadata: dict[str, str]) -> int:
-        schema = self._schema(message)
-        same = (topic, schema, *metadata.values())
+        same = self._same(topic, message, metadata)
         if same not in self._channel_ids:
             number = self._channel_ids[same] = len(self.channels) + 1
-            self.channels[number] = Channel(number, topic, MessageEncoding.Protobuf, metadata, schema)
+            self.channels[number] = Channel(number, topic, MessageEncoding.Protobuf, metadata, self._schema(message))
         return self._channel_ids[same]
+
+    def _same(self, topic: str, message: Descriptor, metadata: Mapping[str, str]) -> tuple[object, ...]:
+        """What only one channel has."""
+        return topic, self._schema(message), *metadata.values()
 
     def _schema(self, message: Descriptor) -> int:
         same = (message.full_name, descriptor_set(message))
@@ -79,6 +78,14 @@ class Channels:
                 id=number, name=message.full_name, encoding=SchemaEncoding.Protobuf, data=same[1]
             )
         return self._schema_ids[same]
+
+
+def _told(case: PayloadCase, holds: Holds, **sender: str) -> dict[str, str]:
+    return {"holds": holds.value, "number": str(case.number), **sender}
+
+
+def _payload(case: PayloadCase) -> Descriptor:
+    return case.message_class.DESCRIPTOR  # type: ignore[return-value]  # or upb's, which is the same
 
 
 def varint(value: int) -> bytes:

@@ -82,6 +82,15 @@ def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
     assert len(channels.channels) == MOST + 2  # the raw datagrams, and their payloads to look at
 
 
+def test_known_senders_keep_their_channels_over_a_reload_when_there_are_too_many() -> None:
+    channels = Channels()
+    case = wire().case("imu_info")
+    numbers = [channels.payload(case, "rover", ("10.0.0.3", port), "sensor_board") for port in range(MOST + 1)]
+    assert numbers[-1] is None
+    assert channels.payload(case, "rover", ("10.0.0.3", 7), "sensor_board") == numbers[7]
+    assert channels.payload(case, "rover", ("10.0.0.3", 7), "renamed") is None
+
+
 def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tmp_path: Path) -> None:
     """A rover without a battery for its clock: GPS comes up, then somebody sets it back."""
     channels = Channels()
