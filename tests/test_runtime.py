@@ -6,12 +6,14 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -21,10 +23,11 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.edges.intake import Receive
 from router.edges.receiver import ReceiveThread
-from router.edges.recorder import Recorder
+from router.edges.recorder import Recorder, RecordError
 from router.edges.udp import Listener
 from router.errors import StartError
 from router.runtime import Router
+from tests.acceptance.site import wait_until
 from tests.edges.recorder_rig import read
 
 ROOT = Path(__file__).parent.parent
@@ -172,6 +175,26 @@ def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
     assert said == [*[DRIVE] * 100, BRAKE]
     [recording] = (site.folder / "recordings").iterdir()
     assert [each.data for each in read(recording)] == [DRIVE] * 100
+
+
+def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, saved = threading.Event(), SimpleQueue[str]()
+
+    def save(_: Recorder, reason: str) -> None:
+        saved.put(reason)
+        assert go_on.wait(10)
+        raise RecordError("the disk is full")
+
+    monkeypatch.setattr(Recorder, "save", save)
+    with capture_logs() as logged, Router(site.program("record: {directory: recordings, last: 60s}\n")) as router:
+        router.save_recording("first")
+        assert saved.get(timeout=10) == "first"
+        for reason in ("second", "third"):  # which the second one saves, as it has not begun
+            router.save_recording(reason)
+        go_on.set()
+        assert saved.get(timeout=10) == "second"
+        wait_until(lambda: [entry.get("problem") for entry in logged].count("the disk is full") == 2)
+    assert saved.empty()
 
 
 def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

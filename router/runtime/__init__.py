@@ -147,7 +147,7 @@ class Router:
         return self._reloader.reload()
 
     def save_recording(self, reason: str) -> None:
-        """Saves the last datagrams, where the table keeps them; what comes of it is logged."""
+        """Has the last datagrams saved, where the table keeps them; what comes of it is logged."""
         self._companions.save_recording(reason)
 
     def _open_companions(self, change: Change, opening: ExitStack) -> None:

@@ -6,9 +6,11 @@ Opens what a table asks for. Knows what belongs together, and does no work itsel
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
+from router.edges.daemon_thread import DaemonThread
 from router.edges.log import logger
 from router.edges.metrics import Asked
 from router.edges.running import Running
@@ -25,6 +27,8 @@ class Companions:
         self.http_address: Address | None = None
         self._running = running
         self._recorder: Recorder | None = None
+        self._saving = DaemonThread("saving")
+        self._last_asked: Future[None] | None = None
 
     def open(self, opening: ExitStack, publish_diagnostics: Callable[[bytes], None] | None) -> None:
         """`publish_diagnostics` takes CDR bytes; None where the table asks for no diagnostics."""
@@ -34,6 +38,7 @@ class Companions:
 
             self._recorder = Recorder(running, table.record)
             opening.callback(self._recorder.close)
+            opening.callback(self._saving.shutdown)
         if table.foxglove is not None:
             from router.edges.foxglove import FoxgloveServer
 
@@ -70,12 +75,22 @@ class Companions:
             self._recorder.deadman_tripped(route)
 
     def save_recording(self, reason: str) -> None:
+        """Returns at once; what comes of it is logged. To be called by one thread.
+
+        Who asks again before it has begun has asked for the same.
+        """
         if self._recorder is None:
             logger.warning("nothing to save: the table has no 'record: {last: ...}'")
             return
-        from router.edges.recorder import RecordError
+        asked = self._last_asked
+        if asked is None or asked.running() or asked.done():
+            self._last_asked = self._saving.submit(_save, self._recorder, reason)
 
-        try:
-            self._recorder.save(reason)
-        except RecordError as error:
-            logger.error("the last datagrams could not be saved", problem=str(error))
+
+def _save(recorder: Recorder, reason: str) -> None:
+    from router.edges.recorder import RecordError
+
+    try:
+        recorder.save(reason)
+    except RecordError as error:
+        logger.error("the last datagrams could not be saved", problem=str(error))
