@@ -145,7 +145,7 @@ def _deadman(deadman: Deadman) -> dict[str, str]:
     return {
         "timeout": duration(deadman.timeout.value),
         "repeat": duration(deadman.repeat.value),
-        "send": f"{deadman.case.value} {field_map(deadman.fields)}",
+        "send": f"{{{deadman.case.value}: {field_map(deadman.fields)}}}",
         "to": ", ".join(endpoint.value for endpoint in deadman.to),
         "hands_over_to": ", ".join(case.value for case in deadman.hands_over_to) or NONE,
     }
@@ -166,7 +166,9 @@ def _targets(targets: Iterable[CheckedTarget], route: Route, origin: str) -> Ite
 def _gateway_parts(gateway: Gateway) -> Iterator[tuple[str, Part]]:
     yield "", Part(gateway.span, gateway.transport.value.value, _gateway_settings(gateway))
     for inbound in gateway.inbound:
-        settings = {**_topic(inbound.topic), **flat(inbound.ttl, "ttl"), **flat(inbound.deadman, "deadman")}
+        settings = {**_topic(inbound.topic), **flat(inbound.ttl, "ttl")}
+        if (deadman := inbound.deadman) is not None:
+            settings |= flat({"timeout": deadman.timeout, "send": deadman.fields, "repeat": deadman.repeat}, "deadman")
         yield f"inbound {inbound.topic.topic.value}", Part(inbound.span, inbound.topic.type.value, settings)
 
 

@@ -68,7 +68,7 @@ def test_a_table_differs_in_nothing_from_itself(told: Told) -> None:
             "routes: {manual_arm: {deadman: {timeout: 400ms, send: {manual_arm: {speed: 1}}, to: [arm_board]}}}",
             [
                 "route manual_arm, deadman: timeout is 400 ms, was 500 ms",
-                "route manual_arm, deadman: send is manual_arm {speed: 1}, was manual_arm {}",
+                "route manual_arm, deadman: send is {manual_arm: {speed: 1}}, was {manual_arm: {}}",
             ],
         ),
         (
@@ -121,6 +121,23 @@ routes:
     assert told(topics) == [
         "route pump_info, topic pump_info: qos.depth is 5, was 10",
         "route pump_info, topic pump_info: speed_rpm is 7, was speed_rpm",
+    ]
+
+
+def test_a_deadman_of_a_gateway_is_told_in_the_words_of_a_table(tmp_path: Path) -> None:
+    text = f"""\
+version: 1
+extends: {ROVER}
+gateways:
+  dashboard:
+    inbound: [{{topic: a, type: std_msgs/msg/Float32, deadman: {{timeout: TIME, send: {{data: 1}}}}}}]
+"""
+    (tmp_path / "old.yaml").write_text(text.replace("TIME", "500ms"))
+    (tmp_path / "new.yaml").write_text(text.replace("TIME", "2s").replace("data: 1", "data: 2"))
+    found = differences(checked(tmp_path / "old.yaml"), checked(tmp_path / "new.yaml"))
+    assert [each.text for each in found] == [
+        "deadman.timeout is 2 s, was 500 ms",
+        "deadman.send is {data: 2}, was {data: 1}",
     ]
 
 
