@@ -15,20 +15,17 @@ from typing import NamedTuple
 from foxglove import Channel, Context, Schema, start_server
 from foxglove.websocket import ChannelView, Client, ServerListener, WebSocketServer
 from google.protobuf.descriptor import Descriptor
-from google.protobuf.message import DecodeError as ProtobufError
 
 from router.compiler.program import Program
 from router.edges.background import background_threads
-from router.edges.http_tap import first_field
 from router.edges.log import logger
-from router.edges.mirror import Seen, Shown
+from router.edges.mirror import Shown
 from router.edges.port_holder import port_holder
 from router.edges.recorder_schemas import descriptor_set
 from router.edges.running import Running
-from router.engine import MAX_DATAGRAM
-from router.engine.framing import restored
+from router.edges.shown import Known, first_field
 from router.errors import StartError
-from router.table.model import Address, Framing, Located
+from router.table.model import Address, Located
 from router.types.protobuf import PayloadCase
 
 LOOK_SECONDS = 1.0
@@ -50,12 +47,12 @@ def _kind(case: PayloadCase) -> _Kind:
     return _Kind(case.name, payload.full_name, descriptor_set(payload))
 
 
-class _Shown(NamedTuple):
-    """What is shown of which program."""
+class _View(NamedTuple):
+    """What is shown of which program. `channels` by payload case."""
 
-    program: Program | None
-    channels: Mapping[_Kind, Channel]
-    by_case: Mapping[str, Channel]
+    program: Program
+    known: Known
+    channels: Mapping[str, Channel]
 
 
 class FoxgloveServer(ServerListener):
@@ -67,14 +64,14 @@ class FoxgloveServer(ServerListener):
     def __init__(self, address: Located[Address], running: Running) -> None:
         self._running = running
         self._context = Context()
-        self._shown = _Shown(None, {}, {})
+        self._open: dict[_Kind, Channel] = {}
         self._subscribed: set[tuple[int, int]] = set()  # client and channel
         self._detach: Callable[[], None] | None = None
         self._stirred, self._is_closing = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="foxglove")
         with background_threads():
             self._server = _started(address, running.program.table.node.name, self._context, self)
-            self._follow_program()
+            self._view = self._view_of(running.program)
             self._thread.start()
         self.address = Address(address.value.host, self._server.port)
 
@@ -94,11 +91,19 @@ class FoxgloveServer(ServerListener):
         self._stirred.set()
 
     def _run(self) -> None:
+        is_well = True
         while not self._is_closing:
             self._stirred.wait(LOOK_SECONDS)
             self._stirred.clear()
-            self._follow_program()
-            self._follow_clients()
+            try:
+                self._follow_program()
+                self._follow_clients()
+            except Exception as error:  # noqa: BLE001 a fault of the router, told loudly; it may be over at the next look
+                if is_well:
+                    logger.critical("a fault in the view for Foxglove; please report it", exc_info=error)
+                is_well = False
+            else:
+                is_well = True
         self._ignore()
 
     def _follow_clients(self) -> None:
@@ -113,15 +118,22 @@ class FoxgloveServer(ServerListener):
             self._detach = None
 
     def _follow_program(self) -> None:
-        """Channels for the payload cases there are now. Those that are as they were stay, with who subscribed."""
-        program, shown = self._running.program, self._shown
-        if program is shown.program:
+        """Channels that are as they were stay, with who subscribed; others go when nothing is shown there any more."""
+        program = self._running.program
+        if program is self._view.program:
             return
-        kinds = [_kind(case) for case in program.envelope.cases.values()]
-        for kind in shown.channels.keys() - kinds:
-            shown.channels[kind].close()
-        channels = {kind: shown.channels.get(kind) or self._channel(kind) for kind in kinds}
-        self._shown = _Shown(program, channels, {kind.case: channel for kind, channel in channels.items()})
+        self._view = self._view_of(program)
+        stay = set(map(_kind, program.envelope.cases.values()))
+        for kind in self._open.keys() - stay:
+            self._open.pop(kind).close()
+
+    def _view_of(self, program: Program) -> _View:
+        kinds = {name: _kind(case) for name, case in program.envelope.cases.items()}
+        for kind in kinds.values():
+            if kind not in self._open:
+                self._open[kind] = self._channel(kind)
+        channels = {name: self._open[kind] for name, kind in kinds.items()}
+        return _View(program, Known(program.envelope, program.table), channels)
 
     def _channel(self, kind: _Kind) -> Channel:
         schema = Schema(name=kind.message, encoding="protobuf", data=kind.descriptors)
@@ -129,28 +141,12 @@ class FoxgloveServer(ServerListener):
 
     def _show(self, batch: Sequence[Shown]) -> None:
         """Called by the mirror's thread. What is no payload for the router is not shown."""
-        program, _, channels = self._shown
-        assert program is not None  # noqa: S101 - there is one since the start
-        wanted = {case.number for case in program.envelope.cases.values() if channels[case.name].has_sinks()}
-        for shown in batch:
-            if first_field(shown[3]) in wanted and (found := _payload(Seen(*shown), program)) is not None:
+        program, known, channels = self._view
+        wanted = {case.number for name, case in program.envelope.cases.items() if channels[name].has_sinks()}
+        for at, listener, _, data in batch:
+            if first_field(data) in wanted and (found := known.payload(listener, data)) is not None:
                 case, payload = found
-                channels[case].log(payload, log_time=shown[0])
-
-
-def _payload(seen: Seen, program: Program) -> tuple[str, bytes] | None:
-    """The payload case and the payload of a datagram, None where the router finds none in it."""
-    listener, data = program.table.listeners.get(seen.listener), seen.data
-    if len(data) > MAX_DATAGRAM:
-        return None
-    if listener is not None and listener.framing is Framing.ZERO_TRIMMED:
-        data = restored(data, MAX_DATAGRAM)
-    try:
-        message = program.envelope.message_class.FromString(data)
-    except ProtobufError:
-        return None
-    case = message.WhichOneof(program.envelope.oneof)
-    return (case, getattr(message, case).SerializeToString()) if case else None
+                channels[case.name].log(payload.SerializeToString(), log_time=at)
 
 
 def _started(address: Located[Address], name: str, context: Context, listener: ServerListener) -> WebSocketServer:

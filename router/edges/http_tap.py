@@ -10,9 +10,9 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
-from router.compiler.network import recognisers
 from router.compiler.program import Program
 from router.edges.mirror import Mirror, Shown
+from router.edges.shown import Known, first_field
 from router.edges.tap_stream import MAGIC, encode, encode_alive, encode_lost
 from router.errors import RouterError, did_you_mean
 
@@ -46,30 +46,25 @@ def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
     if unknown := [name for name in cases if name not in known]:
         raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
     unwanted = frozenset(case.number for name, case in known.items() if name not in cases)
-    return lambda shown: first_field(shown[3]) not in unwanted
+
+    def is_wanted(shown: Shown) -> bool:
+        _, _, _, data = shown
+        return first_field(data) not in unwanted
+
+    return is_wanted
 
 
 def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
     endpoints = program.table.endpoints
     if unknown := [name for name in sources if name not in endpoints and not name[:1].isdigit()]:
         raise TapRequestError(f"the router has no endpoint '{unknown[0]}'; {did_you_mean(unknown[0], endpoints)}")
-    by_host, by_address = recognisers(endpoints)
-    names = frozenset(sources)
+    sender, names = Known(program.envelope, program.table).sender, frozenset(sources)
 
     def is_wanted(shown: Shown) -> bool:
-        peer = shown[2]
-        return peer[0] in names or by_address.get(peer, by_host.get(peer[0])) in names
+        _, _, peer, _ = shown
+        return peer[0] in names or sender(peer) in names
 
     return is_wanted
-
-
-def first_field(data: bytes) -> int:
-    """The number of the field that a message begins with, of those below 2048; 0 where there is none."""
-    if not data:
-        return 0
-    if data[0] < 0x80:
-        return data[0] >> 3
-    return (data[0] & 0x7F | data[1] << 7) >> 3 if len(data) > 1 and data[1] < 0x80 else 0
 
 
 class Tap:

@@ -11,15 +11,11 @@ from time import monotonic
 from typing import Any
 
 from google.protobuf.json_format import MessageToDict
-from google.protobuf.message import DecodeError as ProtobufError
 
-from router.compiler.network import recognisers
 from router.compiler.program import Program
-from router.edges.http_tap import first_field
-from router.edges.mirror import Seen, Shown
+from router.edges.mirror import Shown
 from router.edges.running import Running
-from router.engine import MAX_DATAGRAM
-from router.engine.framing import restored
+from router.edges.shown import Known, first_field
 
 LOOKED_AT_SECONDS = 5.0
 """For so long after it was asked last it watches on; a page asks every second."""
@@ -53,8 +49,9 @@ class LastValues:
                 threading.Thread(target=self._end_when_idle, name="last values", daemon=True).start()
             with self._taking:
                 fresh, self._fresh = self._fresh, {}
+            known = Known(program.envelope, program.table)
             for shown in fresh.values():
-                self._keep(Seen(*shown), program)
+                self._keep(shown, known)
             return dict(self._values)
 
     def close(self) -> None:
@@ -66,24 +63,19 @@ class LastValues:
         """Called by the mirror's thread."""
         with self._taking:
             for shown in batch:
-                self._fresh[first_field(shown[3])] = shown
+                _, _, _, data = shown
+                self._fresh[first_field(data)] = shown
 
-    def _keep(self, seen: Seen, program: Program) -> None:
-        try:
-            envelope = program.envelope.message_class.FromString(restored(seen.data, MAX_DATAGRAM))
-        except ProtobufError:
+    def _keep(self, shown: Shown, known: Known) -> None:
+        at, listener, (host, port), data = shown
+        if (found := known.payload(listener, data)) is None:
             return  # the page shows it among what was rejected
-        if (case := envelope.WhichOneof(program.envelope.oneof)) is None:
-            return
-        by_host, by_address = recognisers(program.table.endpoints)
-        host, port = seen.peer
-        fields = MessageToDict(
-            getattr(envelope, case), preserving_proto_field_name=True, always_print_fields_with_no_presence=True
-        )
-        self._values[case] = {
-            "at": seen.at / 1e9,
-            "source": by_address.get(seen.peer) or by_host.get(host) or f"{host}:{port}",
-            "bytes": len(seen.data),
+        case, payload = found
+        fields = MessageToDict(payload, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
+        self._values[case.name] = {
+            "at": at / 1e9,
+            "source": known.sender((host, port)) or f"{host}:{port}",
+            "bytes": len(data),
             "fields": shortened(fields),
         }
 

@@ -21,11 +21,12 @@ from router.edges.mirror import Shown
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_continuous import Continuous
 from router.edges.recorder_directory import open_directory
-from router.edges.recorder_encoding import Encoder, Known
+from router.edges.recorder_encoding import Encoder
 from router.edges.recorder_intake import PERIOD, Intake
 from router.edges.recorder_packed import Packer
 from router.edges.recorder_saving import RecordError, Saving
 from router.edges.running import Running
+from router.edges.shown import Known
 from router.table.model import RecordSettings
 
 __all__ = ["RecordError", "Recorder"]
@@ -41,7 +42,7 @@ class Recorder:
         self._running = running
         self._channels = Channels()
         self._program = running.program
-        self._known = Known.of(self._program.envelope, self._program.table.endpoints)
+        self._known = Known(self._program.envelope, self._program.table)
         directory = open_directory(settings, running.program.table.path.stem)
         self._continuous = Continuous(settings, directory, self._channels, self._about) if settings.continuous else None
         self._saving = (
@@ -122,7 +123,7 @@ class Recorder:
         """A reload may have changed it."""
         program = self._running.program
         if program is not self._program:
-            self._program, self._known = program, Known.of(program.envelope, program.table.endpoints)
+            self._program, self._known = program, Known(program.envelope, program.table)
         return self._known
 
     def _run(self) -> None:

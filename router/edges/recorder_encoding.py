@@ -1,12 +1,12 @@
 """From datagrams to chunks of a recording, many at a time: what recording costs is spent here.
 
-Knows payload cases and what the table calls senders; knows no file and no thread.
+Knows how datagrams are encoded, and no file and no thread; payloads and senders are as `Known` says.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate, chain, count, repeat
 from operator import getitem, itemgetter, le
 from typing import NamedTuple, cast
@@ -15,15 +15,14 @@ from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 from mcap.opcode import Opcode
 
-from router.compiler.network import recognisers
 from router.edges.mirror import Shown
 from router.edges.recorder_channels import Channels, Peer, varint
 from router.edges.recorder_chunk import BEHIND_LENGTH, HEAD, Chunk, ChunkBuilder
 from router.edges.recorder_schemas import Datagram
+from router.edges.shown import Known
 from router.engine import MAX_DATAGRAM
-from router.engine.framing import LEN, restored
-from router.table.model import Endpoint
-from router.types.protobuf import Envelope, PayloadCase
+from router.engine.framing import LEN
+from router.types.protobuf import PayloadCase
 
 _SEQUENCE = 0xFFFFFFFF
 _TAG = itemgetter(slice(2))
@@ -45,24 +44,6 @@ class _Shape(NamedTuple):
     size: int
     notes: list[int]
     parse: Callable[[bytes], Message]
-
-
-class Known(NamedTuple):
-    """What payloads there are, and who sends them, in one table."""
-
-    envelope: Envelope
-    by_host: Mapping[str, str]
-    by_address: Mapping[Peer, str]
-    tags: Mapping[bytes, PayloadCase]
-
-    @staticmethod
-    def of(envelope: Envelope, endpoints: Mapping[str, Endpoint]) -> Known:
-        tags = {varint(case.number << 3 | LEN): case for case in envelope.cases.values()}
-        return Known(envelope, *recognisers(endpoints), tags)
-
-    def endpoint(self, peer: Peer) -> str:
-        """What the table calls a sender; empty for a stranger."""
-        return self.by_address.get(peer) or self.by_host.get(peer[0]) or ""
 
 
 class Encoder:
@@ -90,6 +71,7 @@ class Encoder:
     def know(self, known: Known) -> None:
         """To be called first, and again when it is another."""
         self._known = known
+        self._tags = {varint(case.number << 3 | LEN): case for case in known.envelope.cases.values()}
         self._shapes.clear()
         self._payload_channels.clear()
 
@@ -179,11 +161,11 @@ class Encoder:
         """None for a datagram that is not one field, encoded as protobuf encodes it, of a known case."""
         if (known := self._shapes.get((listener, peer, len(data), data[:2]))) is not None:
             return known
-        tag = next((data[:size] for size in (1, 2, 3) if data[:size] in self._known.tags), None)
+        tag = next((data[:size] for size in (1, 2, 3) if data[:size] in self._tags), None)
         header = _header(tag, data) if tag is not None and len(data) <= MAX_DATAGRAM else None
         if tag is None or header is None:
             return None
-        case = self._known.tags[tag]
+        case = self._tags[tag]
         channel = self._payload_channel(case, listener, peer)
         if channel is None:
             return None
@@ -201,7 +183,7 @@ class Encoder:
         if sender not in self._payload_channels:
             if len(self._payload_channels) >= _MOST_SHAPES:
                 self._payload_channels.clear()
-            self._payload_channels[sender] = self._channels.payload(case, listener, peer, self._known.endpoint(peer))
+            self._payload_channels[sender] = self._channels.payload(case, listener, peer, self._known.sender(peer))
         return self._payload_channels[sender]
 
     def _add_unusual(self, shown: Shown, steady: int) -> None:
@@ -209,18 +191,11 @@ class Encoder:
         at, listener, peer, data = shown
         self._sequence += 1
         times = (self._sequence & _SEQUENCE, at, steady)
-        raw = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=self._known.endpoint(peer))
+        raw = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=self._known.sender(peer))
         self._chunk.add(self._channels.datagrams(), raw.SerializeToString(), *times)
-        if len(data) > MAX_DATAGRAM:
-            return
-        known = self._known.envelope
-        try:
-            envelope = known.message_class.FromString(restored(data, MAX_DATAGRAM))
-        except ProtobufError:
-            return
-        if name := envelope.WhichOneof(known.oneof):
-            view = self._channels.view(known.cases[name])
-            self._chunk.add(view, getattr(envelope, name).SerializeToString(), *times)
+        if (found := self._known.payload(listener, data)) is not None:
+            case, payload = found
+            self._chunk.add(self._channels.view(case), payload.SerializeToString(), *times)
 
 
 def _parses(parse: Callable[[bytes], Message], data: bytes) -> bool:

@@ -13,8 +13,9 @@ from router.edges.clock import monotonic_ns
 from router.edges.log import logger
 from router.edges.mirror import Shown
 from router.edges.recorder_continuous import Continuous
-from router.edges.recorder_encoding import Encoder, Known
+from router.edges.recorder_encoding import Encoder
 from router.edges.recorder_saving import LONGEST_CHUNK
+from router.edges.shown import Known
 
 PERIOD = 500_000_000
 """ns from chunk to chunk: what a kill costs, with what the mirror still has; more only where the disk is slow."""

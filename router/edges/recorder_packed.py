@@ -11,7 +11,7 @@ from itertools import accumulate
 from typing import NamedTuple
 
 from router.edges.mirror import Shown
-from router.edges.recorder_encoding import Known
+from router.edges.shown import Known
 
 _BESIDE_DATA = 14
 """Bytes that are kept of a datagram beside its data."""

@@ -8,9 +8,10 @@ from time import monotonic_ns, time_ns
 
 from router.edges.mirror import Seen
 from router.edges.recorder_channels import Channels
-from router.edges.recorder_encoding import Encoder, Known
+from router.edges.recorder_encoding import Encoder
 from router.edges.recorder_file import RecordingFile
 from router.edges.recorder_intake import PERIOD
+from router.edges.shown import Known
 from router.edges.tap_stream import Lost
 from router.table.model import RouteTable
 from router.tools import UsageError
@@ -25,7 +26,7 @@ class TapRecording:
         self.datagrams = self.missed = 0
         channels = Channels()
         self._encoder = Encoder(channels)
-        self._encoder.know(Known.of(envelope, table.endpoints))
+        self._encoder.know(Known(envelope, table))
         self._written_at = monotonic_ns()
         try:
             self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})

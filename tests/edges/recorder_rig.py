@@ -14,11 +14,12 @@ from router.assets import asset
 from router.edges.mirror import Seen
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_chunk import Chunk
-from router.edges.recorder_encoding import Encoder, Known
+from router.edges.recorder_encoding import Encoder
 from router.edges.recorder_file import RecordingFile
 from router.edges.running import Running
+from router.edges.shown import Known
 from router.errors import SourceSpan
-from router.table.model import Address, Endpoint, EndpointKind, Located, RecordSettings
+from router.table.model import Address, Endpoint, EndpointKind, Framing, Located, RecordSettings, RouteTable
 from router.tools.recording import Recorded, Recording
 from router.tools.wire import Wire, wire_of_protos
 
@@ -46,9 +47,20 @@ def endpoints() -> dict[str, Endpoint]:
     }
 
 
+def table(**changed: Any) -> RouteTable:
+    """All of it that a recording knows."""
+    listener = SimpleNamespace(name="rover", framing=Framing.ZERO_TRIMMED)
+    told = {"path": Path("routes/rover.yaml"), "endpoints": endpoints(), "listeners": {"rover": listener}, **changed}
+    return cast("RouteTable", SimpleNamespace(**told))
+
+
+def known() -> Known:
+    return Known(wire().envelope, table())
+
+
 def encoder(channels: Channels) -> Encoder:
     made = Encoder(channels)
-    made.know(Known.of(wire().envelope, endpoints()))
+    made.know(known())
     return made
 
 
@@ -107,8 +119,7 @@ class FakeMirror:
 
 
 def running(mirror: FakeMirror) -> Running:
-    table: Any = SimpleNamespace(path=Path("routes/rover.yaml"), endpoints=endpoints())
-    program = SimpleNamespace(table=table, envelope=wire().envelope, protos_sha256="0" * 64)
+    program = SimpleNamespace(table=table(), envelope=wire().envelope, protos_sha256="0" * 64)
     return cast("Running", SimpleNamespace(mirror=mirror, program=program))
 
 

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import cast
 
 import pytest
+from structlog.testing import capture_logs
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.edges import foxglove
 from router.edges.foxglove import FoxgloveServer
 from router.edges.mirror import Consumer, Seen
 from router.edges.running import Running
@@ -200,6 +202,27 @@ def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
         told[next_one.topic] = next_one.message
     assert "imu_info" in told  # subscribed to before
     assert told["manual_brake"].force == 7  # type: ignore[attr-defined]
+
+
+def test_a_fault_is_told_once_and_does_not_end_the_view(
+    program: Program, router: Showing, client: FoxgloveClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults = threading.Semaphore(0)
+
+    def fail(consumer: Consumer) -> Callable[[], None]:
+        faults.release()
+        raise MemoryError
+
+    monkeypatch.setattr(foxglove, "LOOK_SECONDS", 0.01)
+    with capture_logs() as logs:
+        with monkeypatch.context() as faulty:
+            faulty.setattr(router, "attach", fail)
+            client.subscribe("imu_info")
+            assert all(faults.acquire(timeout=PATIENCE) for _ in range(3))
+        router.wait_for(1)
+        router.show(envelope(program, "imu_info"))
+        assert client.receive().topic == "imu_info"
+    assert [each["log_level"] for each in logs] == ["critical"]
 
 
 def test_router_that_is_started_again_gets_its_port_back(router: Showing) -> None:

@@ -9,10 +9,9 @@ from contextlib import closing
 import pytest
 
 from router.edges import http_tap
-from router.edges.http_tap import Tap, TapRequestError, first_field, wanted
+from router.edges.http_tap import Tap, TapRequestError, wanted
 from router.edges.mirror import Seen
 from router.edges.tap_stream import MAGIC, Lost, StreamReader
-from router.types.protobuf import PayloadCase
 from tests.acceptance.site import wait_until
 from tests.edges.fake_running import FakeRunning, sim_program
 
@@ -85,16 +84,6 @@ def test_a_name_that_there_is_not_is_refused() -> None:
         wanted(PROGRAM, ["imu_inf"], [])
     with pytest.raises(TapRequestError, match="no endpoint 'sensor_bord'; did you mean 'sensor_board'"):
         wanted(PROGRAM, [], ["sensor_bord"])
-
-
-@pytest.mark.parametrize("case", PROGRAM.envelope.cases.values(), ids=lambda case: case.name)
-def test_the_first_field_of_a_datagram_is_its_case(case: PayloadCase) -> None:
-    assert first_field(datagram(case.name)) == case.number
-
-
-@pytest.mark.parametrize("data", [b"", b"\x80", b"\xff\xff\xff"])
-def test_what_begins_with_no_short_tag_has_no_first_field(data: bytes) -> None:
-    assert first_field(data) == 0
 
 
 def test_a_reader_who_is_too_slow_is_told_how_many_he_missed(

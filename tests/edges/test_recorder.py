@@ -24,7 +24,7 @@ from router.edges.recorder_file import RecordingFile
 from router.edges.recorder_saving import Saving
 from router.errors import StartError
 from router.tools.recording import Recording
-from tests.edges.recorder_rig import FakeMirror, again, imu, read, running, seen, settings, wire
+from tests.edges.recorder_rig import FakeMirror, again, imu, read, running, seen, settings, table, wire
 
 PATIENCE = 20.0
 
@@ -258,8 +258,7 @@ def test_what_came_before_a_reload_is_saved_as_it_was_known_then(tmp_path: Path)
     router = running(mirror)
     with closing(Recorder(router, settings(tmp_path, continuous=False, last=10**11))) as made:
         mirror.show(now(imu(1)))
-        table: Any = SimpleNamespace(path=Path("routes/rover.yaml"), endpoints={})
-        changed = SimpleNamespace(table=table, envelope=wire().envelope, protos_sha256="1" * 64)
+        changed = SimpleNamespace(table=table(endpoints={}), envelope=wire().envelope, protos_sha256="1" * 64)
         router.program = changed  # type: ignore[misc, assignment]
         mirror.show(now(imu(2)))
         saved = made.save("http")

@@ -73,6 +73,18 @@ def test_datagrams_of_all_lengths_come_back(size: int, tmp_path: Path) -> None:
     assert [each.data for each in read(recorded(tmp_path / "it.mcap", seen(exact)))] == [exact]
 
 
+def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: Path) -> None:
+    """Of a listener that repairs nothing; zeros at the end are repaired by the other."""
+    padded = imu() + bytes(5)
+    batch = [Seen(START, "rover", SENSOR_BOARD, padded), Seen(START, "exact", SENSOR_BOARD, padded)]
+    channels = Channels()
+    made = encoder(channels)
+    made.add(batch, START, 0)
+    chunk = taken(made)
+    by_topic = {channels.channels[number].topic: count for number, count in chunk.messages.items()}
+    assert by_topic == {"raw/datagrams": 2, "imu_info": 1}
+
+
 def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
     channels = Channels()
     made = encoder(channels)

@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.edges.mirror import Shown
-from router.edges.recorder_encoding import Known
 from router.edges.recorder_packed import Packer
 from router.edges.recorder_ring import Ring
 from router.engine import MAX_DATAGRAM
-from tests.edges.recorder_rig import endpoints, seen, wire
+from tests.edges.recorder_rig import known, seen
 
-KNOWN = Known.of(wire().envelope, endpoints())
+KNOWN = known()
 SHOWN: st.SearchStrategy[Shown] = st.tuples(
     st.integers(0, 2**63),
     st.sampled_from(["rover", "rövër"]),

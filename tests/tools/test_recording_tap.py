@@ -5,8 +5,6 @@ from __future__ import annotations
 import socket
 from contextlib import closing
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -15,10 +13,10 @@ from router.edges.tap_stream import Lost
 from router.tools import UsageError
 from router.tools import recording_tap as module
 from router.tools.recording_tap import TapRecording
-from tests.edges.recorder_rig import again, endpoints, imu, read, seen, wire
+from tests.edges.recorder_rig import again, imu, read, seen, table, wire
 from tests.ports import free_port
 
-TABLE: Any = SimpleNamespace(path=Path("rover.yaml"), endpoints=endpoints())
+TABLE = table()
 BATCH = seen(imu(1), b"bad", imu(2))
 
 
