@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from router.compiler import check_table
 from router.edges import http_answers, status
 from router.edges.http import HttpServer
 from router.edges.last_values import LastValues
@@ -152,7 +153,7 @@ def test_what_is_wrong_is_said(running: FakeRunning, page: Page) -> None:
     running.count("unhandled", "arm_diag", to=3)
     page.until("document.querySelectorAll('#troubles li').length === 5")
     said = page.text("#troubles").replace("\n", " ")
-    assert "The last reload failed" in said
+    assert "The last reload failed the table from before it goes on: router reload says why" in said
     assert "arm_board is silent since the router was started" in said
     assert "manual_drive: the deadman is active" in said
     assert "imu_data: a peer gets nothing its QoS does not fit (reliability)" in said
@@ -179,6 +180,85 @@ def test_values_are_text_and_nothing_else(url: str, page: Page, monkeypatch: pyt
     choose(page, "case:imu_info")
     page.until("document.querySelector('#value')?.textContent.includes('onerror')")
     assert page.evaluate("document.querySelector('aside img') === null && window.hacked === undefined")
+
+
+HOSTILE = '<img src=x onerror="window.hacked=1">'
+HOSTILE_PROTO = """\
+syntax = "proto3";
+message Inner { string text = 1; map<string, string> words = 2; }
+message Note {
+  string text = 1; repeated string lines = 2; bytes data = 3; Inner inner = 4; repeated Inner inners = 5;
+  map<string, Inner> table = 6;
+}
+message Hostile {
+  oneof payload { Note note = 1; Note constructor = 2; Note __proto__ = 3; Note toString = 4; Note valueOf = 5; }
+}
+"""
+HOSTILE_TABLE = """\
+version: 1
+envelope: {protos: protos, message: Hostile, oneof: payload}
+listen: {valueOf: {address: 127.0.0.1:5000}}
+endpoints:
+  constructor: {address: 127.0.0.2:8, kind: tool}
+  toString: {address: 127.0.0.3:8, kind: tool}
+routes:
+  note: {source: constructor, destinations: [toString]}
+  constructor: {source: any, destinations: [toString]}
+  __proto__: {source: constructor, destinations: [toString]}
+  toString: {source: constructor, destinations: [toString]}
+"""
+
+
+@pytest.fixture
+def hostile(tmp_path: Path) -> FakeRunning:
+    """A router whose table, of a hostile name, has names that JavaScript's objects have, and texts in its payloads."""
+    folder = tmp_path / HOSTILE
+    (folder / "protos").mkdir(parents=True)
+    (folder / "protos" / "hostile.proto").write_text(HOSTILE_PROTO)
+    (folder / "table.yaml").write_text(HOSTILE_TABLE)
+    program = check_table(folder / "table.yaml").program
+    assert program is not None
+    return FakeRunning(program)
+
+
+def test_texts_of_payloads_and_names_are_text_and_nothing_else(
+    running: FakeRunning, hostile: FakeRunning, browser: Browser
+) -> None:
+    inner = {"text": HOSTILE, "words": {HOSTILE: HOSTILE, "__proto__": HOSTILE}}
+    note: dict[str, object] = {"text": HOSTILE, "data": HOSTILE.encode(), "lines": [HOSTILE] * 2}
+    note |= {"inner": inner, "inners": [inner], "table": {HOSTILE: inner}}
+    cases = ("note", "constructor", "__proto__", "toString")
+    with closing(HttpServer(Address("127.0.0.1", 0), SourceSpan("t.yaml"), hostile, None)) as server:
+        page = open_page(browser, f"http://{server.address}/#%")
+        assert HOSTILE in page.text("#table")
+        for case in cases:
+            choose(page, f"case:{case}")
+            assert "None has come" in page.text("#facts")
+            hostile.receive(
+                hostile.program.envelope.message_class(**{case: note}).SerializeToString(), ("127.0.0.2", 8)
+            )
+            page.until("document.querySelector('#value') !== null")
+            shown = page.text("#value")
+            assert shown.count(HOSTILE) == 16
+            assert f"__proto__: {HOSTILE}" in shown
+        for key in ("from:@constructor", "to:@toString"):
+            choose(page, key)
+            assert page.evaluate("document.querySelectorAll('#facts table tr').length") > 1
+        assert page.evaluate("document.querySelector('img') === null && window.hacked === undefined")
+        assert page.text("#state") == "running"
+        assert page.complaints() == []
+        page.close()
+    hostile.mirror.close()
+    assert hostile.failures == []
+
+
+def test_before_there_is_a_second_answer_no_rate_is_told(page: Page) -> None:
+    page.until("answers.length > 1")
+    numbers = "[...document.querySelectorAll('#tiles dd > span')].map((each) => each.textContent)"
+    first = page.evaluate(f"answers = [now()]; render(); {numbers}")
+    assert first[:5] == ["—"] * 5
+    page.until(f"answers.length > 1 && {numbers}[0] === '0/s'")
+    assert page.evaluate(numbers)[:5] == ["0/s", "0/s", "0", "0", "0"]
 
 
 def test_pointing_shows_for_a_moment_and_clicking_keeps(page: Page) -> None:
