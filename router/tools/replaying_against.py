@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 
 from router.compiler.program import Program
-from router.tools.recording import Recorded
+from router.edges.shown import Known
+from router.tools.recording import Peer, Recorded
 from router.tools.rehearsal import Rehearsal
 from router.tools.rehearsal_events import Dropped, Event, Filtered, Published, Rejected, Sent
 
@@ -58,6 +59,8 @@ class Against:
         self.datagrams = 0
         self.span = 0
         """ns from the first datagram to the last."""
+        self.senders: set[tuple[str, Peer]] = set()
+        """What the recording calls them, and where they are."""
         self._programs = (old, new)
         self._runs: tuple[Rehearsal, ...] = ()
         self._first = self._start = 0
@@ -70,6 +73,7 @@ class Against:
             self._runs = tuple(Rehearsal(program, found.at) for program in self._programs)
         self.datagrams += 1
         self.span = found.steady - self._first
+        self.senders.add((found.endpoint, found.peer))
         for run, program in zip(self._runs, self._programs, strict=True):
             run.advance(self._start + self.span)
             if found.listener in program.table.listeners:
@@ -83,6 +87,12 @@ class Against:
     @property
     def differs(self) -> bool:
         return self.losses[0] != self.losses[1] or any(row.differs for row in self.rows.values())
+
+    @property
+    def is_among_strangers(self) -> bool:
+        """Whether neither table knows anybody who sent."""
+        tables = [Known(program.envelope, program.table) for program in self._programs]
+        return bool(self.senders) and not any(table.sender(peer) for table in tables for _, peer in self.senders)
 
     def _deliveries(self, side: int) -> dict[str, list[Delivery]]:
         """Since the last time, by target; what was lost is counted."""

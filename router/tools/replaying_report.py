@@ -18,6 +18,7 @@ from router.tools.table_tests_places import Places
 from router.tools.wire import Wire
 
 MOST_FIELDS = 12
+MOST_SENDERS = 5
 _COLUMNS = ("old", "new", "same", "changed", "moved", "lost", "added")
 
 
@@ -41,6 +42,7 @@ class Report:
         if not found.differs:
             yield f"both deliver the same, {sum(row.old for row in found.rows.values())} datagrams and messages"
             yield from _same_losses(found)
+            yield from _strangers(found)
             return
         yield from self._counts(found)
         yield from self._losses(found)
@@ -50,6 +52,7 @@ class Report:
                     yield ""
                     yield f"{route} to {target}, {at / 1e9:.3f} s after the beginning:"
                     yield from self._example(before, after)
+        yield from _strangers(found)
 
     def _counts(self, found: Against) -> Iterator[str]:
         rows = {key: row for key, row in sorted(found.rows.items()) if row.differs}
@@ -116,6 +119,17 @@ def _same_losses(found: Against) -> Iterator[str]:
         counts[f"{done} ({reason})"] += count
     for what, count in sorted(counts.items()):
         yield f"{what}: {count} with both"
+
+
+def _strangers(found: Against) -> Iterator[str]:
+    """Why next to nothing was delivered, where the tables are for another network than the recording."""
+    if not found.is_among_strangers:
+        return
+    named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, peer in found.senders})
+    more = f" and {len(named) - MOST_SENDERS} more" if len(named) > MOST_SENDERS else ""
+    yield ""
+    yield f"neither table has an endpoint where the datagrams came from: {', '.join(named[:MOST_SENDERS])}{more};"
+    yield "compare tables with the addresses of the recording"
 
 
 def _is_told(row: Row, before: Delivery | None, after: Delivery | None) -> bool:

@@ -49,10 +49,16 @@ class Compared:
     """Exit code and lines of a comparison of two tables whose routes are these."""
 
     def __init__(
-        self, folder: Path, old: str, new: str, capsys: pytest.CaptureFixture[str], new_head: str = HEAD
+        self,
+        folder: Path,
+        old: str,
+        new: str,
+        capsys: pytest.CaptureFixture[str],
+        new_head: str = HEAD,
+        old_head: str = HEAD,
     ) -> None:
         recorded(folder / "it.mcap", *batches())
-        for name, text in (("old", HEAD + old), ("new", new_head + new)):
+        for name, text in (("old", old_head + old), ("new", new_head + new)):
             (folder / f"{name}.yaml").write_text(text.replace("PROTOS", str(asset("protos"))))
         words = [str(folder / "it.mcap"), "--table", str(folder / "old.yaml"), "--against", str(folder / "new.yaml")]
         self.code = main(["replay", *words])
@@ -75,6 +81,29 @@ def test_the_same_table_delivers_the_same(tmp_path: Path, capsys: pytest.Capture
         "rejected (source_mismatch): 1 with both",
         "rejected (unhandled): 1 with both",
     ]
+
+
+@pytest.mark.parametrize("new", [FORWARD, FORWARD.replace("sensor_board", "any")])
+def test_tables_for_another_network_are_told_as_such(
+    new: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of strangers both deliver the same, which is nothing, and which says nothing of the tables."""
+    elsewhere = HEAD.replace("192.168.0.", "10.1.1.")
+    found = Compared(tmp_path, FORWARD, new, capsys, elsewhere, elsewhere)
+    assert found.code == (new != FORWARD)
+    senders = ", ".join(f"a stranger at 192.168.0.{number}" for number in (10, 30, 99))
+    assert found.lines[-2:] == [
+        f"neither table has an endpoint where the datagrams came from: {senders};",
+        "compare tables with the addresses of the recording",
+    ]
+
+
+def test_where_one_table_knows_the_senders_no_other_network_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = Compared(tmp_path, FORWARD, FORWARD, capsys, HEAD.replace("192.168.0.", "10.1.1."))
+    assert found.code == 1
+    assert not any("came from:" in line for line in found.lines)
 
 
 def test_a_changed_mapping_is_told_field_by_field(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
