@@ -85,8 +85,9 @@ class Encoder:
         shapes = self._shapes_of(listeners, peers, data)
         if None in shapes:
             for each, came, shape in zip(batch, steady, shapes, strict=True):
+                at, _, _, datagram = each
                 if shape is not None:
-                    self._add_usual((each[0],), (came,), (shape,), (each[3],))
+                    self._add_usual((at,), (came,), (shape,), (datagram,))
                 else:
                     self._add_unusual(each, came)
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import closing
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from router.compiler.books import METRICS
 from router.edges import last_values, status
+from router.edges.http_answers import PAGE
 from router.edges.status import Status
 from router.edges.status_numbers import TAKERS
 from tests.acceptance.site import wait_until
@@ -43,6 +45,18 @@ def value(shown: Status, case: str) -> Any:
 
 def imu(**fields: Any) -> bytes:
     return PROGRAM.envelope.message_class(imu_info=fields).SerializeToString()
+
+
+@pytest.mark.parametrize(
+    "shared",
+    [r"^const \$ = [^\n]*$", r"^function make\(.*?^}$", r"^function setText\(.*?^}$"],
+    ids=["$", "make", "setText"],
+)
+def test_what_both_pages_have_is_the_same_in_both(shared: str) -> None:
+    """Each page is one file, so that it needs nothing else; what they share must not drift apart."""
+    pages = [file.read_text(encoding="utf-8") for file in (PAGE, PAGE.parents[1] / "gateway" / "page.html")]
+    [status_page], [gateway_page] = (re.findall(shared, page, re.DOTALL | re.MULTILINE) for page in pages)
+    assert status_page == gateway_page
 
 
 def test_what_is_counted_is_found_by_route_and_target(running: FakeRunning, shown: Status) -> None:
