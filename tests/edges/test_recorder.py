@@ -350,7 +350,9 @@ def test_what_is_saved_at_the_end_is_saved_without_rests(tmp_path: Path, monkeyp
     with recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
         mirror.show(now(imu(1)))
         made.deadman_tripped("drive_motor")
-        made.save("first")  # the trip is saved by then, or with it
+        while not files(tmp_path):  # the trip's, perhaps unfinished
+            sleep(0.01)
+        made.save("first")  # one thread saves: it has finished that one before
         rests.clear()
         made.deadman_tripped("drive_motor")  # too soon: kept for the end
     assert rests == []
