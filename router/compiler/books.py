@@ -127,7 +127,7 @@ CLIENT_DROP_REASONS: Mapping[str, str] = {
 
 RECORD_DROP_REASONS: Mapping[str, str] = {
     "overflow": "the disk was slower than the network for longer than the buffer lasts",
-    "write_error": "the file could not be written, as when the disk is full",
+    "write_error": "the file could not be written, as when the disk is full; or a fault of the router",
 }
 """Why a recording lacks a datagram, with what each means."""
 
