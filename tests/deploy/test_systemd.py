@@ -129,7 +129,8 @@ def test_its_listener_is_systemds_socket(running: Machine) -> None:
 
 def test_it_routes_to_ros_nodes_of_another_user(running: Machine) -> None:
     """Under all of its restrictions, and past the memory that Fast DDS shares among one user's processes only."""
-    for place in (ROOT / ".venv", Path(sys.executable).resolve()):  # the checkout may be in a home that nobody else can enter
+    # The checkout, or its interpreter, may be in a home that nobody else can enter.
+    for place in (ROOT / ".venv", Path(sys.executable).resolve()):
         running.run("chmod", "o+x", *place.parents)
     heard = running.shell(
         f"(for i in $(seq 100); do {SEND}; sleep 0.1; done) >/dev/null 2>&1 & sending=$!\n"
