@@ -55,7 +55,6 @@ class Mirror:
         self._waiting: deque[Shown] = deque()
         self._consumers: tuple[Consumer, ...] = ()
         self._attaching = threading.Lock()
-        self._showing = threading.Lock()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -117,13 +116,13 @@ class Mirror:
             self._show()
 
     def _show(self) -> None:
-        with self._showing:
-            pop = self._waiting.popleft
-            batch = [pop() for _ in range(len(self._waiting))]
-            if not batch:
-                return
-            for consumer in self._consumers:
-                try:
-                    consumer(batch)
-                except Exception as error:  # noqa: BLE001 a fault of the router, told loudly; the others see it all the same
-                    self._failed(error)
+        """Called by the thread, and by whoever has waited for its end: never by two at once."""
+        pop = self._waiting.popleft
+        batch = [pop() for _ in range(len(self._waiting))]
+        if not batch:
+            return
+        for consumer in self._consumers:
+            try:
+                consumer(batch)
+            except Exception as error:  # noqa: BLE001 a fault of the router, told loudly; the others see it all the same
+                self._failed(error)
