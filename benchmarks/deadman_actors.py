@@ -122,6 +122,30 @@ class Source:
         self._process.wait()
 
 
+class Churn:
+    """Subscribers of `topic` that are killed and started again every 1.5 s, as `kill -9` does it, until closed."""
+
+    SUBSCRIBERS, INTERVAL = 5, 1.5
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            subscribers = [child("subscriber", self._topic) for _ in range(self.SUBSCRIBERS)]
+            self._ended.wait(self.INTERVAL)
+            for each in subscribers:
+                each.kill()
+                each.wait()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
 def child(*arguments: str) -> subprocess.Popen[bytes]:
-    """A source, or the flood."""
+    """A process of `deadman_sources`."""
     return subprocess.Popen([sys.executable, "-m", "benchmarks.deadman_sources", *arguments], cwd=ROOT)

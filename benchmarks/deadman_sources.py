@@ -1,8 +1,9 @@
-"""What `deadman_trials` plays against the router, each in a process of its own: command sources, and a flood.
+"""What `deadman_trials` plays against the router, each in a process of its own: command sources, load, subscribers.
 
     python -m benchmarks.deadman_sources udp TABLE HOST:PORT
     python -m benchmarks.deadman_sources ros TOPIC
-    python -m benchmarks.deadman_sources flood TABLE HOST:PORT FROM
+    python -m benchmarks.deadman_sources flood TABLE HOST:PORT FROM RATE
+    python -m benchmarks.deadman_sources subscriber TOPIC
 
 A command carries the wall clock's milliseconds (modulo WRAP) at which it was made. SIGUSR1 cuts the ROS source off:
 it lives on, and what it sends no longer arrives. A second one restores it.
@@ -26,7 +27,6 @@ WRAP = 1 << 22
 """ms; a float holds all numbers below exactly, and an hour is enough to tell fresh from stale."""
 
 COMMAND_RATE = 50
-FLOOD_RATE = 20_000
 _BURST = 20
 
 
@@ -69,12 +69,22 @@ def ros_commands(topic: str) -> None:
     _at_command_rate(publish)
 
 
-def flood(table: str, to: str, source: str) -> None:
+def subscriber(topic: str) -> None:
+    import rclpy
+    from comms.msg import ImuSensorInformation
+
+    rclpy.init(args=[])
+    node = rclpy.create_node("subscriber")
+    node.create_subscription(ImuSensorInformation, topic, lambda _: None, 10, raw=True)
+    rclpy.spin(node)
+
+
+def flood(table: str, to: str, source: str, rate: str) -> None:
     datagram = envelope_class(Path(table))(imu_info={"accel_x": 1.0, "gyro_z": 2.0}).SerializeToString()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind((source, 0))
         opened.connect(_address(to))
-        for _ in paced(None, FLOOD_RATE / _BURST):
+        for _ in paced(None, int(rate) / _BURST):
             for _ in range(_BURST):
                 opened.send(datagram)
 
@@ -91,7 +101,12 @@ def _address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-KINDS: dict[str, Callable[..., None]] = {"udp": udp_commands, "ros": ros_commands, "flood": flood}
+KINDS: dict[str, Callable[..., None]] = {
+    "udp": udp_commands,
+    "ros": ros_commands,
+    "flood": flood,
+    "subscriber": subscriber,
+}
 
 if __name__ == "__main__":
     KINDS[sys.argv[1]](*sys.argv[2:])

@@ -1,10 +1,11 @@
 """How long a board drives on when its commands stop: a router under load, its command sources killed, stopped, cut off.
 
-    python -m benchmarks.deadman_trials --trials 100
+    python -m benchmarks.deadman_trials --trials 100 [--rate 20000] [--churn]
 
 Two 50 Hz sources, one on UDP and one on ROS, each with a board of its own, while another process sends 20,000
-datagrams a second through the router. Times are those at which the kernel got the datagrams: from a board's last
-command to its first brake. Exits 1 if one was late or a stale command was sent. All on the loopback interface.
+datagrams a second through the router. With --churn five subscribers of what these are published to are killed and
+started again all the time. Times are those at which the kernel got the datagrams: from a board's last command to its
+first brake. Exits 1 if one was late or a stale command was sent. All on the loopback interface.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from pathlib import Path
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
-from benchmarks.deadman_actors import Arrival, Board, Proxy, Source, child
+from benchmarks.deadman_actors import Arrival, Board, Churn, Proxy, Source, child
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS, ROUTER
 from tests.acceptance.site import RouterProcess, site, total
@@ -121,7 +122,7 @@ def _stale(arrivals: Iterable[Arrival]) -> int:
     return sum(arrival.is_older_than(TTL + 50) for arrival in arrivals)
 
 
-def run(trials: int, folder: Path) -> dict[tuple[str, str], Result]:
+def run(trials: int, rate: int, is_churning: bool, folder: Path) -> dict[tuple[str, str], Result]:
     noise = random.Random(1)
     with ExitStack() as opened:
         hosts = {name: HOSTS[name] for name in ("sensor_board", "driving_board", "arm_board", "basestation")}
@@ -137,10 +138,12 @@ def run(trials: int, folder: Path) -> dict[tuple[str, str], Result]:
             "UDP": opened.enter_context(closing(Source(("udp", str(table), proxy.address), proxy))),
             "ROS": opened.enter_context(closing(Source(("ros", "drive_motor"), None))),
         }
-        flood = child("flood", str(table), "{}:{}".format(*router_address), hosts["sensor_board"])
+        flood = child("flood", str(table), "{}:{}".format(*router_address), hosts["sensor_board"], str(rate))
         opened.callback(flood.wait)
         opened.callback(flood.kill)
         place.receive("basestation")  # the flood has begun
+        if is_churning:
+            opened.enter_context(closing(Churn("imu_data")))
         results = {(name, fault): Result() for name in sources for fault in Source.FAULTS}
         before, begun = place.scrape(), time.monotonic()
         for name, source in sources.items():
@@ -162,9 +165,11 @@ def run(trials: int, folder: Path) -> dict[tuple[str, str], Result]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--trials", type=int, default=100, help="of each source, the faults by turns; default 100")
+    parser.add_argument("--rate", type=int, default=20_000, help="datagrams per second beside them; default 20000")
+    parser.add_argument("--churn", action="store_true", help="kill and restart subscribers meanwhile")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        results = run(arguments.trials, Path(folder))
+        results = run(arguments.trials, arguments.rate, arguments.churn, Path(folder))
     print(f"ms from the last command to the first brake; late is beyond {(TIMEOUT + REPEAT) // MS}")
     print(f"{'source':8}{'fault':16}{'trials':>8}{'min':>9}{'median':>9}{'max':>9}{'late':>6}{'stale':>7}")
     for (source, fault), result in results.items():
