@@ -1,27 +1,37 @@
-"""A ROS node in a context of its own. Knows no topics."""
+"""A ROS node in a context of its own, and the transports that Fast DDS uses for it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 
+from router.edges.log import logger
 from router.errors import StartError
 
 RCL_ERRORS = (RuntimeError, NameValidationException)
 """What rclpy raises for bad arguments, names and settings: its own errors derive from RuntimeError."""
+
+UDP_ON_LOCALHOST = Path(__file__).with_name("fastdds_udp_localhost.xml")
+"""A profile of Fast DDS: UDP as its only transport, discovery on this computer only."""
+
+_PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> Node:
     """Raises StartError. Signals are left alone, and rclpy's global context as well; close it with `close_node`."""
     context = Context()
     try:
-        # The router has a log of its own: no log file of ROS, no /rosout. Nor parameter services:
-        # parameters fill the table's variables at start, so a service that sets them would pretend.
-        context.init(list(ros_args), initialize_logging=False)
-        return Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
+        with _environment(_transport_variables(os.environ)):
+            # The router has a log of its own: no log file of ROS, no /rosout. Nor parameter services:
+            # parameters fill the table's variables at start, so a service that sets them would pretend.
+            context.init(list(ros_args), initialize_logging=False)
+            return Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
     except RCL_ERRORS as error:
         context.try_shutdown()
         raise StartError(f"the ROS node cannot be created: {error}") from error
@@ -30,3 +40,42 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
 def close_node(node: Node) -> None:
     node.destroy_node()
     node.context.try_shutdown()
+
+
+def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
+    """What to set for the node, so that FASTDDS_BUILTIN_TRANSPORTS=UDPv4 holds with a discovery range of LOCALHOST too.
+
+    For that range rmw_fastrtps opens shared memory and UDP, whatever the variable says. Our profile does the rest of
+    what the range does, and the range SUBNET leaves the profile alone.
+    """
+    wanted = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
+    is_local = any(variables.get(name) == value for name, value in wanted.items())
+    if not is_local or variables.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4":
+        return {}
+    if taken := next((name for name in _PROFILES if variables.get(name)), None):
+        logger.warning(
+            f"{taken} is set: with a discovery range of LOCALHOST, Fast DDS uses shared memory although "
+            "FASTDDS_BUILTIN_TRANSPORTS is UDPv4",
+            remedy=f"unset {taken}, or make it what {UDP_ON_LOCALHOST} is and set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+        )
+        return {}
+    return {
+        _PROFILES[0]: str(UDP_ON_LOCALHOST),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+        "ROS_LOCALHOST_ONLY": "0",
+    }
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Sets variables of the process meanwhile: the middleware reads them from there."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from time import sleep
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from router.compiler.program import TopicPlan
@@ -19,8 +21,46 @@ from router.errors import SourceSpan, StartError
 _MEET_S, _LOOK_S, _OTHERS_S = 0.5, 0.005, 0.1
 
 
+class _SerializedMessage(ctypes.Structure):
+    """rcutils_uint8_array_t. The allocator stays zero: publishing only reads the bytes."""
+
+    _fields_ = (
+        ("buffer", ctypes.c_char_p),
+        ("buffer_length", ctypes.c_size_t),
+        ("buffer_capacity", ctypes.c_size_t),
+        ("allocator", ctypes.c_void_p * 5),
+    )
+
+
+class _ErrorString(ctypes.Structure):
+    """rcutils_error_string_t."""
+
+    _fields_ = (("text", ctypes.c_char * 1024),)
+
+
+# rclpy publishes with the interpreter lock held, and Fast DDS may wait for seconds in there, for a reader that has gone
+# or a shared-memory port. Through ctypes the lock is released meanwhile. rclpy's library has loaded that of rcl.
+_RCL = ctypes.CDLL(rclpy_implementation.__file__)
+_publish_serialized = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_SerializedMessage), ctypes.c_void_p
+)(("rcl_publish_serialized_message", _RCL))
+_error_string = ctypes.CFUNCTYPE(_ErrorString)(("rcutils_get_error_string", _RCL))
+
+
+def _rcl_error() -> Exception:
+    """What rcl says of the last call of this thread that failed."""
+    text = _error_string().text.decode(errors="replace")
+    _RCL.rcutils_reset_error()
+    error: Exception = rclpy_implementation.RCLError(text)
+    return error
+
+
 class Publication:
-    """A publisher. `publish` takes CDR bytes; `wanted` is one boolean: whether anybody listens, or may later."""
+    """A publisher. `wanted` is one boolean: whether anybody listens, or may later.
+
+    `publish` takes CDR bytes, from any thread, with the interpreter lock released while the middleware works.
+    It raises RCLError where the middleware refuses, or the publisher is closed.
+    """
 
     def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
         """Raises StartError."""
@@ -35,11 +75,12 @@ class Publication:
                 callback_group=ReentrantCallbackGroup(),  # the node's own keeps a little of each publisher for ever
             )
             opening.callback(node.destroy_publisher, self._publisher)
-            # Publisher.publish() enters the handle and looks at the message's type each time, which doubles its cost.
             handle = self._publisher.handle
             opening.enter_context(handle)
             self._open = opening.pop_all()
-        self.publish: Callable[[bytes], None] = handle.publish_raw
+        self._calls: list[None] = []  # of `publish`, that have not returned
+        self._is_closed = False
+        self.publish = self._publish_to(handle.pointer)
         self.events: Sequence[EventHandler] = self._publisher.event_handlers
 
     def meet(self) -> None:
@@ -50,8 +91,27 @@ class Publication:
                 return
             sleep(_LOOK_S)
 
+    def _publish_to(self, publisher: int) -> Callable[[bytes], None]:
+        begin, end = self._calls.append, self._calls.pop
+
+        def publish(cdr: bytes) -> None:
+            begin(None)
+            try:
+                if self._is_closed:
+                    raise rclpy_implementation.RCLError("the publisher was closed by a reload")
+                size = len(cdr)
+                if _publish_serialized(publisher, _SerializedMessage(cdr, size, size), None):
+                    raise _rcl_error()
+            finally:
+                end()
+
+        return publish
+
     def close(self) -> None:
-        """Nobody may publish any more, and nobody waits for its events."""
+        """Waits for calls of `publish` that have begun. Nobody may wait for its events any more."""
+        self._is_closed = True
+        while self._calls:
+            sleep(_LOOK_S)
         self._open.close()
 
 

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
+from time import monotonic, sleep
 
 import pytest
 
@@ -12,6 +18,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from structlog.testing import capture_logs
 
 from router.compiler.program import QosPlan, TopicPlan
+from router.edges.ros import RosEdge
 from router.errors import StartError
 from router.types.ros import definition, ros_interfaces
 from tests.edges.ros_opening import HELLO, RELIABLE, open_ros, string_topic
@@ -137,3 +144,95 @@ def test_an_impossible_name_is_refused_and_nothing_stays_open() -> None:
         open_ros(string_topic(), string_topic(topic="2bad"))
     with closing(open_ros(string_topic())) as ros:
         ros.publish["greeting"](HELLO)
+
+
+@pytest.fixture
+def blocked() -> Iterator[RosEdge]:
+    """A topic whose next `publish` blocks: it keeps all, and is full of what a stopped subscriber has not taken."""
+    with closing(open_ros(string_topic(QosPlan("reliable", "volatile", "keep_all", 1)))) as ros:
+        peer = Subscriber("greeting", "std_msgs/msg/String")
+        try:
+            assert peer.line() == "matched"
+            wait_until(lambda: ros.wanted["greeting"][0])
+            peer.process.send_signal(signal.SIGSTOP)
+            with suppress(*ros.publish_errors):
+                while True:
+                    ros.publish["greeting"](HELLO)
+            yield ros
+        finally:
+            peer.kill()
+
+
+def test_python_goes_on_while_the_middleware_blocks_a_publisher(blocked: RosEdge) -> None:
+    ran_at: list[float] = []
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.is_set():
+            ran_at.append(monotonic())
+            sleep(0.001)
+
+    other = threading.Thread(target=run)
+    other.start()
+    begun = monotonic()
+    with pytest.raises(blocked.publish_errors):
+        blocked.publish["greeting"](HELLO)
+    lasted = monotonic() - begun
+    ended.set()
+    other.join()
+    assert any(lasted / 4 < at - begun < lasted * 3 / 4 for at in ran_at)
+
+
+def test_a_publisher_closes_when_nobody_is_in_it_and_refuses_after_that(blocked: RosEdge) -> None:
+    publish, refusals, calls = blocked.publish["greeting"], [], blocked._publications["greeting"]._calls
+
+    def try_to_publish() -> None:
+        with pytest.raises(blocked.publish_errors) as refused:
+            publish(HELLO)
+        refusals.append(str(refused.value))
+
+    other = threading.Thread(target=try_to_publish)
+    other.start()
+    wait_until(lambda: bool(calls))
+    blocked.close()
+    other.join()
+    try_to_publish()
+    assert ["closed" in each for each in refusals] == [False, True]
+
+
+_UDP_ONLY = """
+import sys
+from router.edges.clock import monotonic_ns
+from tests.edges.ros_opening import HELLO, open_ros, string_topic
+ros = open_ros(string_topic())
+with open("/proc/self/maps") as maps:
+    print(sum("/dev/shm/fastrtps" in line for line in maps), flush=True)
+while not ros.wanted["greeting"][0]:
+    pass
+sys.stdin.readline()
+ros.publish["greeting"](HELLO)
+sys.stdin.read()
+ros.close()
+"""
+
+
+@pytest.mark.parametrize(("transports", "shares"), [("UDPv4", False), ("DEFAULT", True)])
+def test_udp_alone_is_used_where_the_environment_says_so(
+    subscribe: Callable[..., Subscriber], transports: str, shares: bool
+) -> None:
+    """With discovery on this computer only, which takes more than that variable; our peer has shared memory as well."""
+    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTDDS_BUILTIN_TRANSPORTS": transports}
+    command = [sys.executable, "-c", _UDP_ONLY]
+    peer = subscribe("greeting", "std_msgs/msg/String")
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as publisher:
+        assert publisher.stdout
+        assert publisher.stdin
+        assert (int(publisher.stdout.readline()) > 0) == shares
+        assert peer.line() == "matched"
+        publisher.stdin.write("publish\n")
+        publisher.stdin.flush()
+        assert bytes.fromhex(peer.line()) == HELLO
+        publisher.stdin.close()
+    assert publisher.returncode == 0
