@@ -15,6 +15,7 @@ from pathlib import Path
 
 import yaml
 
+from router import hold_signals
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table
@@ -55,8 +56,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    # Blocked in all threads, signals wait for sigwait: no handler runs, no system call is interrupted.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})
+    hold_signals(["run"])  # where it was not done before the imports
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
     named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE is
