@@ -76,8 +76,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
             raise
         what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), which is not enough"
-        print(f"router {_verb(arguments)}: {what}: {str(error).partition(chr(10))[0] or 'no memory'}", file=sys.stderr)
-        return BAD_TABLE
+        print(
+            f"router {_verb(arguments)}: {what}: {str(error).partition(chr(10))[0] or 'no memory'}",
+            file=sys.stderr,
+            flush=True,
+        )
+        os._exit(BAD_TABLE)  # threads that could be started when others could not would keep the process
     return code
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import yaml
 
-from router import hold_signals
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table
@@ -56,7 +55,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    hold_signals(["run"])  # where it was not done before the imports
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # `router.main` has done it already
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
     named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE is
