@@ -72,6 +72,7 @@ def main() -> int:
         memory, took = [], []
         for number in range(args.reloads):
             path.write_text(tables[1 - number % 2])
+            os.utime(path, (time.time() - 60,) * 2)  # or the reload waits until it rests
             began = time.monotonic()
             router.reload()
             took.append(time.monotonic() - began)

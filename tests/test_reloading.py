@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 import random
 import socket
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import time
 from unittest.mock import ANY
 
 import pytest
@@ -19,8 +21,9 @@ from structlog.testing import capture_logs
 
 from router.compiler import check_table
 from router.compiler.books import Books
+from router.edges import watching
 from router.edges.receiver import ReceiveThread
-from router.runtime import Router
+from router.runtime import Router, reloading
 from router.runtime.accounts import Accounts
 from router.runtime.edges import Edges
 from tests.acceptance.site import wait_until
@@ -67,6 +70,20 @@ def numbered(number: int) -> bytes:
     return bytes.fromhex("0a050d") + struct.pack("<f", number)
 
 
+def let_rest(path: Path) -> None:
+    """As if it had been written a minute ago: a reload waits for what is being written."""
+    os.utime(path, (time() - 60,) * 2)
+
+
+@contextmanager
+def later(write: Callable[[], object]) -> Iterator[None]:
+    """Writes a moment after this was entered, as a slow copy goes on."""
+    timer = threading.Timer(0.2, write)
+    timer.start()
+    yield
+    timer.join()
+
+
 def udp(host: str) -> socket.socket:
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
@@ -96,6 +113,7 @@ class Site:
                 protos=ROOT / "protos", listen=listeners, basestation=destination, more=f"{endpoints}routes:\n{routes}"
             )
         )
+        let_rest(path)
         return path
 
     @contextmanager
@@ -318,6 +336,80 @@ def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(site: Site) 
         wait_until(lambda: len(router.program.table.routes) == 2, "the change")
         site.send(DRIVE)
         assert site.basestation.recv(1000) == DRIVE
+
+
+def test_a_reload_waits_for_files_that_are_being_written(site: Site) -> None:
+    """What is there meanwhile is valid: the base that the table extends, whose routes go elsewhere."""
+    with site.router(PH) as router:
+        table = router.program.table.path
+        table.rename(site.folder / "base.yaml")
+        beginning = "version: 1\nextends: base.yaml\n"
+        table.write_text(beginning)
+        with later(lambda: table.write_text(f"{beginning}routes:\n{turns('1s')}")):
+            assert router.reload().text == "route manual_drive added"
+
+
+def test_a_reload_waits_for_files_that_only_the_new_table_names(site: Site) -> None:
+    with site.router(PH) as router:
+        table, base = router.program.table.path, site.folder / "base.yaml"
+        beginning = table.read_text()
+        table.write_text("version: 1\nextends: base.yaml\n")
+        let_rest(table)
+        base.write_text(beginning)
+        with later(lambda: base.write_text(beginning + turns("1s"))):
+            assert router.reload().text == "route manual_drive added"
+
+
+def test_a_reload_refuses_files_that_do_not_come_to_rest(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reloading, "PATIENCE", 1.0)
+    with site.router(PH) as router:
+        path, ended = site.write(PH + turns("1s")), threading.Event()
+
+        def write() -> None:
+            while not ended.wait(0.05):
+                path.write_text(path.read_text() + "# more\n")
+
+        writing = threading.Thread(target=write)
+        writing.start()
+        wait_until(lambda: path.read_text().endswith("more\n"), "the first line")
+        result = router.reload()
+        ended.set()
+        writing.join()
+        assert (result.ok, result.text) == (False, f"these files are still being written: {path}")
+        assert len(router.program.table.routes) == 1
+        let_rest(path)
+        assert router.reload().ok
+
+
+def test_a_reload_waits_for_nothing_where_files_rest(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def sleep(seconds: float) -> None:
+        raise AssertionError(f"it waits for {seconds} s")
+
+    monkeypatch.setattr(watching, "sleep", sleep)
+    with site.router(PH) as router:
+        os.utime(site.write(PH + turns("1s")), (time() + 60,) * 2)  # by a clock that was set back since
+        assert router.reload().ok
+
+
+def test_a_reload_that_moves_every_endpoint_is_warned_about(site: Site) -> None:
+    with site.router(PH) as router:
+        path = site.write(PH)
+        text = path.read_text()
+        port = site.basestation.getsockname()[1]
+
+        def warned(*moves: tuple[str, str]) -> list[object]:
+            path.write_text(functools.reduce(lambda text, move: text.replace(*move), moves, text))
+            let_rest(path)
+            with capture_logs() as logged:
+                assert router.reload().ok
+            return [line["endpoints"] for line in logged if line["log_level"] == "warning"]
+
+        one = ("127.0.0.30:8", "127.0.0.31:8")
+        two = (f"127.0.0.1:{port}", f"127.0.0.2:{port}")
+        assert warned(one) == warned() == []
+        assert warned(one, two) == [
+            ["sensor_board 127.0.0.30:8 -> 127.0.0.31:8", f"basestation 127.0.0.1:{port} -> 127.0.0.2:{port}"]
+        ]
 
 
 def test_a_gateway_keeps_its_clients_unless_it_changes_itself(site: Site) -> None:

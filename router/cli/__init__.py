@@ -14,6 +14,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from router.edges.ros_environment import ADDRESS_SPACE, address_space
 from router.errors import RouterError, TableError
 
 OK = 0
@@ -71,7 +72,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BROKEN_PIPE
     except KeyboardInterrupt:
         return INTERRUPTED
+    except (MemoryError, ImportError, OSError, RuntimeError) as error:  # each of them says that memory could not be had
+        if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
+            raise
+        what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), which is not enough"
+        print(
+            f"router {_verb(arguments)}: {what}: {str(error).partition(chr(10))[0] or 'no memory'}",
+            file=sys.stderr,
+            flush=True,
+        )
+        os._exit(BAD_TABLE)  # threads that could be started when others could not would keep the process
     return code
+
+
+def _verb(arguments: Sequence[str]) -> str | None:
+    return next((argument for argument in arguments if not argument.startswith("-")), None)
 
 
 def _open_what_is_closed() -> None:
@@ -89,7 +104,7 @@ def _run(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
+    chosen = _verb(arguments)
     module = None
     for verb, summary in VERBS.items():
         if verb == chosen:
@@ -102,6 +117,11 @@ def _run(arguments: Sequence[str]) -> int:
         subparsers.choices[args.verb].error(f"unrecognized arguments: {' '.join(unknown)}")
     if module is None:
         raise AssertionError("argparse refuses what is no verb")
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        print(f"router {chosen}: the working directory was deleted; change to one that exists", file=sys.stderr)
+        return BAD_TABLE
     try:
         code: int = module.run(args)
     except TableError as error:

@@ -5,6 +5,7 @@ Prints what the compiler found out, and what ROS knows of topics; finds out noth
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from time import sleep
 
@@ -12,6 +13,7 @@ from router.cli.explain_words import quality
 from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import resolved
+from router.edges.ros_environment import check_environment
 from router.errors import StartError
 from router.gateway.following import by_frequency
 from router.table.model import EACH, Gateway, GatewayFormat, IgnoredGateway, RouteTable, TopicPattern, Transport
@@ -30,6 +32,7 @@ def known_topics(table: RouteTable) -> Topics:
 
 def seen_topics(table: RouteTable, seconds: float) -> Topics:
     """The same with all that a node has discovered after so long. Raises StartError."""
+    check_environment(os.environ)
     try:
         from router.edges.ros_node import close_node, open_node
         from router.edges.ros_topics import RosTopics

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import add_url_option, add_wire_options, explained, load_wire, running_url, whole
+from router.edges.ros_environment import check_environment
 from router.errors import StartError, nearest
 from router.tools import UsageError
 
@@ -153,7 +155,10 @@ def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Ite
 @contextmanager
 def _topic(args: argparse.Namespace) -> Iterator[Iterator[HeardMessage]]:
     try:
+        check_environment(os.environ)
         from router.edges.ros_listen import TopicListener
+    except StartError as error:
+        raise UsageError(str(error)) from error
     except ImportError as error:
         raise UsageError(f"a topic needs ROS 2, which is not installed here ({error}); run 'make setup'") from error
     from router.tools.tapping import listen_to_topic

@@ -58,7 +58,9 @@ METRICS = (
     Metric("config_reloads", "counter", ("result",), "Changed tables that the running router was to take."),
     Metric("config_last_reload_successful", "number", (), "1 unless the last reload failed."),
     Metric("config_last_reload_timestamp_seconds", "time", (), "When the running table was taken."),
-    Metric("qos_incompatible", "number", ("route", "topic", "policy"), "Peers that got or gave nothing for their QoS."),
+    Metric(
+        "qos_incompatible", "number", ("route", "topic", "policy"), "Peers that get or give nothing now, for their QoS."
+    ),
 )
 
 REJECT_REASONS: Mapping[str, str] = {

@@ -6,6 +6,7 @@ Between two datagrams it does what others ask for: so what it calls can be repla
 
 from __future__ import annotations
 
+import ctypes
 import select
 import sys
 import threading
@@ -25,6 +26,10 @@ _PATIENCE = 0.25
 
 _MOST_WAITING = 1 << 16
 """Datagrams that are taken from a socket at its end, at most: more than a receive buffer holds."""
+
+_ppoll = ctypes.CDLL(None).ppoll
+"""Python's own waits take whole milliseconds, or (select) no descriptor above 1023."""
+_ppoll.argtypes = (ctypes.c_void_p, ctypes.c_ulong, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class ReceiveThread:
@@ -180,10 +185,11 @@ class ReceiveThread:
             intakes = {intake.descriptor: intake for intake in self._intakes}
             for descriptor in intakes:
                 waiting.register(descriptor, select.EPOLLIN)
+            wait_for = _BriefWait(waiting.fileno())
             looks: dict[int, float] = {}  # of those that coalesce: when, by time.monotonic
             while not self._tasks:
                 self._turns += 1
-                for descriptor in _ready(waiting, looks):
+                for descriptor in _ready(waiting, looks, wait_for):
                     _, rest = intakes[descriptor].take_one()
                     if rest:
                         waiting.modify(descriptor, 0)
@@ -199,12 +205,33 @@ class ReceiveThread:
                         del looks[descriptor]
 
 
-def _ready(waiting: select.epoll, looks: Mapping[int, float]) -> list[int]:
-    """What has something. Waits for that until the next look is due; epoll alone would wait whole milliseconds."""
+class _PollFd(ctypes.Structure):
+    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
+
+
+class _TimeSpec(ctypes.Structure):
+    _fields_ = (("sec", ctypes.c_long), ("nsec", ctypes.c_long))
+
+
+class _BriefWait:
+    """Waits until `descriptor` is readable, for less than one second. It may end early. For one thread."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._timeout = _TimeSpec()
+        self._polled = _PollFd(descriptor, select.POLLIN)
+        self._arguments = ctypes.addressof(self._polled), 1, ctypes.addressof(self._timeout), None
+
+    def __call__(self, seconds: float) -> None:
+        self._timeout.nsec = int(seconds * 1e9)
+        _ppoll(*self._arguments)
+
+
+def _ready(waiting: select.epoll, looks: Mapping[int, float], wait_for: Callable[[float], None]) -> list[int]:
+    """What has something. Waits for that until the next look is due."""
     if not looks:
         return [descriptor for descriptor, _ in waiting.poll(_PATIENCE)]
     if (timeout := min(looks.values()) - time.monotonic()) > 0:
-        select.select([waiting], [], [], timeout)
+        wait_for(timeout)
     return [descriptor for descriptor, _ in waiting.poll(0) if descriptor not in looks]
 
 

@@ -28,7 +28,8 @@ class RosEdge:
     `publish[topic]` takes CDR bytes. `wanted[topic]` is one boolean in a list, kept up to date in place: whether
     anybody listens, or may want it later. `subscribed` has the topics with a subscriber now.
     `incompatible(topic, policy, peers)` is called by a thread of events, from opening on: peers whose QoS does not go
-    with ours, so far. Nothing is received before `start`. `topics` are those that the node sees.
+    with ours, now. It is called once per second for a topic that has such peers, and for some seconds after that.
+    Nothing is received before `start`. `topics` are those that the node sees.
 
     What is open can be replaced: `prepare` opens what is new, `apply` has it used, `finish` closes what is not used
     any more. Or `abandon` closes what was opened.
@@ -139,10 +140,7 @@ class RosEdge:
             receive[topic](cdr, sent_at)
 
     def finish(self, change: RosChange) -> None:
-        """Closes what is not used any more: nobody may publish there when this is called.
-
-        `incompatible` is told of all peers again, for those who have named the topics since.
-        """
+        """Closes what is not used any more: nobody may publish there when this is called."""
         for topic in self.publish.keys() - self._publications.keys():
             del self.publish[topic], self.wanted[topic]
         if change.left or change.opened:
@@ -152,7 +150,6 @@ class RosEdge:
             self._peers.forget_all_but(self._publications)
             self._events = self._event_thread()
             self._events.start()
-        self._peers.tell()
 
     def _use(self, change: RosChange) -> None:
         self._publications, self._subscriptions = change.publications, change.subscriptions
@@ -175,7 +172,11 @@ class RosEdge:
             self._node,
             [event for each in self._publications.values() for event in each.events],
             [event for each in self._subscriptions.values() for event in each.events],
+            self._look,
         )
+
+    def _look(self) -> None:
+        self._peers.look(self._node, self._publications, self._subscriptions)
 
     def _stop_events(self) -> None:
         self._events.stop()

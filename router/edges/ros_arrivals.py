@@ -56,7 +56,7 @@ class RawSubscription:
         self.capacity: int = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else MOST_KEPT
         self._node = node
         self._subscription = subscription
-        self._handle = subscription.handle
+        self.handle = subscription.handle
         self._message_class = message_class
 
     def take(self) -> tuple[bytes, int] | None:
@@ -66,7 +66,7 @@ class RawSubscription:
         would make new what is not: reliable DDS repairs a loss seconds later, keeps messages for late joiners, and
         a process that was stopped finds all that was sent meanwhile coming in at once.
         """
-        taken = self._handle.take_message(self._message_class, True)
+        taken = self.handle.take_message(self._message_class, True)
         if taken is None:
             return None
         cdr, info = taken
@@ -85,7 +85,7 @@ class RawSubscription:
         the eventfd that was announced to before is not touched any more. Raises one of `ros_node.RCL_ERRORS`.
         """
         callback = None if eventfd is None else _ADD_TO_EVENTFD
-        if _set_callback(self._handle.pointer, callback, eventfd):
+        if _set_callback(self.handle.pointer, callback, eventfd):
             raise rclpy_implementation.RCLError("the middleware does not tell of new messages")
 
     def close(self) -> None:

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from router.compiler.program import TopicPlan
 from router.edges.ros_arrivals import RawSubscription
 from router.edges.ros_node import RCL_ERRORS
-from router.edges.ros_qos import PeerEvents, qos_profile
+from router.edges.ros_qos import PeerEvents, publisher_qos, qos_profile, subscription_qos
 from router.errors import SourceSpan, StartError
 
 _MEET_S, _LOOK_S, _OTHERS_S = 0.5, 0.005, 0.1
@@ -81,6 +81,8 @@ class Publication:
         self._calls: list[None] = []  # of `publish`, that have not returned
         self._is_closed = False
         self.publish = self._publish_to(handle.pointer)
+        self.topic: str = handle.get_topic_name()
+        self.qos = publisher_qos(handle.pointer)
         self.events: Sequence[EventHandler] = self._publisher.event_handlers
 
     def meet(self) -> None:
@@ -124,6 +126,8 @@ class Subscription:
         with _refusing(f"{span}: topic '{plan.topic}' cannot be subscribed to"):
             self.raw = RawSubscription(node, message, plan.topic, qos_profile(plan.qos), peers.of_subscription(plan))
         self.events: Sequence[EventHandler] = self.raw.events
+        self.topic: str = self.raw.handle.get_topic_name()
+        self.qos = subscription_qos(self.raw.handle.pointer)
 
     def meet(self) -> None:
         """Waits a moment for the publishers, who find this one by and by; an earlier subscription hears them meanwhile.

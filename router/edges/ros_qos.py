@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections import Counter
-from collections.abc import Callable, Collection
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rclpy.duration import Duration, Infinite
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
@@ -20,6 +23,9 @@ from rclpy.qos import (
 from router.compiler.books import QOS_POLICIES
 from router.compiler.program import QosPlan, TopicPlan
 from router.edges.log import logger
+
+if TYPE_CHECKING:
+    from router.edges.ros_opened import Publication, Subscription
 
 
 def qos_profile(plan: QosPlan) -> QoSProfile:
@@ -39,8 +45,63 @@ def _duration(nanoseconds: int | None) -> Duration:
     return Infinite if nanoseconds is None else Duration(nanoseconds=nanoseconds)
 
 
+class OpenQos(NamedTuple):
+    """The policies of an open publisher or subscription that decide whom it goes with. Times in ns."""
+
+    reliability: int
+    durability: int
+    deadline: int
+    liveliness: int
+    lease: int
+
+
+class _Time(ctypes.Structure):
+    _fields_ = (("sec", ctypes.c_uint64), ("nsec", ctypes.c_uint64))
+
+    def in_ns(self) -> int:
+        return int(self.sec) * 1_000_000_000 + int(self.nsec)
+
+
+class _Profile(ctypes.Structure):
+    """rmw_qos_profile_t, as far as it is read."""
+
+    _fields_ = (
+        ("history", ctypes.c_int),
+        ("depth", ctypes.c_size_t),
+        ("reliability", ctypes.c_int),
+        ("durability", ctypes.c_int),
+        ("deadline", _Time),
+        ("lifespan", _Time),
+        ("liveliness", ctypes.c_int),
+        ("lease", _Time),
+    )
+
+
+_rcl = ctypes.CDLL(rclpy_implementation.__file__)
+for _actual_qos in (_rcl.rcl_publisher_get_actual_qos, _rcl.rcl_subscription_get_actual_qos):
+    _actual_qos.argtypes, _actual_qos.restype = (ctypes.c_void_p,), ctypes.POINTER(_Profile)
+
+
+def publisher_qos(pointer: int) -> OpenQos:
+    """What the middleware made of `system_default` and `best_available`. `pointer` is that of an open handle."""
+    return _open_qos(_rcl.rcl_publisher_get_actual_qos(pointer).contents)
+
+
+def subscription_qos(pointer: int) -> OpenQos:
+    """As `publisher_qos`."""
+    return _open_qos(_rcl.rcl_subscription_get_actual_qos(pointer).contents)
+
+
+def _open_qos(qos: Any) -> OpenQos:
+    return OpenQos(qos.reliability, qos.durability, qos.deadline.in_ns(), qos.liveliness, qos.lease.in_ns())
+
+
 Incompatible = Callable[[str, str, int], None]
-"""Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and how many peers it kept away so far."""
+"""Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and how many peers it keeps away now."""
+
+_EMPTY_LOOKS = 10
+"""A topic is looked at so often after the last incompatible peer: not every middleware has a peer in its graph before
+it reports the event."""
 
 
 class PeerEvents:
@@ -52,7 +113,7 @@ class PeerEvents:
     def __init__(self, incompatible: Incompatible) -> None:
         self.subscribed: set[str] = set()
         self._incompatible = incompatible
-        self._peers: Counter[tuple[str, str]] = Counter()
+        self._looks: dict[str, int] = {}  # topics with incompatible peers: how often to look until none counts as gone
 
     def of_publisher(self, plan: TopicPlan, wanted: list[bool]) -> PublisherEventCallbacks:
         """They keep `wanted` up to date as well: whether anybody listens."""
@@ -76,11 +137,20 @@ class PeerEvents:
         """Nobody subscribes to what is not published any more. To be called while no thread calls the callbacks."""
         self.subscribed.intersection_update(published)
 
-    def tell(self) -> None:
-        """All peers that were kept away so far, once more: for books in which their topics are new."""
-        for (topic, policy), peers in list(self._peers.items()):
-            if policy in QOS_POLICIES:
-                self._incompatible(topic, policy, peers)
+    def look(
+        self, node: Node, publishers: Mapping[str, Publication], subscriptions: Mapping[str, Subscription]
+    ) -> None:
+        """Reports how many incompatible peers each topic has now, where an event has named one. Both are by topic.
+
+        Events tell of peers that come, and none of those that go; the graph has those that are there.
+        """
+        for topic, looks in list(self._looks.items()):
+            del self._looks[topic]  # what `incompatible` raises ends the looking until the next event
+            apart = Counter(_apart(node, publishers.get(topic), subscriptions.get(topic)))
+            for policy in QOS_POLICIES:
+                self._incompatible(topic, policy, apart[policy])
+            if apart or looks > 1:
+                self._looks[topic] = _EMPTY_LOOKS if apart else looks - 1
 
     def of_subscription(self, plan: TopicPlan) -> SubscriptionEventCallbacks:
         def on_incompatible_qos(status: Any) -> None:
@@ -95,7 +165,43 @@ class PeerEvents:
     def _on_incompatible_qos(self, sentence: str, plan: TopicPlan, status: Any) -> None:
         """The middleware names one policy: the last one of the last peer."""
         policy = qos_policy_name_from_kind(status.last_policy_kind).lower()
-        self._peers[plan.topic, policy] += status.total_count_change
+        self._looks[plan.topic] = _EMPTY_LOOKS
         logger.warning(sentence, topic=plan.topic, policy=policy)
-        if policy in QOS_POLICIES:
-            self._incompatible(plan.topic, policy, self._peers[plan.topic, policy])
+
+
+def _apart(node: Node, publisher: Publication | None, subscription: Subscription | None) -> Iterator[str]:
+    """The policies that keep each peer away that is in the graph now."""
+    if publisher:
+        for qos in _peers(node, publisher, rclpy_implementation.rclpy_get_subscriptions_info_by_topic):
+            yield from incompatible_policies(publisher.qos, qos)
+    if subscription:
+        for qos in _peers(node, subscription, rclpy_implementation.rclpy_get_publishers_info_by_topic):
+            yield from incompatible_policies(qos, subscription.qos)
+
+
+def _peers(
+    node: Node, ours: Publication | Subscription, ask: Callable[[Any, str, bool], Iterable[dict[str, Any]]]
+) -> Iterator[OpenQos]:
+    with node.handle:
+        peers = ask(node.handle, ours.topic, False)
+    for qos in (peer["qos_profile"] for peer in peers if peer["topic_type"] == ours.plan.type_name):
+        yield OpenQos(
+            qos["reliability"],
+            qos["durability"],
+            qos["deadline"].nanoseconds,
+            qos["liveliness"],
+            qos["liveliness_lease_duration"].nanoseconds,
+        )
+
+
+def incompatible_policies(offered: OpenQos, requested: OpenQos) -> Iterator[str]:
+    """Those of QOS_POLICIES for which DDS does not match a publisher that offers with a subscriber that requests."""
+    if (offered.reliability, requested.reliability) == (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE):
+        yield "reliability"
+    if (offered.durability, requested.durability) == (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL):
+        yield "durability"
+    if offered.deadline > requested.deadline:
+        yield "deadline"
+    automatic_for_manual = LivelinessPolicy.AUTOMATIC, LivelinessPolicy.MANUAL_BY_TOPIC
+    if offered.lease > requested.lease or (offered.liveliness, requested.liveliness) == automatic_for_manual:
+        yield "liveliness"

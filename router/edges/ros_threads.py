@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
+from functools import partial
 
 from rclpy.event_handler import EventHandler
 from rclpy.node import Node
@@ -22,7 +23,8 @@ from router.edges.ros_wait import WaitSet
 Receive = Callable[[bytes, int], None]
 
 LOOK_INTERVAL_NS = 1_000_000_000
-"""How long something may go unnoticed that ends no wait: events of subscriptions, and a shutdown by somebody else."""
+"""How long something may go unnoticed that ends no wait: events of subscriptions, incompatible peers that have left,
+and a shutdown by somebody else."""
 
 TURN = 32
 """Messages of one topic that are served before others have their turn."""
@@ -57,12 +59,18 @@ class EventThread(_WaitThread):
     """
 
     def __init__(
-        self, node: Node, of_publishers: Sequence[EventHandler], of_subscriptions: Sequence[EventHandler]
+        self,
+        node: Node,
+        of_publishers: Sequence[EventHandler],
+        of_subscriptions: Sequence[EventHandler],
+        look: Callable[[], None],
     ) -> None:
+        """`look` is called once per second, after the callbacks."""
         self._waited_for = WaitSet(node, of_publishers)
         super().__init__("ros events", self._waited_for)
         self._looked_at = WaitSet(node, of_subscriptions)
         self._context = node.context
+        self._look = look
 
     def stop(self) -> None:
         super().stop()
@@ -80,13 +88,17 @@ class EventThread(_WaitThread):
                 look_at = now + LOOK_INTERVAL_NS
                 self._looked_at.wait(0)
                 self._serve(self._looked_at)
+                self._call(self._look)
 
     def _serve(self, wait_set: WaitSet) -> None:
         for event, status in wait_set.happened():
-            try:
-                event.callback(status)
-            except Exception as error:  # noqa: BLE001 told loudly; the next event matters as much
-                logger.critical("a fault in the router itself lost an event; please report it", exc_info=error)
+            self._call(partial(event.callback, status))
+
+    def _call(self, callback: Callable[[], None]) -> None:
+        try:
+            callback()
+        except Exception as error:  # noqa: BLE001 told loudly; the next event matters as much
+            logger.critical("a fault in the router itself lost an event; please report it", exc_info=error)
 
 
 class MessageThread(_WaitThread):

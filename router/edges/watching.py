@@ -1,16 +1,22 @@
-"""Looks whether files have changed, and tells when they have come to rest. Knows nothing of what is in them."""
+"""Looks whether files have changed, and when they have come to rest. Knows nothing of what is in them."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from time import sleep
 
-from router.compiler.program import Program
+from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.log import logger
+from router.errors import StartError
+from router.table.model import RouteTable
 
 PERIOD = 0.5
 """Seconds between two looks. A change is told when the second look finds it the same: editors write in pieces."""
+
+PATIENCE = 5.0
+"""Seconds for which a reload that was asked for waits for files that do not come to rest."""
 
 _Look = dict[Path, tuple[int, int, int]]
 
@@ -56,9 +62,30 @@ class Watcher:
             return None
 
 
-def watched_files(program: Program) -> list[Path]:
+def watched_files(table: RouteTable) -> list[Path]:
     """The table, what it extends, and everything beside its protos, files that are new there among them."""
-    return [*program.table.files, *program.table.envelope.protos.value.rglob("*")]
+    return [*table.files, *table.envelope.protos.value.rglob("*")]
+
+
+def wait_for_rest(files: Iterable[Path], until: int) -> bool:
+    """Waits for files that were written less than PERIOD ago, and returns whether there are any.
+
+    `until` is in ns of the monotonic clock. Raises StartError if they are still written then.
+    """
+    files = list(files)
+    seen = _look(files)
+    ages = [(wall_ns() - written) / 1e9 for written, _, _ in seen.values()]
+    young = [age for age in ages if 0 <= age < PERIOD]  # a time stamp of tomorrow says nothing
+    if not young:
+        return False
+    sleep(PERIOD - min(young))
+    while seen != (now := _look(files)):
+        if monotonic_ns() > until:
+            changing = ", ".join(sorted({str(path) for path, _ in seen.items() ^ now.items()}))
+            raise StartError(f"these files are still being written: {changing}")
+        seen = now
+        sleep(PERIOD)
+    return True
 
 
 def _look(files: Iterable[Path]) -> _Look:

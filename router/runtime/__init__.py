@@ -172,7 +172,7 @@ class Router:
     def _watch(self) -> None:
         """Watches the files of the table that runs, where it asks for that."""
         if self.program.table.reload_on_change and self._watcher is None:
-            self._watcher = Watcher(lambda: watched_files(self.program), self.reload)
+            self._watcher = Watcher(lambda: watched_files(self.program.table), self.reload)
         elif not self.program.table.reload_on_change:
             self._unwatch()
 

@@ -54,6 +54,18 @@ def changes(before: Program, after: Program) -> str:
     return ", ".join([*named, *([f"and {others} more"] if others > 0 else [])])
 
 
+def all_moved(now: RouteTable, then: RouteTable) -> list[str]:
+    """`sensor_board 127.0.0.30:8 -> 192.168.0.30:8` for each endpoint that both have, if none is where it was."""
+    both = [
+        (name, endpoint.address.value, then.endpoints[name].address.value)
+        for name, endpoint in now.endpoints.items()
+        if name in then.endpoints
+    ]
+    if any(before == after for _, before, after in both):
+        return []
+    return [f"{name} {before} -> {after}" for name, before, after in both]
+
+
 def _routes(table: RouteTable) -> Mapping[str, object]:
     return {route.name: route for route in table.routes}
 

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 
 from router.compiler import check_table
+from router.compiler.check import Checked
 from router.compiler.definitions import Definitions
 from router.compiler.program import Program
 from router.edges.background import background_threads
@@ -17,9 +18,10 @@ from router.edges.log import logger
 from router.edges.parking import StuckError
 from router.edges.running import ReloadResult
 from router.edges.supervision import reloading
+from router.edges.watching import PATIENCE, wait_for_rest, watched_files
 from router.errors import Diagnostic, Severity, StartError
 from router.runtime.accounts import Accounts
-from router.runtime.changes import changes, unchangeable
+from router.runtime.changes import all_moved, changes, unchangeable
 from router.runtime.edges import Edges
 from router.runtime.interpreter import beside_traffic
 
@@ -70,7 +72,7 @@ class Reloader:
         """As what it is counted, and what came of it."""
         findings: Sequence[Diagnostic] = ()
         try:
-            checked = check_table(now.table.path, self._environ, Definitions(now.protos))
+            checked = self._check(now)
             findings = checked.diagnostics
             then = checked.program_in(now.books.continued())
             if then is None:
@@ -79,6 +81,8 @@ class Reloader:
                 return "invalid", _refused([*findings, *refused])
             text = changes(now, then)
             self._edges.take_over(self._edges.prepare(then))
+            if moved := all_moved(now.table, then.table):
+                logger.warning("the reload has moved every endpoint to another address", endpoints=moved)
         except (StartError, StuckError) as error:
             why = str(error)
         except OSError as error:  # files come and go while they are read, and descriptors may be short
@@ -90,6 +94,15 @@ class Reloader:
             self._settle()
             return "ok", ReloadResult(True, tuple(findings), text)
         return "failed", ReloadResult(False, tuple(findings), why)
+
+    def _check(self, now: Program) -> Checked:
+        """The table, once no file of it is being written. Raises StartError if that takes too long, or OSError."""
+        until = monotonic_ns() + round(PATIENCE * 1e9)
+        wait_for_rest(watched_files(now.table), until)
+        while True:
+            checked = check_table(now.table.path, self._environ, Definitions(now.protos))
+            if checked.table is None or not wait_for_rest(watched_files(checked.table), until):
+                return checked  # else it was read while it was written, or names other files than before
 
     def _settle(self) -> None:
         try:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
+from router.edges.ros_environment import check_environment
 from router.errors import SourceSpan, StartError
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ def wants_ros(program: Program) -> bool:
 
 def open_ros(program: Program, ros_args: Sequence[str], incompatible: Callable[[str, str, int], None]) -> RosEdge:
     """A node without any topic. Raises StartError."""
+    check_environment(os.environ)
     try:
         from router.edges.ros import RosEdge
     except ImportError as error:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from router.compiler.program import Program
 from router.edges.recorder_directory import kept_bytes
+from router.edges.ros_environment import SHM
 from router.tools.doctor_report import Finding, fine, problem, warning
 
 RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
-SHM = Path("/dev/shm")  # noqa: S108 - the place where Linux has shared memory, and nothing is written there
 
 _BUILT = datetime(2025, 1, 1, tzinfo=timezone.utc)
 """A clock that says less was never set."""

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 
 from router.compiler.program import Program
+from router.edges.ros_environment import obstacles
 from router.errors import StartError
 from router.tools.doctor_report import Finding, fine, problem
 
@@ -15,6 +16,10 @@ _INSTALL = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy
 def ros(program: Program) -> Iterator[Finding]:
     plans = (*program.publishers, *program.subscriptions)
     if not plans and not program.gateways:
+        return
+    found = [problem("ROS", what, remedy) for what, remedy in obstacles(os.environ)]
+    yield from found
+    if found:  # to load it would end this process
         return
     try:
         from router.edges.ros_installation import middleware, usable_class

@@ -31,5 +31,6 @@ def test_a_peer_that_cannot_be_served_is_told_and_counted(
     assert rover.site.samples()[series] == 0
     with closing(kind(topic, {**TOPICS, **TOPICS_FROM_ROS}[topic], *options)):
         wait_until(lambda: rover.site.samples()[series] == 1, "the event")
+    wait_until(lambda: rover.site.samples()[series] == 0, "the peer to have gone")
     lines = [line for line in rover.router.log() if (line.get("topic"), line.get("policy")) == (topic, policy)]
     assert [line["level"] for line in lines] == ["warning"]

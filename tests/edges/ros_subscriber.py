@@ -28,7 +28,7 @@ class Subscriber(RosProcess):
         super().__init__(__file__, topic, type_name, *options)
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], object]) -> None:
     deadline = monotonic() + 20
     while not condition():
         assert monotonic() < deadline, "it never happened"
@@ -40,11 +40,12 @@ def main() -> None:
     parser.add_argument("topic")
     parser.add_argument("type")
     parser.add_argument("--transient-local", action="store_true")
+    parser.add_argument("--best-effort", action="store_true")
     arguments = parser.parse_args()
     lines = own_stdout()
     qos = QoSProfile(
         depth=100,
-        reliability=ReliabilityPolicy.RELIABLE,
+        reliability=ReliabilityPolicy.BEST_EFFORT if arguments.best_effort else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if arguments.transient_local else DurabilityPolicy.VOLATILE,
     )
     rclpy.init(args=[])

@@ -7,21 +7,27 @@ import signal
 import subprocess
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
+from pathlib import Path
 from time import monotonic, sleep
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from rclpy.duration import Duration
+from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from structlog.testing import capture_logs
 
 from router.compiler.program import QosPlan, TopicPlan
 from router.edges.ros import RosEdge
+from router.edges.ros_qos import OpenQos, incompatible_policies
 from router.errors import StartError
 from router.types.ros import definition, ros_interfaces
-from tests.edges.ros_opening import HELLO, RELIABLE, open_ros, string_topic
+from tests.edges.ros_opening import HELLO, RELIABLE, SPAN, STRING, open_ros, string_topic
+from tests.edges.ros_publisher import Publisher
 from tests.edges.ros_subscriber import Subscriber, wait_until
 
 
@@ -65,6 +71,114 @@ def test_a_subscriber_with_incompatible_qos_is_warned_about(subscribe: Callable[
     assert logged[0]["topic"] == "greeting"
     assert logged[0]["policy"] == "reliability"
     assert logged[0]["log_level"] == "warning"
+
+
+BEST_EFFORT = QosPlan("best_effort", "volatile", "keep_last", 5)
+
+
+class Apart(dict[tuple[str, str], int]):
+    """The last number that was reported for each topic and policy."""
+
+    def __call__(self, topic: str, policy: str, peers: int) -> None:
+        self[topic, policy] = peers
+
+    def wait_for(self, *policies: str, topic: str = "greeting") -> None:
+        """`policies`: one for each peer that it keeps away; no others are."""
+        wanted = Counter(policies)
+        wait_until(lambda: self and +Counter({p: n for (t, p), n in self.items() if t == topic}) == wanted)
+
+
+def test_peers_are_counted_by_policy_until_they_have_gone(subscribe: Callable[..., Subscriber]) -> None:
+    apart = Apart()
+    with closing(open_ros(string_topic(BEST_EFFORT), incompatible=apart)) as ros:
+        one = subscribe("greeting", STRING)
+        both = subscribe("greeting", STRING, "--transient-local")
+        apart.wait_for("reliability", "reliability", "durability")
+        both.close()
+        apart.wait_for("reliability")
+        one.close()
+        apart.wait_for()
+        subscribe("greeting", STRING, "--best-effort")  # it comes back as it should be
+        wait_until(lambda: ros.wanted["greeting"][0])
+        apart.wait_for()
+        subscribe("greeting", STRING)
+        apart.wait_for("reliability")
+
+
+def test_publishers_that_are_not_heard_are_counted_until_they_have_gone() -> None:
+    apart = Apart()
+    hearing = string_topic(QosPlan("reliable", "transient_local", "keep_last", 5))
+    with closing(open_ros(subscriptions=[hearing], args=("--ros-args", "-r", "greeting:=salute"), incompatible=apart)):
+        with closing(Publisher("salute", STRING, "--best-effort")), closing(Publisher("salute", STRING)):
+            apart.wait_for("reliability", "durability", "durability")
+        apart.wait_for()
+
+
+SHORT_LEASE = """\
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <participant profile_name="short" is_default_profile="true"><rtps><builtin><discovery_config>
+    <leaseDuration><sec>2</sec></leaseDuration>
+    <leaseAnnouncement><nanosec>500000000</nanosec></leaseAnnouncement>
+  </discovery_config></builtin></rtps></participant>
+</profiles>
+"""
+
+
+def test_a_peer_that_was_killed_counts_until_its_lease_is_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "short.xml").write_text(SHORT_LEASE)  # 20 s without it
+    apart = Apart()
+    with closing(open_ros(string_topic(BEST_EFFORT), incompatible=apart)):
+        with monkeypatch.context() as child:
+            child.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(tmp_path / "short.xml"))
+            peer = Subscriber("greeting", STRING)
+        apart.wait_for("reliability")
+        peer.kill()
+        apart.wait_for()
+
+
+def test_two_of_our_own_that_do_not_go_together_are_counted() -> None:
+    apart = Apart()
+    with closing(
+        open_ros(string_topic(BEST_EFFORT), subscriptions=[string_topic(RELIABLE)], incompatible=apart)
+    ) as ros:
+        apart.wait_for("reliability", "reliability")
+        ros.start({"greeting": lambda *_: None}, failed=lambda _: None)
+        change = ros.prepare([string_topic(RELIABLE)], [string_topic(RELIABLE)], {"greeting": SPAN})
+        with ros.paused():
+            ros.apply(change, {"greeting": lambda *_: None})
+        ros.finish(change)
+        apart.wait_for()
+
+
+@pytest.mark.parametrize("reliability", ["best_effort", "reliable", "system_default"])
+@pytest.mark.parametrize("durability", ["volatile", "transient_local", "system_default"])
+@pytest.mark.parametrize("deadline", [None, 1_000_000_000])
+@pytest.mark.parametrize("liveliness", [("automatic", None), ("automatic", 1_000_000), ("manual_by_topic", None)])
+def test_policies_keep_apart_as_rclpy_says(
+    reliability: str, durability: str, deadline: int | None, liveliness: tuple[str, int | None]
+) -> None:
+    def plan(reliability: str, durability: str, deadline: int | None, kind: str, lease: int | None) -> QosPlan:
+        return QosPlan(reliability, durability, "keep_last", 5, deadline, None, kind, lease)
+
+    asked = plan("reliable", "transient_local", 500_000_000, "manual_by_topic", 1_000_000)
+    offered = plan(reliability, durability, deadline, *liveliness)
+    with closing(open_ros(string_topic(offered), subscriptions=[string_topic(asked)])) as ros:
+        ours, theirs = ros._publications["greeting"].qos, ros._subscriptions["greeting"].qos
+    assert ReliabilityPolicy.SYSTEM_DEFAULT not in (ours.reliability, ours.durability)  # but what the middleware took
+    policies = set(incompatible_policies(ours, theirs))
+    verdict, why = qos_check_compatible(_profile(ours), _profile(theirs))
+    assert bool(policies) == (verdict == QoSCompatibility.ERROR), why
+
+
+def _profile(qos: OpenQos) -> QoSProfile:
+    return QoSProfile(
+        depth=1,
+        reliability=qos.reliability,
+        durability=qos.durability,
+        deadline=Duration(nanoseconds=qos.deadline),
+        liveliness=qos.liveliness,
+        liveliness_lease_duration=Duration(nanoseconds=qos.lease),
+    )
 
 
 def test_a_fault_in_counting_an_event_is_told_and_costs_that_event_alone(subscribe: Callable[..., Subscriber]) -> None:

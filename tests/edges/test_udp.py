@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import queue
+import resource
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -197,6 +198,28 @@ def test_what_comes_thick_is_looked_at_seldom(
     assert receiving.all_received() == sent
     assert max(taken for taken, _ in rests) > 1
     assert 0 < max(rest for _, rest in rests) <= COALESCE / 1e9
+
+
+def test_a_listener_may_come_when_more_than_a_thousand_descriptors_are_open(
+    stack: ExitStack, peer: socket.socket, rests: list[tuple[int, float]]
+) -> None:
+    """As many clients have them: `select` takes none above 1023."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+    early = listen(stack, "early")
+    receiving = Receiving([early])
+    receiving.thread.start()
+    while stack.enter_context(socket.socket()).fileno() <= 1024:
+        continue
+    late = listen(stack, "late")
+    both = {listener.name: receiving._into_queue(listener.name) for listener in (early, late)}
+    receiving.thread.between(lambda: receiving.thread.serve([early, late], both))
+    sent = pour(peer, late, 6000, 3000)
+    receiving.thread.stop()
+    assert receiving.failures.empty()
+    assert receiving.all_received() == sent
+    assert max(taken for taken, _ in rests) > 1
 
 
 @pytest.mark.parametrize("others", [0, 1])

@@ -1,0 +1,84 @@
+"""What in this process's environment keeps ROS 2 from being loaded. Imports nothing of ROS: that could end the process.
+
+A full /dev/shm is a SIGBUS without a word, an unknown middleware an exit with 102, a domain above 232 one with 1.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from router.errors import StartError
+
+LAST_DOMAIN = 232
+"""DDS makes port numbers of domains, and has none left for a higher one."""
+
+SHM = Path("/dev/shm")  # noqa: S108 - the place where Linux has shared memory, and nothing is written there
+_TRACING = 8 << 10
+"""Bytes there that the tracing library of ROS writes to while it is loaded."""
+_FAST_DDS = 1 << 20
+"""Bytes there for a participant's segment and ports: 652 KiB, in full pages. With less, messages are lost silently."""
+
+ADDRESS_SPACE = 1 << 30
+"""Bytes that a router with a few topics maps, of which it uses a tenth; without ROS a fifth of that is enough."""
+
+
+def check_environment(environ: Mapping[str, str]) -> None:
+    """Raises StartError for what would end the process when ROS is imported or a node is opened."""
+    for what, remedy in obstacles(environ):
+        raise StartError(f"{what}; {remedy}")
+
+
+def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str, str]]:
+    """What keeps ROS from being loaded here, and what to do about each."""
+    domain = environ.get("ROS_DOMAIN_ID") or "0"
+    if not re.fullmatch("[0-9]{1,9}", domain) or int(domain) > LAST_DOMAIN:
+        yield f"ROS_DOMAIN_ID is '{domain}'", f"set it to a number from 0 to {LAST_DOMAIN}"
+    middleware, installed = environ.get("RMW_IMPLEMENTATION"), _middlewares(environ)
+    if middleware and installed and middleware not in installed:
+        remedy = f"unset it, or set it to one that is installed: {', '.join(sorted(installed))}"
+        yield f"RMW_IMPLEMENTATION is '{middleware}', which is not installed here", remedy
+    limit = address_space()
+    if limit is not None and limit < ADDRESS_SPACE:
+        what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), and ROS 2 needs {ADDRESS_SPACE >> 20}"
+        yield what, "start it with `ulimit -v unlimited`; to bound what it uses take systemd's MemoryMax"
+    needed, free = shared_memory(environ, shm)
+    if free < needed:
+        remedy = "remove what nobody uses there (`fastdds shm clean`), or make it larger"
+        if needed > _TRACING:
+            remedy += "; with FASTDDS_BUILTIN_TRANSPORTS=UDPv4, ROS needs almost nothing there"
+        yield f"{shm} has {free >> 10} KiB free, and ROS 2 needs {needed >> 10}", remedy
+
+
+def shared_memory(environ: Mapping[str, str], folder: Path = SHM) -> tuple[int, int]:
+    """Bytes of shared memory that ROS needs in `folder`, and those that are free there."""
+    needed = _TRACING + (_FAST_DDS if uses_shared_memory(environ) else 0)
+    try:
+        room = os.statvfs(folder)
+    except OSError:  # then there is no shared memory, and ROS does without
+        return 0, 0
+    return needed, room.f_bavail * room.f_frsize
+
+
+def uses_shared_memory(environ: Mapping[str, str]) -> bool:
+    """Whether Fast DDS opens its shared memory transport, as it does unless it is told something else."""
+    transports = environ.get("FASTDDS_BUILTIN_TRANSPORTS") or "DEFAULT"
+    is_fast_dds = (environ.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
+    return is_fast_dds and not transports.startswith(("UDP", "TCP", "NONE"))
+
+
+def address_space() -> int | None:
+    """Bytes that this process may map (`ulimit -v`), or None."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def _middlewares(environ: Mapping[str, str]) -> set[str]:
+    """Those that the sourced workspaces and this Python have registered; none where nothing is registered."""
+    prefixes = [*filter(None, environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    folders = [Path(prefix, "share", "ament_index", "resource_index", "rmw_typesupport") for prefix in prefixes]
+    return {each.name for folder in folders for each in folder.glob("*")} - {"rmw_implementation"}
