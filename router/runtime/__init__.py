@@ -92,7 +92,7 @@ class Router:
         logger.info(
             "router started",
             table=str(program.table.path),
-            listening={name: str(listener.address) for name, listener in self.listeners.items()},
+            listening={name: listener.bound_to for name, listener in self.listeners.items()},
             routes=sum(not route.ignore for route in program.table.routes),
             destinations=len(program.senders),
             published=len(program.publishers),

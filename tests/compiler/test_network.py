@@ -87,6 +87,6 @@ def test_senders_are_recognised_by_host_or_by_host_and_port(check_text: CheckTex
         " twin_a: {address: 127.0.0.4:8, kind: tool}, twin_b: {address: 127.0.0.4:9, kind: tool}}",
     )
     assert checked.table is not None
-    by_host, by_address = recognisers(checked.table.endpoints)
+    by_host, by_address = recognisers(checked.table.endpoints, None)
     assert by_host == {"127.0.0.2": "alone"}
     assert by_address == {("127.0.0.3", 81): "first", ("127.0.0.3", 82): "second"}

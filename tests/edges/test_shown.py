@@ -54,4 +54,4 @@ def test_zeros_are_repaired_where_the_listener_does_that(tmp_path: Path) -> None
 
 def test_senders_are_called_what_the_table_calls_them() -> None:
     peers = [("127.0.0.30", 25008), ("127.0.0.10", 1), ("10.9.9.9", 1)]
-    assert [KNOWN.sender(peer) for peer in peers] == ["sensor_board", "basestation", ""]
+    assert [KNOWN.sender("rover", peer) for peer in peers] == ["sensor_board", "basestation", ""]

@@ -184,10 +184,11 @@ def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.Monk
     address = Address(*held.getsockname())
     ours = Inherited([held.dup(), stream.dup()])
     assert len(ours.unclaimed()) == 2
-    stack.enter_context(ours.take(address) or pytest.fail("it is there"))
+    stack.enter_context(ours.take(str(address)) or pytest.fail("it is there"))
     [left] = ours.unclaimed()
     assert left.endswith("which is no IPv4 UDP socket")
-    assert ours.take(address._replace(port=1)) is None
+    assert ours.take(str(address._replace(port=1))) is None
+    assert ours.take(f"{address} on lo") is None
 
 
 def test_what_is_meant_for_another_process_is_left_alone() -> None:
