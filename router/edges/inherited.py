@@ -10,6 +10,7 @@ import socket
 from collections.abc import Iterable, MutableMapping
 from functools import cache
 
+from router.edges.udp_kernel import bound_interface
 from router.table.model import Address, bound_to
 
 FIRST = 3
@@ -17,9 +18,6 @@ FIRST = 3
 
 SO_TIMESTAMPNS = 35
 """Of Linux, where the socket module does not name it."""
-
-
-IFNAMSIZ = 16
 
 
 class Inherited:
@@ -35,7 +33,7 @@ class Inherited:
         What is in it has the time at which the kernel got it, if the socket was told to keep that (Timestamping=ns).
         """
         held = self._sockets.get(bound)
-        if held is None:
+        if held is None or _bound_to(held) != bound:  # its interface may have gone meanwhile
             return None
         self._taken.add(bound)
         # Stamps then go with each datagram instead, where nobody looks; that the kernel makes them remains.
@@ -68,12 +66,6 @@ def _descriptors(environment: MutableMapping[str, str]) -> list[int]:
 
 def _bound_to(held: socket.socket) -> str:
     if (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM):
-        return bound_to(Address(*held.getsockname()), _interface(held))
+        interface = bound_interface(held)
+        return bound_to(Address(*held.getsockname()), "an interface that has gone" if interface is None else interface)
     return f"{held.getsockname()}, which is no IPv4 UDP socket"
-
-
-def _interface(held: socket.socket) -> str | None:
-    try:
-        return held.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, IFNAMSIZ).rstrip(b"\0").decode() or None
-    except OSError:  # it has gone since the socket was bound, and with it all that the socket could receive
-        return "an interface that has gone"

@@ -15,7 +15,7 @@ from router.compiler.program import ListenerPlan, SenderPlan
 from router.edges.inherited import inherited
 from router.edges.log import logger
 from router.edges.port_holder import port_taken
-from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops, receive_buffer
+from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, bound_interface, drops, receive_buffer
 from router.errors import SourceSpan, StartError
 from router.table.model import Address, bound_to
 
@@ -62,6 +62,14 @@ class Listener:
     def coalesce(self) -> int:
         """The longest rest, in ns."""
         return self._plan.coalesce
+
+    @property
+    def interface(self) -> str | None:
+        return self._plan.interface
+
+    def has_lost_interface(self) -> bool:
+        """Whether its network interface has gone. It receives nothing then, nor by a later one of the same name."""
+        return self._plan.interface is not None and bound_interface(self.socket) is None
 
     def follow(self, plan: ListenerPlan) -> None:
         """Is what another table calls and wants of the same address and interface."""

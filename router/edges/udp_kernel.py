@@ -18,6 +18,7 @@ SIOCGSTAMPNS = 0x8907
 SIOCGIFFLAGS = 0x8913
 SIOCGIFADDR = 0x8915
 IFF_UP = 0x1
+IFNAMSIZ = 16
 _IFREQ = struct.Struct("16s24s")
 _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
@@ -65,6 +66,14 @@ def receive_buffer(opened: socket.socket) -> int:
     """Its size in bytes, as it is asked for."""
     # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
+def bound_interface(opened: socket.socket) -> str | None:
+    """The network interface that a socket is bound to, empty for none; None where that interface has gone."""
+    try:
+        return opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, IFNAMSIZ).rstrip(b"\0").decode()
+    except OSError:
+        return None
 
 
 def interface_is_up(name: str) -> bool | None:

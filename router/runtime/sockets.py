@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from router.compiler.program import Program
 from router.edges.udp import Listener, Sender
+from router.edges.udp_kernel import interface_is_up
 from router.runtime.accounts import KernelDrops
 from router.table.model import Address
 
@@ -25,6 +26,11 @@ class SocketChange:
     left: ExitStack = field(default_factory=ExitStack)
 
 
+def is_replaceable(listener: Listener) -> bool:
+    """Whether its network interface has gone, and another one of the same name is there."""
+    return listener.has_lost_interface() and interface_is_up(listener.interface or "") is not None
+
+
 class Sockets:
     """Listeners by name, and senders by endpoint. Nothing is open before the first change."""
 
@@ -40,7 +46,8 @@ class Sockets:
         with ExitStack() as opening:
             listeners = {}
             for plan in program.listeners:
-                if (listener := self._bound.get(plan.bound_to)) is None:
+                listener = self._bound.get(plan.bound_to)
+                if listener is None or is_replaceable(listener):
                     listener = Listener(plan, table.listeners[plan.name].address.span)
                     opening.callback(listener.close)
                 listeners[plan.name] = listener

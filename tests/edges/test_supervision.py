@@ -178,6 +178,19 @@ def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listene
     assert held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
 
 
+def test_a_socket_is_taken_for_its_interface_only(stack: ExitStack) -> None:
+    bound = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+    bound.bind(("127.0.0.1", 0))
+    address = Address(*bound.getsockname())
+    ours = Inherited([bound.dup()])
+    assert ours.take(str(address)) is None
+    assert ours.take(f"{address} on eth0") is None
+    assert ours.unclaimed() == [f"{address} on lo"]
+    stack.enter_context(ours.take(f"{address} on lo") or pytest.fail("it is there"))
+    assert ours.unclaimed() == []
+
+
 def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
     stream = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
     stream.bind(("127.0.0.1", 0))
