@@ -6,18 +6,25 @@ Each is a network namespace of its own, with interfaces as on real computers.
 from __future__ import annotations
 
 import signal
-import socket
-import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from tests.acceptance.payloads import WIRE
-from tests.acceptance.site import ROOT, RouterProcess, key, wait_until
-from tests.namespaces import Computer, cable, computers
+from tests.acceptance.site import ROOT, RouterProcess, wait_until
+from tests.acceptance.two_networks import (
+    BASESTATION,
+    BOARD,
+    DRIVE,
+    LAN,
+    RADIO,
+    Rover,
+    attacker,
+    rover_with_networks,
+)
+from tests.namespaces import Computer, cable
 
 TABLE = """\
 version: 1
@@ -40,93 +47,20 @@ routes:
   arm_diag: {{source: anywhere, destinations: [basestation]}}
   imu_info: {{source: any, destinations: [basestation]}}
 """
-BASESTATION, BOARD = ("10.78.2.10", 9000), ("10.78.1.222", 8)
-LAN, RADIO = ("10.78.1.1", 5000), ("10.78.2.1", 5000)
-DRIVE = WIRE.encode(WIRE.case("manual_drive"), WIRE.case("manual_drive").message_class())
 DIAG = WIRE.encode(WIRE.case("drive_diag"), WIRE.case("drive_diag").message_class())
 ARM = WIRE.encode(WIRE.case("arm_diag"), WIRE.case("arm_diag").message_class())
-BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
 IMU = WIRE.encode(WIRE.case("imu_info"), WIRE.case("imu_info").message_class())
-
-
-@dataclass
-class Rover:
-    """The rover and its two networks; `board` and `basestation` are sockets there."""
-
-    folder: Path
-    rover: Computer
-    lan: Computer
-    radio: Computer
-    board: socket.socket
-    basestation: socket.socket
-
-    def table(self, text: str = TABLE) -> Path:
-        path = self.folder / "table.yaml"
-        path.write_text(text.format(root=ROOT))
-        return path
-
-    @contextmanager
-    def router(self, text: str = TABLE) -> Iterator[RouterProcess]:
-        path = self.table(text)
-        with self.rover.inside(lambda: RouterProcess(self.folder, path)) as router:
-            yield router
-
-    def samples(self) -> dict[str, float]:
-        def ask() -> str:
-            with urllib.request.urlopen("http://127.0.0.1:9108/metrics", timeout=5) as answer:
-                return str(answer.read().decode())
-
-        lines = (line.rpartition(" ") for line in self.rover.inside(ask).splitlines() if line.startswith("router_"))
-        return {name[len("router_") :]: float(value) for name, _, value in lines}
-
-    def board_gets(self) -> list[bytes]:
-        """What reached the board and was not looked at yet, but for what deadmen say to it."""
-        found = []
-        self.board.settimeout(0.2)
-        with suppress(TimeoutError):
-            while True:
-                found.append(self.board.recv(1000))
-        return [datagram for datagram in found if datagram != BRAKE]
-
-    def count(self, metric: str, **labels: str) -> float:
-        return self.samples()[key(metric, **labels)]
-
-    def mismatches(self, listener: str) -> float:
-        return self.count("datagrams_rejected_total", listener=listener, reason="source_mismatch")
-
-    def seen(self, endpoint: str) -> bool:
-        return self.count("endpoint_last_seen_timestamp_seconds", endpoint=endpoint) > 0
-
-
-def udp(computer: Computer, address: tuple[str, int]) -> socket.socket:
-    opened = computer.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    opened.bind(address)
-    opened.settimeout(5)
-    return opened
 
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Rover]:
-    with computers("rover", "lan", "radio") as (rover, lan, radio), ExitStack() as stack:
-        cable(rover, "lan0", "10.78.1.1/24", lan, "eth0", "10.78.1.222/24")
-        cable(rover, "radio0", "10.78.2.1/24", radio, "eth0", "10.78.2.10/24")
-        lan.ip("address", "add", "10.78.1.60/24", "dev", "eth0")
-        board = stack.enter_context(udp(lan, BOARD))
-        basestation = stack.enter_context(udp(radio, BASESTATION))
-        yield Rover(tmp_path, rover, lan, radio, board, basestation)
-
-
-def attacker(site: Rover, stack: ExitStack, computer: Computer, address: tuple[str, int]) -> socket.socket:
-    """A socket with somebody else's address, in a network where that one is not."""
-    computer.ip("address", "add", f"{address[0]}/32", "dev", "eth0")
-    computer.ip("route", "replace", "10.78.0.0/16", "dev", "eth0")
-    # Or the router's answers, and its own ARP, would tell the two apart.
-    return stack.enter_context(udp(computer, (address[0], 0)))
+    with rover_with_networks(tmp_path) as found:
+        yield found
 
 
 def test_a_command_is_believed_by_its_listener_only(site: Rover) -> None:
     """The basestation's drives. A forged one from the LAN does not, whichever of the rover's addresses it goes to."""
-    with site.router() as router, ExitStack() as stack:
+    with site.router(TABLE) as router, ExitStack() as stack:
         forger = attacker(site, stack, site.lan, BASESTATION)
         forger.sendto(DRIVE, LAN)
         site.lan.ip("route", "replace", "10.78.2.1", "via", "10.78.1.1", "dev", "eth0", "onlink")
@@ -145,7 +79,7 @@ def test_a_command_is_believed_by_its_listener_only(site: Rover) -> None:
 
 
 def test_a_board_is_not_played_from_the_radio_either(site: Rover) -> None:
-    with site.router(), ExitStack() as stack:
+    with site.router(TABLE), ExitStack() as stack:
         forger = attacker(site, stack, site.radio, BOARD)
         site.rover.ip("neighbour", "replace", "10.78.2.10", "lladdr", mac(site.radio), "dev", "radio0")
         forger.sendto(DIAG, RADIO)
@@ -157,7 +91,7 @@ def test_a_board_is_not_played_from_the_radio_either(site: Rover) -> None:
 
 def test_without_a_listener_an_endpoint_is_believed_by_all_and_any_takes_whatever_comes(site: Rover) -> None:
     """A datagram from an endpoint's address by another listener is a stranger's: routes from `any` take it as such."""
-    with site.router(), ExitStack() as stack:
+    with site.router(TABLE), ExitStack() as stack:
         tool = attacker(site, stack, site.radio, ("10.78.1.60", 0))
         tool.sendto(ARM, RADIO)
         assert site.basestation.recv(1000) == ARM
@@ -169,7 +103,7 @@ def test_without_a_listener_an_endpoint_is_believed_by_all_and_any_takes_whateve
 
 
 def test_forged_commands_do_not_keep_a_deadman_from_tripping(site: Rover) -> None:
-    with site.router(), ExitStack() as stack:
+    with site.router(TABLE), ExitStack() as stack:
         forger = attacker(site, stack, site.lan, BASESTATION)
         site.basestation.sendto(DRIVE, RADIO)
 
@@ -183,7 +117,7 @@ def test_forged_commands_do_not_keep_a_deadman_from_tripping(site: Rover) -> Non
 
 def test_verbs_reach_a_listener_by_the_address_of_its_interface(site: Rover) -> None:
     """`router send`, and so `replay`; `doctor` finds nothing wrong with the interfaces."""
-    with site.router():
+    with site.router(TABLE):
         router = ROOT / ".venv/bin/python", "-m", "router"
         table = site.folder / "table.yaml"
         for listener in ("lan", "radio"):
@@ -212,7 +146,7 @@ def test_an_interface_that_is_not_there_ends_the_start_with_what_to_do(site: Rov
 
 def test_a_listener_on_another_interface_is_another_listener(site: Rover) -> None:
     """Reloaded, the two change places."""
-    with site.router() as router:
+    with site.router(TABLE) as router:
         swapped = TABLE.replace("lan0", "other").replace("radio0", "lan0").replace("other", "radio0")
         site.table(swapped)
         router.process.send_signal(signal.SIGHUP)
@@ -228,7 +162,7 @@ def test_a_listener_on_another_interface_is_another_listener(site: Rover) -> Non
 
 def test_an_interface_that_goes_and_comes_back_is_heard_again(site: Rover) -> None:
     """As a tunnel that is restarted, or an adapter that is plugged in again: it has the name, and is another one."""
-    with site.router() as router:
+    with site.router(TABLE) as router:
         site.rover.ip("link", "del", "radio0")
         wait_until(lambda: bool(router.events("a network interface has gone: nothing comes in by it")), "the loss")
         cable(site.rover, "radio0", "10.78.2.1/24", site.radio, "eth0", "10.78.2.10/24")
