@@ -77,6 +77,7 @@ if [ ! -e "$settings" ]; then
 # listeners, run deploy/install-service.sh again.
 ROUTER_TABLE=$root/routes/rover.yaml
 ROS_DOMAIN_ID=0
+#ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
 #BASESTATION=192.168.0.10:9000
 END
 fi

@@ -15,7 +15,7 @@ from router.errors import Severity, shown_path
 from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
 from router.tools.doctor_network import endpoints, interfaces, ports
 from router.tools.doctor_report import Finding, fine, problem, warning
-from router.tools.doctor_ros import ros
+from router.tools.doctor_ros import open_domain, ros
 from router.tools.doctor_running import Health, health
 
 
@@ -37,6 +37,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
     if running is None:
         yield from recordings(program)
     yield from shared_memory(variables)
+    yield from open_domain(program, variables)
     yield from clock()
     yield from endpoints(program)
     yield from _running(program, running)

@@ -17,11 +17,12 @@ import pytest
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.tools import doctor_host, doctor_network
+from router.tools import doctor_host, doctor_network, doctor_ros
 from router.tools.doctor import before_start, examine
 from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
 from router.tools.doctor_network import endpoints, interfaces, ports
 from router.tools.doctor_report import Finding, Grade
+from router.tools.doctor_ros import open_domain
 from router.tools.doctor_running import health
 from tests.ports import free_port
 
@@ -105,6 +106,34 @@ def test_an_address_that_no_interface_has_is_told(table: Path) -> None:
     table.write_text(table.read_text().replace('address: "127.0.0.1:', 'address: "192.0.2.1:'))
     [found] = ports(compiled(table), running=False)
     assert (found.grade, "no interface of this computer has 192.0.2.1" in found.text) == (Grade.PROBLEM, True)
+
+
+@pytest.mark.parametrize(
+    ("variables", "networks", "warned"),
+    [
+        ({}, ["lo", "eth0", "wlan0"], "by eth0, wlan0"),
+        ({"ROS_DOMAIN_ID": "0", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, ["lo", "eth0"], "by eth0"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, ["lo", "eth0"], None),
+        ({"ROS_DOMAIN_ID": "42"}, ["lo", "eth0"], None),
+        ({}, ["lo"], None),
+    ],
+)
+def test_an_open_ros_domain_is_a_warning(
+    table: Path, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], networks: list[str], warned: str | None
+) -> None:
+    monkeypatch.setattr(socket, "if_nameindex", lambda: list(enumerate(networks, 1)))
+    monkeypatch.setattr(doctor_ros, "interface_is_up", lambda _: True)
+    assert list(open_domain(compiled(table), variables)) == []  # without topics
+    table.write_text(
+        table.read_text().replace(
+            "ph_info: {source: sensor_board, destinations: [basestation]}",
+            "ph_info: {source: sensor_board, topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, fields: auto}]}",
+        )
+    )
+    found = list(open_domain(compiled(table), variables))
+    assert [(each.grade, each.text.partition("looked for ")[2]) for each in found] == (
+        [(Grade.WARNING, warned)] if warned else []
+    )
 
 
 def on_interface(table: Path, name: str) -> Program:
