@@ -76,7 +76,7 @@ class Reloader:
                 return
             try:
                 self._edges.take_over(self._edges.prepare(wiring.program))
-            except (StartError, StuckError) as error:  # tried again
+            except (StartError, StuckError, OSError) as error:  # tried again
                 logger.warning("a listener cannot be opened on its network interface", why=str(error))
             else:
                 logger.info("network interfaces are back", listeners=[each.name for each in replaceable])

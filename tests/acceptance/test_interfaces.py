@@ -78,6 +78,16 @@ def test_a_command_is_believed_by_its_listener_only(site: Rover) -> None:
         }
 
 
+def test_the_kernels_reverse_path_filter_drops_it_before_that(site: Rover) -> None:
+    site.rover.run("sysctl", "-qw", "net.ipv4.conf.all.rp_filter=1")
+    with site.router(TABLE), ExitStack() as stack:
+        forger = attacker(site, stack, site.lan, BASESTATION)
+        forger.sendto(DRIVE, LAN)
+        site.board.sendto(DIAG, LAN)
+        assert site.basestation.recv(1000) == DIAG
+        assert site.count("datagrams_received_total", listener="lan") == 1
+
+
 def test_a_board_is_not_played_from_the_radio_either(site: Rover) -> None:
     with site.router(TABLE), ExitStack() as stack:
         forger = attacker(site, stack, site.radio, BOARD)
