@@ -133,6 +133,6 @@ install -m 644 "$new"/* "$units"
 systemctl daemon-reload
 if [ $same_sockets = no ]; then systemctl stop rover-router.service "${sockets[@]}"; fi
 systemctl enable --quiet "${sockets[@]}" rover-router.service
-systemctl start "${sockets[@]}"
+[ ${#sockets[@]} = 0 ] || systemctl start "${sockets[@]}"
 systemctl restart rover-router.service || die "it did not start; see: journalctl -u rover-router -e"
 echo "install-service: rover-router is running; see: systemctl status rover-router, journalctl -u rover-router -f"

@@ -6,12 +6,14 @@ Each is a network namespace of its own, with interfaces as on real computers.
 from __future__ import annotations
 
 import signal
+import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from router.edges.inherited import Inherited
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.site import ROOT, RouterProcess, wait_until
 from tests.acceptance.two_networks import (
@@ -168,6 +170,21 @@ def test_a_listener_on_another_interface_is_another_listener(site: Rover) -> Non
         wait_until(lambda: len(router.events("table reloaded")) == 2, "the second reload")
         site.basestation.sendto(DRIVE, RADIO)
         wait_until(lambda: site.board_gets() == [DRIVE], "the command")
+
+
+def test_a_socket_that_was_handed_over_is_not_taken_when_its_interface_has_gone(site: Rover) -> None:
+    def bound() -> socket.socket:
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"radio0")
+        opened.bind(("0.0.0.0", 5000))
+        return opened
+
+    with site.rover.inside(bound) as held:
+        ours = Inherited([held.dup()])
+        with ours.take("0.0.0.0:5000 on radio0") or pytest.fail("it is there"):
+            pass
+        site.rover.ip("link", "del", "radio0")
+        assert ours.take("0.0.0.0:5000 on radio0") is None
 
 
 def test_an_interface_that_goes_and_comes_back_is_heard_again(site: Rover) -> None:
