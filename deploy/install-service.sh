@@ -2,10 +2,11 @@
 # Installs the router of this checkout as a systemd service, and starts it. `make install-service` calls it, as root.
 #
 #   deploy/install-service.sh [TABLE]     the table is routes/rover.yaml unless said; run it again after changing
-#                                         the addresses of its listeners, its `record.directory`, or the checkout's place
+#                                         address or interface of its listeners, its `record.directory`, or the
+#                                         checkout's place
 #
 # It writes rover-router.service, .socket and -hold.service to /etc/systemd/system, /etc/default/rover-router once, and
-# makes the user rover-router. docs/operations.md tells how to live with the service, and how to remove it.
+# makes the user rover-router. Listeners on an interface, wg0, get rover-router-wg0.socket. docs/operations.md tells how to live with the service, and how to remove it.
 set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 units=/etc/systemd/system
@@ -35,7 +36,8 @@ if [ $# -gt 0 ]; then
   check_place "$chosen"
 fi
 
-# What the units have to know of the table: "socket ADDRESS", "write FOLDER", "read FOLDER"; findings go to stderr.
+# What the units have to know of the table: "socket ADDRESS INTERFACE" (- for none), "write FOLDER", "read FOLDER";
+# findings go to stderr.
 facts=$(
   set -a
   RECORDINGS=/var/lib/$user  # as the unit says, unless the settings say something else
@@ -57,7 +59,7 @@ if checked.program is None:
     sys.exit(78)
 table = checked.program.table
 for listener in checked.program.listeners:
-    print("socket", listener.address)
+    print("socket", listener.address, listener.interface or "-")
 if table.record is not None and (directory := table.record.directory.resolve()) != Path("/var/lib/rover-router"):
     print("write", directory)
 read = {Path(sys.argv[1]), Path(sys.base_prefix), *(file.resolve().parent for file in table.files)}
@@ -75,6 +77,7 @@ if [ ! -e "$settings" ]; then
 # listeners, run deploy/install-service.sh again.
 ROUTER_TABLE=$root/routes/rover.yaml
 ROS_DOMAIN_ID=0
+#ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
 #BASESTATION=192.168.0.10:9000
 END
 fi
@@ -87,13 +90,25 @@ if [ -n "$chosen" ]; then
   fi
 fi
 
-for unit in rover-router.service rover-router.socket rover-router-hold.service; do
-  sed -e "s|/opt/rover-router|$root|g" "$root/deploy/systemd/$unit" >"$units/$unit.new"
-done
-addresses=$(printf '%s\n' "$facts" | sed -n 's/^socket /ListenDatagram=/p')
-awk -v addresses="$addresses" '/^ListenDatagram=/ { print addresses; next } { print }' \
-  "$units/rover-router.socket.new" >"$units/rover-router.socket.newer"
-mv "$units/rover-router.socket.newer" "$units/rover-router.socket.new"
+# A socket unit has one BindToDevice=, and what it starts must be its own: so there is a pair of units for each interface.
+new=$(mktemp -d)
+trap 'rm -r "$new"' EXIT
+sockets=()
+while read -r interface; do
+  on=${interface:+-$interface}
+  sockets+=("rover-router$on.socket")
+  for unit in rover-router.socket rover-router-hold.service; do
+    sed -e "s|rover-router\.socket|rover-router$on.socket|g; s|rover-router-hold\.service|rover-router-hold$on.service|g" \
+      "$root/deploy/systemd/$unit" >"$new/${unit%.*}$on.${unit##*.}"
+  done
+  addresses=$(printf '%s\n' "$facts" | awk -v on="${interface:--}" '$1 == "socket" && $3 == on { print "ListenDatagram=" $2 }')
+  if [ -n "$interface" ]; then addresses+=$'\n'"BindToDevice=$interface"; fi
+  awk -v addresses="$addresses" '/^ListenDatagram=/ { print addresses; next } { print }' \
+    "$new/rover-router$on.socket" >"$new/filled"
+  mv "$new/filled" "$new/rover-router$on.socket"
+done < <(printf '%s\n' "$facts" | awk '$1 == "socket" { print $3 == "-" ? "" : $3 }' | sort -u)
+sed -e "s|/opt/rover-router|$root|g; s|^Sockets=.*|Sockets=${sockets[*]}|" "$root/deploy/systemd/rover-router.service" \
+  >"$new/rover-router.service"
 
 # Home folders are hidden from the service, but for what it needs there.
 mkdir -p "$units/rover-router.service.d"
@@ -105,13 +120,19 @@ printf '%s\n' "$facts" | sed -n 's/^write //p' | while read -r folder; do
   [ -d "$folder" ] || install -d -o "$user" -g "$user" "$folder"
 done
 
-same_socket=$(cmp -s "$units/rover-router.socket.new" "$units/rover-router.socket" && echo yes || echo no)
-for unit in rover-router.service rover-router.socket rover-router-hold.service; do
-  mv "$units/$unit.new" "$units/$unit"
+same_sockets=yes
+for socket in "${sockets[@]}"; do cmp -s "$new/$socket" "$units/$socket" || same_sockets=no; done
+for unit in "$units"/rover-router*.socket "$units"/rover-router-hold*.service; do  # of a table before
+  if [ -e "$unit" ] && [ ! -e "$new/${unit##*/}" ]; then
+    same_sockets=no
+    systemctl disable --quiet --now "${unit##*/}"
+    rm "$unit"
+  fi
 done
+install -m 644 "$new"/* "$units"
 systemctl daemon-reload
-if [ "$same_socket" = no ]; then systemctl stop rover-router.service rover-router.socket; fi
-systemctl enable --quiet rover-router.socket rover-router.service
-systemctl start rover-router.socket
+if [ $same_sockets = no ]; then systemctl stop rover-router.service "${sockets[@]}"; fi
+systemctl enable --quiet "${sockets[@]}" rover-router.service
+[ ${#sockets[@]} = 0 ] || systemctl start "${sockets[@]}"
 systemctl restart rover-router.service || die "it did not start; see: journalctl -u rover-router -e"
 echo "install-service: rover-router is running; see: systemctl status rover-router, journalctl -u rover-router -f"

@@ -81,6 +81,8 @@ class Code(enum.Enum):
     UNKNOWN_PAYLOAD_CASE = ("unknown-payload-case", "A route for a payload case that the envelope does not have.")
     UNCOVERED_PAYLOAD_CASE = ("uncovered-payload-case", "A payload case with neither a route nor `ignore`.")
     UNKNOWN_ENDPOINT = ("unknown-endpoint", "A source or destination that `endpoints` does not have.")
+    UNKNOWN_LISTENER = ("unknown-listener", "An endpoint's `listener` that `listen` does not have.")
+    UNUSED_LISTENER = ("unused-listener", "A listener that no endpoint which sends is believed by.")
     ADDRESS_CLASH = (
         "address-clash",
         "Two want one local address or Zenoh key, or two endpoints could not be told apart.",
@@ -118,7 +120,7 @@ class Code(enum.Enum):
         return Severity.WARNING if self in _WARNINGS else Severity.ERROR
 
 
-_WARNINGS = frozenset({Code.UNCOVERED_PAYLOAD_CASE, Code.NOT_LOCKED, Code.NO_DEADMAN})
+_WARNINGS = frozenset({Code.UNCOVERED_PAYLOAD_CASE, Code.UNUSED_LISTENER, Code.NOT_LOCKED, Code.NO_DEADMAN})
 
 
 @dataclass(frozen=True, slots=True)

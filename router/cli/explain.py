@@ -145,7 +145,8 @@ def _source(name: str, table: RouteTable) -> str:
         return name
     endpoint = table.endpoints[name]
     port = f":{endpoint.source_port.value}" if endpoint.source_port else ""
-    return f"{name} ({endpoint.address.value.host}{port})"
+    by = f" by listener {endpoint.listener.value}" if endpoint.listener else ""
+    return f"{name} ({endpoint.address.value.host}{port}{by})"
 
 
 def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:

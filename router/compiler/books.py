@@ -71,7 +71,7 @@ REJECT_REASONS: Mapping[str, str] = {
     "unknown_case": "a field number that the envelope does not have",
     "unhandled": "a payload case without a route",
     "ignored": "a payload case that the table ignores",
-    "source_mismatch": "from an address that the route does not take it from",
+    "source_mismatch": "from an address that the route does not take it from, or not by the listener that believes it",
 }
 """Why no route took a datagram, with what each means."""
 

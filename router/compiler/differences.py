@@ -86,7 +86,7 @@ def _parts(checked: Checked) -> Iterator[Named]:
         about = f"{case.type.name}, number {case.number}"
         yield (f"payload case {case.name}", ""), Part(schema.span(envelope.name, case.name), about, settings)
     for listener in table.listeners.values():
-        yield (f"listener {listener.name}", ""), Part(listener.span, str(listener.address.value), flat(listener))
+        yield (f"listener {listener.name}", ""), Part(listener.span, listener.bound_to, flat(listener))
     for endpoint in table.endpoints.values():
         yield (f"endpoint {endpoint.name}", ""), Part(endpoint.span, str(endpoint.address.value), flat(endpoint))
     for route in checked.routes:

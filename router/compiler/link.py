@@ -73,7 +73,14 @@ def link(
         envelope=envelope,
         books=books,
         listeners=tuple(
-            ListenerPlan(one.name, one.address.value, one.framing, one.receive_buffer, one.coalesce)
+            ListenerPlan(
+                one.name,
+                one.address.value,
+                one.framing,
+                one.receive_buffer,
+                one.coalesce,
+                one.interface.value if one.interface else None,
+            )
             for one in table.listeners.values()
         ),
         senders=tuple(

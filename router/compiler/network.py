@@ -7,8 +7,8 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import combinations
 
-from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import Address, Endpoint, Gateway, Located, RouteTable, Transport
+from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.table.model import ANY, Address, Endpoint, Gateway, Located, RouteTable, Transport
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
@@ -21,14 +21,18 @@ class _Held:
     owner: str
     address: Located[Address]
     is_udp: bool = False
+    interface: str | None = None
 
 
 def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
     for first, second in combinations(_held(table), 2):
-        if first.is_udp == second.is_udp and _overlap(first.address.value, second.address.value):
+        if first.is_udp == second.is_udp and _overlap(first, second):
             message = f"{second.owner} has the address of {first.owner}"
             hint = "one socket takes it all; give it a port of its own"
+            if first.interface != second.interface:  # what is bound to no interface takes that of all of them
+                hint += f", or give {second.owner if first.interface else first.owner} an 'interface' too"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
+    yield from _listener_findings(table)
     yield from _gateway_findings(table)
     sources = {source.value for route in table.routes for source in route.sources}
     blamed: set[str] = set()
@@ -40,7 +44,8 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 def _held(table: RouteTable) -> Iterator[_Held]:
     for listener in table.listeners.values():
-        yield _Held(f"listener '{listener.name}'", listener.address, is_udp=True)
+        interface = listener.interface.value if listener.interface else None
+        yield _Held(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
     if table.metrics is not None:
         yield _Held("the metrics", table.metrics)
     if table.foxglove is not None:
@@ -78,18 +83,45 @@ def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable)
             yield Diagnostic(address.span, Code.FORWARDING_LOOP, message, "name the address of its client")
 
 
-def _overlap(one: Address, other: Address) -> bool:
-    return one.port == other.port and (one.host == other.host or WILDCARD in (one.host, other.host))
+def _overlap(one: _Held, other: _Held) -> bool:
+    """Whether the kernel refuses the second: it does unless both are bound to an interface, each to another one."""
+    if one.interface and other.interface and one.interface != other.interface:
+        return False
+    hosts = one.address.value.host, other.address.value.host
+    return one.address.value.port == other.address.value.port and (hosts[0] == hosts[1] or WILDCARD in hosts)
+
+
+def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Endpoints that name a listener there is not, and listeners that every endpoint which sends passes by."""
+    for endpoint in table.endpoints.values():
+        named = endpoint.listener
+        if named and named.value not in table.listeners and not table.broken & {"listen", f"listen/{named.value}"}:
+            hint = did_you_mean(named.value, table.listeners)
+            yield Diagnostic(named.span, Code.UNKNOWN_LISTENER, f"there is no listener '{named.value}'", hint)
+    sources = {source.value for route in table.routes for source in route.sources}
+    senders = [endpoint for endpoint in table.endpoints.values() if endpoint.name in sources]
+    believed_by = {endpoint.listener.value if endpoint.listener else None for endpoint in senders}
+    if not senders or ANY in sources or None in believed_by or table.broken:
+        return
+    for listener in table.listeners.values():
+        if listener.name not in believed_by:
+            message = f"no endpoint that sends is believed by listener '{listener.name}': it rejects everything"
+            hint = f"remove it, or give an endpoint 'listener: {listener.name}'"
+            yield Diagnostic(listener.span, Code.UNUSED_LISTENER, message, hint)
 
 
 def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | None:
     """Two endpoints that a received datagram could both be from."""
     if one.address.value.host != other.address.value.host or not sources & {one.name, other.name}:
         return None
+    if one.listener and other.listener and one.listener.value != other.listener.value:
+        return None
     host = one.address.value.host
     if one.source_port is None or other.source_port is None:
         message = f"endpoints '{one.name}' and '{other.name}' share the address {host}"
         hint = "an endpoint is recognised by its address: correct it, or give both a 'source_port'"
+        if one.listener or other.listener:
+            hint += ", or a 'listener' each"
         return Diagnostic(other.address.span, Code.ADDRESS_CLASH, message, hint)
     if one.source_port.value == other.source_port.value:
         message = f"endpoints '{one.name}' and '{other.name}' share the address {host} and the source port"
@@ -117,15 +149,21 @@ def _reaches(address: Address, own: Address) -> bool:
     return address.host in (own.host, WILDCARD) or (own.host == WILDCARD and address.host.startswith(LOOPBACK))
 
 
-def recognisers(endpoints: Mapping[str, Endpoint]) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
+def recognisers(
+    endpoints: Mapping[str, Endpoint], listener: str | None
+) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
     """How a sender's address becomes an endpoint's name: by IP address, and by (IP address, port).
 
+    Those are for what `listener` receives: an endpoint that is believed by another listener is not among them. None is
+    for datagrams that came by no listener of the table, and has all endpoints.
     An IP address that several endpoints share without source ports recognises none of them; the table
     may have that only where none is a source.
     """
     by_address: dict[tuple[str, int], str] = {}
     by_host: dict[str, list[str]] = {}
     for endpoint in endpoints.values():
+        if listener is not None and endpoint.listener is not None and endpoint.listener.value != listener:
+            continue
         host = endpoint.address.value.host
         if endpoint.source_port is not None:
             by_address[host, endpoint.source_port.value] = endpoint.name

@@ -12,7 +12,7 @@ from itertools import chain
 from types import CodeType
 
 from router.compiler.books import Books
-from router.table.model import Address, Framing, Gateway, Keep, Priority, RouteTable
+from router.table.model import Address, Framing, Gateway, Keep, Priority, RouteTable, bound_to
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
@@ -27,13 +27,22 @@ def source_label(source: str | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ListenerPlan:
-    """A UDP socket to receive from. `receive_buffer` in bytes, `coalesce` in ns."""
+    """A UDP socket to receive from, by one network interface only if `interface` names one.
+
+    `receive_buffer` in bytes, `coalesce` in ns.
+    """
 
     name: str
     address: Address
     framing: Framing
     receive_buffer: int
     coalesce: int
+    interface: str | None = None
+
+    @property
+    def bound_to(self) -> str:
+        """What tells the sockets of a program apart."""
+        return bound_to(self.address, self.interface)
 
 
 @dataclass(frozen=True, slots=True)

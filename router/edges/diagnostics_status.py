@@ -60,7 +60,7 @@ def _listener(seen: Situation, name: str) -> Status:
     findings = [warning(f"the kernel dropped {n}") for _, n in seen.grown("kernel_drops", name)]
     findings += rejections(seen, name)
     values = [
-        ("address", seen.program.table.listeners[name].address.value),
+        ("address", seen.program.table.listeners[name].bound_to),
         ("received", seen.count("datagrams_received", name)),
         ("dropped by the kernel", seen.count("kernel_drops", name)),
         *((f"rejected: {reason}", n) for (reason,), n in seen.counted("datagrams_rejected", name)),

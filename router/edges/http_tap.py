@@ -61,8 +61,8 @@ def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
     sender, names = Known(program.envelope, program.table).sender, frozenset(sources)
 
     def is_wanted(shown: Shown) -> bool:
-        _, _, peer, _ = shown
-        return peer[0] in names or sender(peer) in names
+        _, listener, peer, _ = shown
+        return peer[0] in names or sender(listener, peer) in names
 
     return is_wanted
 

@@ -10,7 +10,8 @@ import socket
 from collections.abc import Iterable, MutableMapping
 from functools import cache
 
-from router.table.model import Address
+from router.edges.udp_kernel import bound_interface
+from router.table.model import Address, bound_to
 
 FIRST = 3
 """The descriptor of the first one; the others follow it."""
@@ -20,21 +21,21 @@ SO_TIMESTAMPNS = 35
 
 
 class Inherited:
-    """UDP sockets by the address that they are bound to."""
+    """UDP sockets by what they are bound to: an address, or an address on an interface (see `bound_to`)."""
 
     def __init__(self, sockets: Iterable[socket.socket] = ()) -> None:
         self._sockets = {_bound_to(each): each for each in sockets}
         self._taken: set[str] = set()
 
-    def take(self, address: Address) -> socket.socket | None:
-        """The socket that is bound to `address`, as one of the caller's own, which he closes. It can be taken again.
+    def take(self, bound: str) -> socket.socket | None:
+        """The socket that is `bound` so, as one of the caller's own, which he closes. It can be taken again.
 
         What is in it has the time at which the kernel got it, if the socket was told to keep that (Timestamping=ns).
         """
-        held = self._sockets.get(str(address))
-        if held is None:
+        held = self._sockets.get(bound)
+        if held is None or _bound_to(held) != bound:  # its interface may have gone meanwhile
             return None
-        self._taken.add(str(address))
+        self._taken.add(bound)
         # Stamps then go with each datagram instead, where nobody looks; that the kernel makes them remains.
         held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 0)
         held.setblocking(True)
@@ -65,5 +66,6 @@ def _descriptors(environment: MutableMapping[str, str]) -> list[int]:
 
 def _bound_to(held: socket.socket) -> str:
     if (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM):
-        return str(Address(*held.getsockname()))
+        interface = bound_interface(held)
+        return bound_to(Address(*held.getsockname()), "an interface that has gone" if interface is None else interface)
     return f"{held.getsockname()}, which is no IPv4 UDP socket"

@@ -74,7 +74,7 @@ class LastValues:
         fields = MessageToDict(payload, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
         self._values[case.name] = {
             "at": at / 1e9,
-            "source": known.sender((host, port)) or f"{host}:{port}",
+            "source": known.sender(listener, (host, port)) or f"{host}:{port}",
             "bytes": len(data),
             "fields": shortened(fields),
         }

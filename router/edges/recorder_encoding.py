@@ -184,7 +184,8 @@ class Encoder:
         if sender not in self._payload_channels:
             if len(self._payload_channels) >= _MOST_SHAPES:
                 self._payload_channels.clear()
-            self._payload_channels[sender] = self._channels.payload(case, listener, peer, self._known.sender(peer))
+            endpoint = self._known.sender(listener, peer)
+            self._payload_channels[sender] = self._channels.payload(case, listener, peer, endpoint)
         return self._payload_channels[sender]
 
     def _add_unusual(self, shown: Shown, steady: int) -> None:
@@ -192,7 +193,8 @@ class Encoder:
         at, listener, peer, data = shown
         self._sequence += 1
         times = (self._sequence & _SEQUENCE, at, steady)
-        raw = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=self._known.sender(peer))
+        endpoint = self._known.sender(listener, peer)
+        raw = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}", data=data, endpoint=endpoint)
         self._chunk.add(self._channels.datagrams(), raw.SerializeToString(), *times)
         if (found := self._known.payload(listener, data)) is not None:
             case, payload = found

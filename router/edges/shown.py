@@ -14,6 +14,8 @@ from router.engine.framing import restored
 from router.table.model import Framing, RouteTable
 from router.types.protobuf import Envelope, PayloadCase
 
+_NOBODY: tuple[dict[str, str], dict[tuple[str, int], str]] = {}, {}
+
 
 class Known:
     """What one table knows of payloads, listeners and senders. Any thread may ask."""
@@ -23,7 +25,7 @@ class Known:
         self._repairing = frozenset(
             listener.name for listener in table.listeners.values() if listener.framing is Framing.ZERO_TRIMMED
         )
-        self._by_host, self._by_address = recognisers(table.endpoints)
+        self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
 
     def payload(self, listener: str, data: bytes) -> tuple[PayloadCase, Message] | None:
         """None for a datagram that this listener's would reject, because there is none in it."""
@@ -38,9 +40,10 @@ class Known:
         case = envelope.WhichOneof(self.envelope.oneof)
         return (self.envelope.cases[case], getattr(envelope, case)) if case else None
 
-    def sender(self, peer: tuple[str, int]) -> str:
-        """What the table calls him; empty for a stranger."""
-        return self._by_address.get(peer) or self._by_host.get(peer[0]) or ""
+    def sender(self, listener: str, peer: tuple[str, int]) -> str:
+        """What the table calls who sent something to this listener; empty for a stranger."""
+        by_host, by_address = self._recognisers.get(listener, _NOBODY)
+        return by_address.get(peer) or by_host.get(peer[0]) or ""
 
 
 def first_field(data: bytes) -> int:

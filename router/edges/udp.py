@@ -15,9 +15,9 @@ from router.compiler.program import ListenerPlan, SenderPlan
 from router.edges.inherited import inherited
 from router.edges.log import logger
 from router.edges.port_holder import port_taken
-from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, drops, receive_buffer
+from router.edges.udp_kernel import arrivals, ask_for_receive_buffer, bound_interface, drops, receive_buffer
 from router.errors import SourceSpan, StartError
-from router.table.model import Address
+from router.table.model import Address, bound_to
 
 _NETWORK_CHANGED = (errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL)
 """What sending says: there was no network when the router started, there is none now, or this computer has no longer
@@ -27,17 +27,19 @@ the address that the socket sends from."""
 class Listener:
     """A bound socket. Opening raises StartError, which says where in the table and what to do.
 
-    Where this process was handed one with the listener's address, it is that one. Then what is not taken from it waits
-    for the next process, and what the kernel dropped was perhaps dropped before this one began.
+    Where this process was handed one with the listener's address and interface, it is that one. Then what is not taken
+    from it waits for the next process, and what the kernel dropped was perhaps dropped before this one began.
     """
 
     def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
         self._plan = plan
-        handed = inherited().take(plan.address)
+        handed = inherited().take(plan.bound_to)
         self.is_inherited = handed is not None
         self.socket = handed or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             if handed is None:
+                if plan.interface is not None:
+                    self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, plan.interface.encode())
                 # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
                 self.socket.bind(plan.address)
             self._want_receive_buffer(plan)
@@ -53,12 +55,24 @@ class Listener:
         return self._plan.name
 
     @property
+    def bound_to(self) -> str:
+        return bound_to(self.address, self._plan.interface)
+
+    @property
     def coalesce(self) -> int:
         """The longest rest, in ns."""
         return self._plan.coalesce
 
+    @property
+    def interface(self) -> str | None:
+        return self._plan.interface
+
+    def has_lost_interface(self) -> bool:
+        """Whether its network interface has gone. It receives nothing then, nor by a later one of the same name."""
+        return self._plan.interface is not None and bound_interface(self.socket) is None
+
     def follow(self, plan: ListenerPlan) -> None:
-        """Is what another table calls and wants of the same address."""
+        """Is what another table calls and wants of the same address and interface."""
         if plan.receive_buffer != self._plan.receive_buffer:
             self._want_receive_buffer(plan)
         self._plan = plan
@@ -105,7 +119,11 @@ class Listener:
 
 
 def _why_not_bound(plan: ListenerPlan, error: OSError) -> str:
-    what = f"listener '{plan.name}' cannot use {plan.address}"
+    what = f"listener '{plan.name}' cannot use {plan.bound_to}"
+    if error.errno == errno.ENODEV:
+        return f"{what}: there is no such network interface now; `ip link` lists those that there are"
+    if error.errno == errno.EPERM:
+        return f"{what}: before Linux 5.7 an 'interface' needs a privilege; grant CAP_NET_RAW"
     if error.errno == errno.EADDRINUSE:
         return f"{what}: {port_taken('udp', plan.address.port)}"
     if error.errno == errno.EADDRNOTAVAIL:

@@ -1,4 +1,7 @@
-"""What Linux tells of a UDP socket, and the socket module does not: when a datagram arrived, and what was dropped."""
+"""What Linux tells of a UDP socket, and the socket module does not: when a datagram arrived, and what was dropped.
+
+And of a network interface: whether it is there and up, and its address.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,11 @@ from contextlib import suppress
 SO_RCVBUFFORCE = 33
 SO_MEMINFO = 55
 SIOCGSTAMPNS = 0x8907
+SIOCGIFFLAGS = 0x8913
+SIOCGIFADDR = 0x8915
+IFF_UP = 0x1
+IFNAMSIZ = 16
+_IFREQ = struct.Struct("16s24s")
 _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
 _MEMINFO_DROPS = 8
@@ -58,3 +66,32 @@ def receive_buffer(opened: socket.socket) -> int:
     """Its size in bytes, as it is asked for."""
     # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
+def bound_interface(opened: socket.socket) -> str | None:
+    """The network interface that a socket is bound to, empty for none; None where that interface has gone."""
+    try:
+        return opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, IFNAMSIZ).rstrip(b"\0").decode()
+    except OSError:
+        return None
+
+
+def interface_is_up(name: str) -> bool | None:
+    """Whether it is; None where there is no such network interface."""
+    answer = _ask_interface(name, SIOCGIFFLAGS)
+    return None if answer is None else bool(int.from_bytes(answer[:2], "little") & IFF_UP)
+
+
+def interface_address(name: str) -> str | None:
+    """Its first IPv4 address, if there is one."""
+    answer = _ask_interface(name, SIOCGIFADDR)
+    return None if answer is None else socket.inet_ntoa(answer[4:8])
+
+
+def _ask_interface(name: str, request: int) -> bytes | None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        try:
+            answer = fcntl.ioctl(asking, request, _IFREQ.pack(name.encode(), b""))
+        except OSError:
+            return None
+    return bytes(_IFREQ.unpack(answer)[1])

@@ -1,4 +1,7 @@
-"""Looks whether files have changed, and when they have come to rest. Knows nothing of what is in them."""
+"""Looks whether files have changed, and when they have come to rest. Knows nothing of what is in them.
+
+And whether network interfaces of listeners have gone, and are back.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from time import sleep
 
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.log import logger
+from router.edges.udp import Listener
 from router.errors import StartError
 from router.table.model import RouteTable
 
@@ -17,6 +21,9 @@ PERIOD = 0.5
 
 PATIENCE = 5.0
 """Seconds for which a reload that was asked for waits for files that do not come to rest."""
+
+INTERFACE_PERIOD = 1.0
+"""Seconds between two looks at network interfaces."""
 
 _Look = dict[Path, tuple[int, int, int]]
 
@@ -60,6 +67,34 @@ class Watcher:
             return _look(self._files())
         except OSError:
             return None
+
+
+class InterfaceWatcher:
+    """Looks once a second whether `listeners` still have their network interfaces.
+
+    A socket stays bound to the interface that there was: when a tunnel is set up again, or an adapter plugged in again,
+    it hears nothing. Then `reopen` is called, in the watcher's thread, until it hears again. Closing waits for nothing.
+    """
+
+    def __init__(self, listeners: Callable[[], Iterable[Listener]], reopen: Callable[[], object]) -> None:
+        self._listeners = listeners
+        self._reopen = reopen
+        self._stopped = threading.Event()
+        threading.Thread(target=self._run, name="interfaces", daemon=True).start()
+
+    def close(self) -> None:
+        self._stopped.set()
+
+    def _run(self) -> None:
+        told: list[Listener] = []
+        while not self._stopped.wait(INTERFACE_PERIOD):
+            lost = [each for each in self._listeners() if each.has_lost_interface()]
+            for each in lost:
+                if each not in told:
+                    logger.error("a network interface has gone: nothing comes in by it", listener=each.name)
+            if lost:
+                self._reopen()
+            told = lost
 
 
 def watched_files(table: RouteTable) -> list[Path]:

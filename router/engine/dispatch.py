@@ -21,6 +21,8 @@ from router.engine.settling import MAX_DATAGRAM, Rejected, Settler
 
 Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]
+_Addresses = Sequence[tuple[object, str]]
+"""By what endpoints are recognised, and their names."""
 _SUM = HISTOGRAM_SLOTS - 1
 
 
@@ -57,8 +59,6 @@ class Engine:
         self._counts = outlets.counts
         self._arrived_at = arrived_at
         self._freshness = outlets.state.keep("freshness of datagrams", Freshness)
-        by_host, self._by_address = recognisers(program.table.endpoints)
-        self._addresses: list[tuple[object, str]] = [*by_host.items(), *self._by_address.items()]
         self._handles = {
             handler.route: bind(handler, program.books, outlets, self._freshness)
             for handlers in program.inbound.values()
@@ -70,18 +70,19 @@ class Engine:
         for handle in self._handles.values():
             unbind(handle)
 
-    def _cases(self, listener: str) -> dict[int, _Case]:
+    def _cases(self, listener: str, addresses: _Addresses) -> dict[int, _Case]:
         """What a listener's datagrams are given to, by field number."""
-        return {number: self._case(handlers, listener) for number, handlers in self._program.inbound.items()}
+        inbound = self._program.inbound
+        return {number: self._case(handlers, listener, addresses) for number, handlers in inbound.items()}
 
-    def _case(self, handlers: Sequence[Handler], listener: str) -> _Case:
+    def _case(self, handlers: Sequence[Handler], listener: str, addresses: _Addresses) -> _Case:
         by_source = {
             source: self._route(handler, source, listener) for handler in handlers for source in handler.sources
         }
         return _Case(
             name=handlers[0].case.name,
             parse=handlers[0].case.message_class.FromString,
-            routes={key: by_source[name] for key, name in self._addresses if name in by_source},
+            routes={key: by_source[name] for key, name in addresses if name in by_source},
             stranger=by_source.get(STRANGER),
         )
 
@@ -112,13 +113,15 @@ class Engine:
         complete, of a routed case, from its endpoint) goes straight through.
         """
         books, counts = self._program.books, self._counts
-        cases = self._cases(listener)
+        # Whose they are: an endpoint that is believed by another listener is a stranger here.
+        by_host, by_address = recognisers(self._program.table.endpoints, listener)
+        addresses: _Addresses = [*by_host.items(), *by_address.items()]
+        cases = self._cases(listener, addresses)
         # Of those whose tag is two bytes at most.
         by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
         clock_ns, wall_ns, bounds = self._outlets.clock_ns, self._outlets.wall_ns, HISTOGRAM_BOUNDS_NS
         received, received_bytes = books.slot("datagrams_received", listener), books.slot("received_bytes", listener)
-        seen = self._seen_slots()
-        by_address = self._by_address
+        seen = self._seen_slots(addresses)
         settle, reject = Settler(self._program, counts, listener, cases).settle, self._rejecter(listener)
 
         def receive(data: bytes, peer: Peer) -> None:
@@ -160,9 +163,9 @@ class Engine:
 
         return receive
 
-    def _seen_slots(self) -> dict[object, int]:
+    def _seen_slots(self, addresses: _Addresses) -> dict[object, int]:
         metric = "endpoint_last_seen_timestamp_seconds"
-        return {key: self._program.books.slot(metric, name) for key, name in self._addresses}
+        return {key: self._program.books.slot(metric, name) for key, name in addresses}
 
     def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
         books, counts, report = self._program.books, self._counts, self._outlets.report

@@ -23,7 +23,7 @@ from router.edges.mirror import Mirror
 from router.edges.reports import Reporter
 from router.edges.running import ReloadResult
 from router.edges.udp import Listener
-from router.edges.watching import Watcher, watched_files
+from router.edges.watching import InterfaceWatcher, Watcher, watched_files
 from router.engine import MAX_DATAGRAM
 from router.runtime.accounts import Accounts
 from router.runtime.companions import Companions
@@ -68,6 +68,7 @@ class Router:
         self._companions = Companions(self)
         self._reloader = Reloader(self._edges, self._accounts, environ, self._settled)
         self._watcher: Watcher | None = None
+        self._interfaces: InterfaceWatcher | None = None
         self._collector = self._new_collector()
         self._open_edges = ExitStack()
 
@@ -83,7 +84,7 @@ class Router:
                 self._open_companions(change, companions)
             self._edges.start(change, opening)
             self._reloader.open()
-            opening.callback(self._unwatch)
+            opening.callback(self._unwatch_all)
             self._watch()
             opening.callback(self._reloader.close)
             self._open_edges = opening.pop_all()
@@ -92,7 +93,7 @@ class Router:
         logger.info(
             "router started",
             table=str(program.table.path),
-            listening={name: str(listener.address) for name, listener in self.listeners.items()},
+            listening={name: listener.bound_to for name, listener in self.listeners.items()},
             routes=sum(not route.ignore for route in program.table.routes),
             destinations=len(program.senders),
             published=len(program.publishers),
@@ -170,7 +171,9 @@ class Router:
         self._watch()
 
     def _watch(self) -> None:
-        """Watches the files of the table that runs, where it asks for that."""
+        """Watches the table's files, where it asks for that, and the network interfaces that it names."""
+        if self._interfaces is None and any(plan.interface for plan in self.program.listeners):
+            self._interfaces = InterfaceWatcher(lambda: list(self.listeners.values()), self._reloader.reopen)
         if self.program.table.reload_on_change and self._watcher is None:
             self._watcher = Watcher(lambda: watched_files(self.program.table), self.reload)
         elif not self.program.table.reload_on_change:
@@ -180,6 +183,11 @@ class Router:
         if self._watcher is not None:
             self._watcher.close()
             self._watcher = None
+
+    def _unwatch_all(self) -> None:
+        self._unwatch()
+        if self._interfaces is not None:
+            self._interfaces.close()
 
     def _asked(self) -> dict[str, Asked]:
         """Series that nobody counts in a slot."""

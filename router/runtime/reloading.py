@@ -24,6 +24,7 @@ from router.runtime.accounts import Accounts
 from router.runtime.changes import all_moved, changes, unchangeable
 from router.runtime.edges import Edges
 from router.runtime.interpreter import beside_traffic
+from router.runtime.sockets import is_replaceable
 
 
 class Reloader:
@@ -67,6 +68,20 @@ class Reloader:
         event = "table reloaded" if result.ok else "the table was not taken over, and nothing has changed"
         log(event, result=result.text, findings=[str(finding) for finding in result.findings], seconds=seconds)
         return result
+
+    def reopen(self) -> None:
+        """Opens listeners of the running program anew whose network interface was replaced, if there are any."""
+        with self._one_at_a_time:
+            wiring = self._edges.wiring
+            replaceable = [each for each in self._edges.sockets.listeners.values() if is_replaceable(each)]
+            if not self._is_open or wiring is None or not replaceable:
+                return
+            try:
+                self._edges.take_over(self._edges.prepare(wiring.program))
+            except (StartError, StuckError, OSError) as error:  # tried again
+                logger.warning("a listener cannot be opened on its network interface", why=str(error))
+            else:
+                logger.info("network interfaces are back", listeners=[each.name for each in replaceable])
 
     def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
         """As what it is counted, and what came of it."""

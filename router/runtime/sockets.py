@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from router.compiler.program import Program
 from router.edges.udp import Listener, Sender
+from router.edges.udp_kernel import interface_is_up
 from router.runtime.accounts import KernelDrops
 from router.table.model import Address
 
@@ -25,12 +26,17 @@ class SocketChange:
     left: ExitStack = field(default_factory=ExitStack)
 
 
+def is_replaceable(listener: Listener) -> bool:
+    """Whether its network interface has gone, and another one of the same name is there."""
+    return listener.has_lost_interface() and interface_is_up(listener.interface or "") is not None
+
+
 class Sockets:
     """Listeners by name, and senders by endpoint. Nothing is open before the first change."""
 
     def __init__(self, drops: KernelDrops) -> None:
         self.listeners: dict[str, Listener] = {}
-        self._addresses: dict[Address, Listener] = {}  # as tables write them
+        self._bound: dict[str, Listener] = {}  # by what tables bind them to
         self._senders: dict[str, tuple[Address, Sender]] = {}
         self._drops = drops
 
@@ -40,7 +46,8 @@ class Sockets:
         with ExitStack() as opening:
             listeners = {}
             for plan in program.listeners:
-                if (listener := self._addresses.get(plan.address)) is None:
+                listener = self._bound.get(plan.bound_to)
+                if listener is None or is_replaceable(listener):
                     listener = Listener(plan, table.listeners[plan.name].address.span)
                     opening.callback(listener.close)
                 listeners[plan.name] = listener
@@ -55,7 +62,7 @@ class Sockets:
 
     def left(self, change: SocketChange) -> list[Listener]:
         """The listeners that nobody listens to after the change."""
-        return [each for each in self._addresses.values() if each not in change.listeners.values()]
+        return [each for each in self._bound.values() if each not in change.listeners.values()]
 
     def apply(self, change: SocketChange) -> None:
         """From now on these are used."""
@@ -69,7 +76,7 @@ class Sockets:
         for name, listener in change.listeners.items():
             listener.follow(plans[name])
         self.listeners = change.listeners
-        self._addresses = {plans[name].address: listener for name, listener in change.listeners.items()}
+        self._bound = {plans[name].bound_to: listener for name, listener in change.listeners.items()}
         self._senders = {to.endpoint: (to.address, change.senders[to.endpoint]) for to in change.program.senders}
 
     def close_listeners(self) -> None:
@@ -85,7 +92,7 @@ class Sockets:
         moved = {name for name, each in self.listeners.items() if change.listeners.get(name) is not each}
         for name in moved:
             self._drops.leave(name)
-        known = self._addresses.values()
+        known = self._bound.values()
         for name, listener in change.listeners.items():
             if self.listeners.get(name) is not listener:
                 since = listener.kernel_drops() if listener in known else 0

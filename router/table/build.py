@@ -202,6 +202,7 @@ def _listener(entry: Entry) -> Listener:
         framing=Framing(text_or(settings, "framing", Framing.ZERO_TRIMMED.value)),
         receive_buffer=_parsed(settings, "receive_buffer", parse_size, DEFAULT_RECEIVE_BUFFER),
         coalesce=_parsed(settings, "coalesce", parse_coalesce, DEFAULT_COALESCE),
+        interface=optional_text(settings, "interface"),
     )
 
 
@@ -217,4 +218,5 @@ def _endpoint(entry: Entry) -> Endpoint:
         trim_trailing_zeros=boolean(settings, "trim_trailing_zeros"),
         budget=Located(UnsoundError.guard(parse_data_rate, budget), budget.span) if budget else None,
         stale_after=_parsed(settings, "stale_after", parse_patience, DEFAULT_STALE_AFTER) or None,
+        listener=optional_text(settings, "listener"),
     )

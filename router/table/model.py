@@ -36,6 +36,11 @@ class Address(NamedTuple):
         return f"{self.host}:{self.port}"
 
 
+def bound_to(address: Address, interface: str | None) -> str:
+    """Return what a local socket is bound to as text: `0.0.0.0:5000`, or `0.0.0.0:5000 on wlan0`."""
+    return f"{address} on {interface}" if interface else str(address)
+
+
 class Framing(enum.Enum):
     EXACT = "exact"
     ZERO_TRIMMED = "zero_trimmed"
@@ -83,7 +88,10 @@ class NodeSettings:
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """`span` is the listener's name in the table. `receive_buffer` is in bytes, `coalesce` in ns."""
+    """`span` is the listener's name in the table. `receive_buffer` is in bytes, `coalesce` in ns.
+
+    With an `interface`, only what comes in by that network interface is received.
+    """
 
     name: str
     span: SourceSpan
@@ -91,6 +99,11 @@ class Listener:
     framing: Framing
     receive_buffer: int
     coalesce: int
+    interface: Located[str] | None = None
+
+    @property
+    def bound_to(self) -> str:
+        return bound_to(self.address.value, self.interface.value if self.interface else None)
 
 
 DEFAULT_STALE_AFTER = 5_000_000_000
@@ -101,7 +114,8 @@ DEFAULT_STALE_AFTER = 5_000_000_000
 class Endpoint:
     """`span` is the endpoint's name in the table. `budget` is in bytes per second, None for no limit.
 
-    Silent for longer than `stale_after` (ns) it is stale; None means that it never is.
+    Silent for longer than `stale_after` (ns) it is stale; None means that it never is. With a `listener`, only what
+    that one receives can be from it.
     """
 
     name: str
@@ -112,6 +126,7 @@ class Endpoint:
     trim_trailing_zeros: bool
     budget: Located[int] | None = None
     stale_after: int | None = DEFAULT_STALE_AFTER
+    listener: Located[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.errors import Severity, shown_path
 from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
-from router.tools.doctor_network import endpoints, ports
+from router.tools.doctor_network import endpoints, interfaces, ports
 from router.tools.doctor_report import Finding, fine, problem, warning
-from router.tools.doctor_ros import ros
+from router.tools.doctor_ros import open_domain, ros
 from router.tools.doctor_running import Health, health
 
 
@@ -31,11 +31,13 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
         return
     running = health(program)
     yield from ros(program)
+    yield from interfaces(program)
     yield from ports(program, running=running is not None)
     yield from receive_buffers(program)
     if running is None:
         yield from recordings(program)
     yield from shared_memory(variables)
+    yield from open_domain(program, variables)
     yield from clock()
     yield from endpoints(program)
     yield from _running(program, running)
@@ -46,6 +48,7 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
     for finding in _table(path, variables):
         if isinstance(finding, Program):
             yield from ros(finding)
+            yield from interfaces(finding)
             yield from ports(finding, running=False, with_listeners=False)
             yield from recordings(finding)
         else:

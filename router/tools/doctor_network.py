@@ -12,7 +12,8 @@ from time import monotonic
 
 from router.compiler.program import Program
 from router.edges.port_holder import port_holder
-from router.table.model import Address, Transport
+from router.edges.udp_kernel import interface_is_up
+from router.table.model import Address, Transport, bound_to
 from router.tools.doctor_report import Finding, fine, problem, warning
 
 PATIENCE = 1.0
@@ -30,11 +31,29 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
     if running:
         yield fine("ports", "the running router has them")
         return
-    wanted = [("tcp", address, what) for address, what in _tcp(program)]
+    wanted: list[tuple[str, Address, str | None, str]] = []
+    wanted += [("tcp", address, None, what) for address, what in _tcp(program)]
     if with_listeners:
-        wanted += [("udp", each.address, f"listener '{each.name}'") for each in program.listeners]
-    refused = [finding for protocol, address, what in wanted for finding in _port(protocol, address, what)]
-    yield from refused or [fine("ports", "free: " + ", ".join(str(address) for _, address, _ in wanted))]
+        wanted += [("udp", each.address, each.interface, f"listener '{each.name}'") for each in program.listeners]
+    refused = [finding for each in wanted for finding in _port(*each)]
+    free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
+    yield from refused or [fine("ports", f"free: {free}")]
+
+
+def interfaces(program: Program) -> Iterator[Finding]:
+    """Whether the network interfaces of listeners are there and up."""
+    for listener in program.listeners:
+        if listener.interface is None:
+            continue
+        is_up = interface_is_up(listener.interface)
+        about = f"listener '{listener.name}': network interface {listener.interface}"
+        if is_up is None:
+            remedy = "`ip link` lists those there are; a tunnel has to be up before the router starts"
+            yield problem("interfaces", f"{about} does not exist", remedy)
+        elif is_up:
+            yield fine("interfaces", f"{about} is up")
+        else:
+            yield problem("interfaces", f"{about} is down: nothing comes in", f"ip link set {listener.interface} up")
 
 
 def _tcp(program: Program) -> Iterator[tuple[Address, str]]:
@@ -48,13 +67,17 @@ def _tcp(program: Program) -> Iterator[tuple[Address, str]]:
             yield gateway.address.value, f"gateway '{gateway.name}'"
 
 
-def _port(protocol: str, address: Address, what: str) -> Iterator[Finding]:
+def _port(protocol: str, address: Address, interface: str | None, what: str) -> Iterator[Finding]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM) as probe:
         if protocol == "tcp":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as a server has it
         try:
+            if interface is not None:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
             probe.bind(address)
         except OSError as error:
+            if error.errno == errno.ENODEV:  # `interfaces` tells
+                return
             yield from _refused(protocol, address, what, error)
 
 

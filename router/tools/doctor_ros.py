@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import socket
+from collections.abc import Iterator, Mapping
 
 from router.compiler.program import Program
 from router.edges.ros_environment import obstacles
+from router.edges.udp_kernel import interface_is_up
 from router.errors import StartError
-from router.tools.doctor_report import Finding, fine, problem
+from router.tools.doctor_report import Finding, fine, problem, warning
 
 _INSTALL = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
 
@@ -38,3 +40,21 @@ def ros(program: Program) -> Iterator[Finding]:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         types = len({plan.type_name for plan in plans})
         yield fine("ROS", f"{middleware()} in domain {domain}, and the {types} message types of the table")
+
+
+def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[Finding]:
+    """Whether whoever reaches this computer by a network is in the ROS domain without having to look for it."""
+    if not (program.publishers or program.subscriptions or program.gateways):
+        return
+    found_everywhere = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "") in ("", "SUBNET", "SYSTEM_DEFAULT")
+    if variables.get("ROS_DOMAIN_ID", "") not in ("", "0") or not found_everywhere:
+        return
+    networks = [name for _, name in socket.if_nameindex() if name != "lo" and interface_is_up(name)]
+    if networks:
+        yield warning(
+            "ROS",
+            "whoever is in a network of this computer is in the ROS domain, and can publish commands: it is domain 0, "
+            f"and nodes are looked for by {', '.join(networks)}",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST where all nodes are on this computer, as the service has it by "
+            "itself; else a domain of your own, and docs/security.md",
+        )

@@ -45,7 +45,9 @@ class Health:
             endpoint = self.table.endpoints.get(name)
             if endpoint is None or endpoint.stale_after is None or name not in sources:
                 continue
-            listening = ", ".join(str(each.address.value) for each in self.table.listeners.values())
+            believed_by = endpoint.listener.value if endpoint.listener else None
+            listeners = [each for each in self.table.listeners.values() if believed_by in (None, each.name)]
+            listening = ", ".join(each.bound_to for each in listeners)
             remedy = (
                 f"is it on, and does it send to this computer, where the router listens ({listening})? "
                 f"`tcpdump -n udp and host {endpoint.address.value.host}` shows whether anything comes"

@@ -8,9 +8,12 @@ from __future__ import annotations
 import errno
 import socket
 from collections.abc import Callable
+from functools import cache
 
+from router.compiler.network import recognisers
+from router.edges.udp_kernel import interface_address
 from router.errors import did_you_mean
-from router.table.model import Address, RouteTable
+from router.table.model import Address, Listener, RouteTable
 from router.tools import UsageError
 
 ANY_HOST = "0.0.0.0"
@@ -21,6 +24,8 @@ ANYWHERE = Address(ANY_HOST, 0)
 
 def destination(text: str, table: RouteTable | None) -> Address:
     """`HOST:PORT`, or the name of an endpoint or listener of the table."""
+    if table is not None and text in table.listeners and text not in table.endpoints:
+        return listener_address(table.listeners[text])
     if (named := _named(text, table)) is not None:
         return reachable(named)
     host, colon, port = text.rpartition(":")
@@ -50,21 +55,36 @@ def origin(text: str, table: RouteTable | None) -> Address:
     return Address(_resolve(host), _port(port, lowest=0) if colon else 0)
 
 
-def reachable(address: Address) -> Address:
-    """Where to send so that a socket bound to this address receives it."""
-    return address._replace(host=LOOPBACK) if address.host == ANY_HOST else address
+def reachable(address: Address, interface: str | None = None) -> Address:
+    """Where to send so that a socket bound to this address, and to this network interface, receives it.
+
+    From this computer, an interface is reached by its own address. Raises UsageError where it has none.
+    """
+    if address.host != ANY_HOST:
+        return address
+    host = interface_address(interface) if interface else LOOPBACK
+    if host is None:
+        raise UsageError(f"network interface '{interface}' is not there, or has no IPv4 address to send to")
+    return address._replace(host=host)
 
 
-def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
-    """A function from a peer's address to its endpoint's name, else to the address as text."""
-    by_peer: dict[tuple[str, int | None], str] = {}
-    for name, endpoint in table.endpoints.items() if table is not None else ():
-        port = endpoint.source_port.value if endpoint.source_port else None
-        by_peer[endpoint.address.value.host, port] = name
+def listener_address(listener: Listener) -> Address:
+    """Where to send from this computer so that a router of the table receives it there. Raises UsageError."""
+    return reachable(listener.address.value, listener.interface.value if listener.interface else None)
 
-    def name_of(peer: tuple[str, int]) -> str:
-        host, port = peer
-        return by_peer.get((host, port)) or by_peer.get((host, None)) or f"{host}:{port}"
+
+def peer_names(table: RouteTable | None) -> Callable[..., str]:
+    """A function from a peer's address, and the listener if it is one of the table, to its endpoint's name, else to the
+    address as text.
+    """
+
+    @cache
+    def recognised(listener: str | None) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
+        return recognisers(table.endpoints if table is not None else {}, listener)
+
+    def name_of(peer: tuple[str, int], listener: str | None = None) -> str:
+        by_host, by_address = recognised(listener)
+        return by_address.get(peer) or by_host.get(peer[0]) or f"{peer[0]}:{peer[1]}"
 
     return name_of
 

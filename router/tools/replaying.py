@@ -112,7 +112,7 @@ class Replayer:
         if listener not in listeners:
             hint = did_you_mean(listener, listeners)
             raise UsageError(f"the table has no listener '{listener}' as the recording has; {hint or 'give --to'}")
-        return places.reachable(listeners[listener].address.value)
+        return places.listener_address(listeners[listener])
 
     def _bound(self, found: Recorded) -> socket.socket:
         if self._origin is not None:

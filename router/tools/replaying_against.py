@@ -59,8 +59,8 @@ class Against:
         self.datagrams = 0
         self.span = 0
         """ns from the first datagram to the last."""
-        self.senders: set[tuple[str, Peer]] = set()
-        """What the recording calls them, and where they are."""
+        self.senders: set[tuple[str, str, Peer]] = set()
+        """What the recording calls them, by which listener they came, and where they are."""
         self._programs = (old, new)
         self._runs: tuple[Rehearsal, ...] = ()
         self._first = self._start = 0
@@ -73,7 +73,7 @@ class Against:
             self._runs = tuple(Rehearsal(program, found.at) for program in self._programs)
         self.datagrams += 1
         self.span = found.steady - self._first
-        self.senders.add((found.endpoint, found.peer))
+        self.senders.add((found.endpoint, found.listener, found.peer))
         for run, program in zip(self._runs, self._programs, strict=True):
             run.advance(self._start + self.span)
             if found.listener in program.table.listeners:
@@ -92,7 +92,8 @@ class Against:
     def is_among_strangers(self) -> bool:
         """Whether neither table knows anybody who sent."""
         tables = [Known(program.envelope, program.table) for program in self._programs]
-        return bool(self.senders) and not any(table.sender(peer) for table in tables for _, peer in self.senders)
+        places = {(listener, peer) for _, listener, peer in self.senders}
+        return bool(places) and not any(table.sender(*place) for table in tables for place in places)
 
     def _deliveries(self, side: int) -> dict[str, list[Delivery]]:
         """Since the last time, by target; what was lost is counted."""

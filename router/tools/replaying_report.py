@@ -125,7 +125,7 @@ def _strangers(found: Against) -> Iterator[str]:
     """Why next to nothing was delivered, where the tables are for another network than the recording."""
     if not found.is_among_strangers:
         return
-    named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, peer in found.senders})
+    named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, _, peer in found.senders})
     more = f" and {len(named) - MOST_SENDERS} more" if len(named) > MOST_SENDERS else ""
     yield ""
     yield f"neither table has an endpoint where the datagrams came from: {', '.join(named[:MOST_SENDERS])}{more};"

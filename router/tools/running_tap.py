@@ -25,7 +25,7 @@ class RunningTap:
     def __init__(
         self,
         wire: Wire,
-        name_of: Callable[[tuple[str, int]], str],
+        name_of: Callable[..., str],
         cases: Collection[str] = (),
         condition: Condition | None = None,
     ) -> None:
@@ -48,7 +48,7 @@ class RunningTap:
 
     def _heard(self, seen: Seen) -> Heard | None:
         """None where it is not wanted."""
-        peer = self._name_of(seen.peer)
+        peer = self._name_of(seen.peer, seen.listener)
         try:
             decoded = self._wire.decode(seen.data)
         except DecodeError as error:

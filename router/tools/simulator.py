@@ -21,7 +21,7 @@ from router.tools.board import Change, boards
 from router.tools.inbox import Inbox
 from router.tools.models import moment
 from router.tools.payload_model import PayloadModel
-from router.tools.places import LOOPBACK, open_udp, reachable
+from router.tools.places import LOOPBACK, listener_address, open_udp
 from router.tools.streams import STRANGER, Silence, check_silences, streams
 from router.tools.wire import Wire
 
@@ -75,7 +75,13 @@ class Simulator:
         self._silences = silences
         check_silences(silences, self._streams)
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed) for stream in self._streams]
-        self._router = reachable(next(iter(table.listeners.values())).address.value)
+        # What is known by no listener in particular sends to the first one.
+        self._router = listener_address(next(iter(table.listeners.values())))
+        self._believed_at = {
+            name: listener_address(table.listeners[endpoint.listener.value])
+            for name, endpoint in table.endpoints.items()
+            if endpoint.listener is not None
+        }
         self._selector = selectors.DefaultSelector()
         self._opened: list[socket.socket] = []
         self._senders: dict[str, socket.socket] = {}
@@ -157,7 +163,8 @@ class Simulator:
         message = stream.case.message_class()
         self._models[index].fill(message, moment(at, epoch))
         try:
-            self._senders[stream.endpoint].sendto(self._wire.encode(stream.case, message), self._router)
+            to = self._believed_at.get(stream.endpoint, self._router)
+            self._senders[stream.endpoint].sendto(self._wire.encode(stream.case, message), to)
         except OSError:
             self.statistics.unsent += 1
         else:

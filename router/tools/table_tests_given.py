@@ -48,7 +48,7 @@ class GivenReader:
         return GivenDatagram(
             span=span,
             peer=self._names.peer(sender.value, sender.span),
-            listener=self._listener(span, node),
+            listener=self._listener(span, node, sender.value),
             content=data if data is not None else self._payload(node, case),
             trim=boolean(node, "trim"),
             pad=pad.value if pad else 0,
@@ -61,10 +61,13 @@ class GivenReader:
         fields = node.get("fields")
         return case, self._fields.message(case.type, fields) if fields else MessageMatch({}, named.span)
 
-    def _listener(self, span: SourceSpan, node: MappingNode) -> str:
+    def _listener(self, span: SourceSpan, node: MappingNode, sender: str) -> str:
+        """The one that is named, else the one by which the sender is believed, else the only one."""
         named = optional_text(node, "listener")
         if named is not None:
             return self._names.listener(named.value, named.span)
+        if (believed_by := self._names.believed_by(sender)) is not None:
+            return believed_by
         if len(self._names.listeners) > 1:
             raise unsound(span, Code.MISSING_KEY, f"say which listener: {', '.join(self._names.listeners)}")
         return self._names.listeners[0]

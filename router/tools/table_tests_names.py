@@ -50,6 +50,11 @@ class Names:
         self._known(name, self._table.listeners, span, "listener", Code.BAD_VALUE)
         return name
 
+    def believed_by(self, sender: str) -> str | None:
+        """The listener of an endpoint, if it is one that has one."""
+        endpoint = self._table.endpoints.get(sender)
+        return endpoint.listener.value if endpoint and endpoint.listener else None
+
     @property
     def listeners(self) -> tuple[str, ...]:
         return tuple(self._table.listeners)

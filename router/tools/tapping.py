@@ -101,7 +101,7 @@ def listen_to_topic(listener: TopicListener) -> Iterator[HeardMessage]:
             yield HeardMessage(at, listener.type_name, cdr, listener.message(cdr))
 
 
-def listen(receiver: socket.socket, wire: Wire, name_of: Callable[[tuple[str, int]], str]) -> Iterator[Heard]:
+def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> Iterator[Heard]:
     """Wait for one datagram after the other, for ever."""
     receiver.setblocking(True)
     while True:

@@ -46,6 +46,10 @@ def test_endpoints_that_never_send_may_share_an_address(check_text: CheckText) -
         ("{a: {address: 127.0.0.1:1000}, b: {address: 127.0.0.4:1000}}", False),
         ("{a: {address: 127.0.0.1:1000}, b: {address: 127.0.0.1:1000}}", True),
         ("{a: {address: 0.0.0.0:1000}, b: {address: 127.0.0.1:1000}}", True),
+        ("{a: {address: 0.0.0.0:1000, interface: x}, b: {address: 0.0.0.0:1000, interface: y}}", False),
+        ("{a: {address: 0.0.0.0:1000, interface: x}, b: {address: 127.0.0.1:1000, interface: x}}", True),
+        ("{a: {address: 0.0.0.0:1000, interface: x}, b: {address: 0.0.0.0:1000}}", True),
+        ("{a: {address: 127.0.0.1:1000}, b: {address: 127.0.0.1:1000, interface: x}}", True),
     ],
 )
 def test_listeners_do_not_share_a_socket(check_text: CheckText, listen: str, has_clash: bool) -> None:
@@ -87,6 +91,60 @@ def test_senders_are_recognised_by_host_or_by_host_and_port(check_text: CheckTex
         " twin_a: {address: 127.0.0.4:8, kind: tool}, twin_b: {address: 127.0.0.4:9, kind: tool}}",
     )
     assert checked.table is not None
-    by_host, by_address = recognisers(checked.table.endpoints)
+    by_host, by_address = recognisers(checked.table.endpoints, None)
     assert by_host == {"127.0.0.2": "alone"}
     assert by_address == {("127.0.0.3", 81): "first", ("127.0.0.3", 82): "second"}
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "has_clash"),
+    [("a", "b", False), ("a", "a", True), ("a", None, True), (None, "b", True)],
+)
+def test_endpoints_with_one_address_are_told_apart_by_their_listeners(
+    check_text: CheckText, first: str | None, second: str | None, has_clash: bool
+) -> None:
+    listeners = (f", listener: {name}" if name else "" for name in (first, second))
+    one, two = (f"{{address: 127.0.0.2:8, kind: tool{listener}}}" for listener in listeners)
+    routes = "routes: {ph_info: {source: one, destinations: [three]}}"
+    three = "three: {address: 127.0.0.3:8, kind: tool}"
+    listen = "{a: {address: 127.0.0.1:1000}, b: {address: 127.0.0.1:1001}}"
+    found = codes(check_text, f"one: {one}, two: {two}, {three}", routes, listen=listen)
+    assert found == [Code.ADDRESS_CLASH] * has_clash
+
+
+def test_senders_are_recognised_by_their_listener(check_text: CheckText) -> None:
+    checked = check_text(
+        "routes: {ph_info: {source: [lan, radio], destinations: [tool]}}",
+        endpoints="{lan: {address: 127.0.0.2:8, kind: board, listener: a},"
+        " radio: {address: 127.0.0.2:8, kind: board, source_port: 81, listener: b},"
+        " tool: {address: 127.0.0.3:8, kind: tool}}",
+        listen="{a: {address: 127.0.0.1:1000}, b: {address: 127.0.0.1:1001}}",
+    )
+    assert checked.table is not None
+    endpoints = checked.table.endpoints
+    assert recognisers(endpoints, "a") == ({"127.0.0.2": "lan", "127.0.0.3": "tool"}, {})
+    assert recognisers(endpoints, "b") == ({"127.0.0.3": "tool"}, {("127.0.0.2", 81): "radio"})
+
+
+@pytest.mark.parametrize(
+    ("station", "source", "unused"),
+    [
+        ("", "board", []),
+        (", listener: radio", "[board, station]", []),
+        ("", "[board, station]", []),
+        (", listener: lan", "[board, station]", ["radio"]),
+        (", listener: lan", "any", []),
+    ],
+)
+def test_a_listener_that_rejects_everything_is_told(
+    check_text: CheckText, station: str, source: str, unused: list[str]
+) -> None:
+    board = ", listener: lan" if station else ""
+    found = check_text(
+        f"routes: {{ph_info: {{source: {source}, destinations: [tool]}}}}",
+        endpoints=f"{{board: {{address: 127.0.0.2:8, kind: board{board}}},"
+        f" station: {{address: 127.0.0.4:8, kind: basestation{station}}}, tool: {{address: 127.0.0.3:8, kind: tool}}}}",
+        listen="{lan: {address: 127.0.0.1:1000}, radio: {address: 127.0.0.1:1001}}",
+    ).diagnostics
+    told = [finding.message for finding in found if finding.code is Code.UNUSED_LISTENER]
+    assert [f"listener '{name}'" in message for name, message in zip(unused, told, strict=True)] == [True] * len(unused)

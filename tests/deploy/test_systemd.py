@@ -127,6 +127,32 @@ def test_its_listener_is_systemds_socket(running: Machine) -> None:
     assert f"pid={running.show('MainPID')}" in holders
 
 
+def test_listeners_on_an_interface_have_a_socket_unit_of_their_own(running: Machine) -> None:
+    table = f"""version: 1
+extends: {SIM}
+listen:
+  rover: {{interface: lo}}
+  radio: {{address: 127.0.0.6:25000}}
+"""
+    running.shell(f"printf '%s' '{table}' > /opt/two.yaml; {ROOT}/deploy/install-service.sh /opt/two.yaml")
+    assert (
+        running.state() == running.state("rover-router.socket") == running.state("rover-router-lo.socket") == "active"
+    )
+    assert running.show("BindToDevice", "rover-router-lo.socket") == "lo"
+    holders = running.shell("ss -lunpH 'sport = :25000'").splitlines()
+    assert sorted(line.split()[3] for line in holders) == ["127.0.0.5%lo:25000", "127.0.0.6:25000"]
+    assert all('"systemd"' in line and f"pid={running.show('MainPID')}" in line for line in holders)
+    running.shell(SEND)
+    running.wait_for(f"{METRICS} | grep -q '^router_datagrams_received_total{{listener=\"rover\"}} 1'")
+    assert "was handed over" not in running.journal().rpartition("router started")[2]
+    running.shell(f"sed -i '/radio:/d' /opt/two.yaml; {ROOT}/deploy/install-service.sh")
+    assert running.run("systemctl", "cat", "rover-router.socket", check=False).returncode != 0
+    assert running.state() == running.state("rover-router-lo.socket") == "active"
+    running.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
+    assert running.run("systemctl", "cat", "rover-router-lo.socket", check=False).returncode != 0
+    assert running.state() == running.state("rover-router.socket") == "active"
+
+
 def test_it_routes_to_ros_nodes_of_another_user(running: Machine) -> None:
     """Under all of its restrictions, and past the memory that Fast DDS shares among one user's processes only."""
     # The checkout, or its interpreter, may be in a home that nobody else can enter.

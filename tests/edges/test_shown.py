@@ -54,4 +54,18 @@ def test_zeros_are_repaired_where_the_listener_does_that(tmp_path: Path) -> None
 
 def test_senders_are_called_what_the_table_calls_them() -> None:
     peers = [("127.0.0.30", 25008), ("127.0.0.10", 1), ("10.9.9.9", 1)]
-    assert [KNOWN.sender(peer) for peer in peers] == ["sensor_board", "basestation", ""]
+    assert [KNOWN.sender("rover", peer) for peer in peers] == ["sensor_board", "basestation", ""]
+
+
+def test_a_sender_is_called_what_the_listener_takes_it_for(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text(
+        f"version: 1\nextends: {ROOT}/routes/sim.yaml\n"
+        "listen: {radio: {address: 127.0.0.6:25000, interface: lo}}\n"
+        "endpoints: {basestation: {listener: radio}}\n"
+    )
+    program = check_table(table).program
+    assert program is not None
+    known, station = Known(program.envelope, program.table), ("127.0.0.10", 29000)
+    assert [known.sender(listener, station) for listener in ("rover", "radio", "gone")] == ["", "basestation", ""]
+    assert known.sender("rover", ("127.0.0.30", 25008)) == "sensor_board"

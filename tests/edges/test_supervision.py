@@ -178,16 +178,30 @@ def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listene
     assert held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
 
 
+def test_a_socket_is_taken_for_its_interface_only(stack: ExitStack) -> None:
+    bound = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+    bound.bind(("127.0.0.1", 0))
+    address = Address(*bound.getsockname())
+    ours = Inherited([bound.dup()])
+    assert ours.take(str(address)) is None
+    assert ours.take(f"{address} on eth0") is None
+    assert ours.unclaimed() == [f"{address} on lo"]
+    stack.enter_context(ours.take(f"{address} on lo") or pytest.fail("it is there"))
+    assert ours.unclaimed() == []
+
+
 def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
     stream = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
     stream.bind(("127.0.0.1", 0))
     address = Address(*held.getsockname())
     ours = Inherited([held.dup(), stream.dup()])
     assert len(ours.unclaimed()) == 2
-    stack.enter_context(ours.take(address) or pytest.fail("it is there"))
+    stack.enter_context(ours.take(str(address)) or pytest.fail("it is there"))
     [left] = ours.unclaimed()
     assert left.endswith("which is no IPv4 UDP socket")
-    assert ours.take(address._replace(port=1)) is None
+    assert ours.take(str(address._replace(port=1))) is None
+    assert ours.take(f"{address} on lo") is None
 
 
 def test_what_is_meant_for_another_process_is_left_alone() -> None:

@@ -390,6 +390,19 @@ def test_an_address_of_another_computer_is_refused() -> None:
         Listener(plan(host="192.0.2.77"), SPAN)
 
 
+def test_a_listener_takes_only_what_comes_by_its_interface(stack: ExitStack, peer: socket.socket) -> None:
+    listener = stack.enter_context(closing(Listener(replace(plan(host="0.0.0.0"), interface="lo"), SPAN)))
+    peer.sendto(b"hello", ("127.0.0.1", listener.address.port))
+    assert listener.socket.recv(100) == b"hello"
+    assert listener.bound_to == f"0.0.0.0:{listener.address.port} on lo"
+    assert not listener.has_lost_interface()
+
+
+def test_an_interface_that_is_not_there_is_refused() -> None:
+    with pytest.raises(StartError, match=r"rover.yaml:12:20: listener 'rover' cannot use .* on nowhere0: there is no"):
+        Listener(replace(plan(), interface="nowhere0"), SPAN)
+
+
 def test_a_receive_buffer_is_as_large_as_asked_or_warned_about(stack: ExitStack) -> None:
     asked = 8 * int(Path("/proc/sys/net/core/rmem_max").read_text())
     with capture_logs() as logged:

@@ -27,7 +27,7 @@ class Naive:
     def receive(self, data: bytes, peer: tuple[str, int], listener: str) -> None:
         self._add(1, "datagrams_received", listener)
         self._add(len(data), "received_bytes", listener)
-        if (sender := self._endpoint(peer)) is not None:
+        if (sender := self._endpoint(peer, listener)) is not None:
             self._stamp("endpoint_last_seen_timestamp_seconds", sender)
         reason = self._take(data, peer, listener)
         if reason is not None:
@@ -52,9 +52,9 @@ class Naive:
             return "malformed"
         if whole != data:
             self._add(1, "datagrams_padded", listener)
-        return self._route(message, data, peer)
+        return self._route(message, data, peer, listener)
 
-    def _route(self, message: Message, data: bytes, peer: tuple[str, int]) -> str | None:
+    def _route(self, message: Message, data: bytes, peer: tuple[str, int], listener: str) -> str | None:
         name = message.WhichOneof("payload")
         if name is None:
             fields = UnknownFieldSet(message)
@@ -71,7 +71,7 @@ class Naive:
         if number not in self.program.inbound:
             self._add(1, "unhandled", name)
             return "unhandled"
-        sender = self._endpoint(peer)
+        sender = self._endpoint(peer, listener)
         if sender not in self.program.inbound[number][0].sources:
             return "source_mismatch"
         label = sender or "unknown"
@@ -81,8 +81,10 @@ class Naive:
         self._add(1, "route_seconds", name)  # the first bucket: the clock of these tests stands still
         return None
 
-    def _endpoint(self, peer: tuple[str, int]) -> str | None:
+    def _endpoint(self, peer: tuple[str, int], listener: str) -> str | None:
         for endpoint in self.program.table.endpoints.values():
+            if endpoint.listener is not None and endpoint.listener.value != listener:
+                continue
             port = endpoint.source_port.value if endpoint.source_port else None
             if endpoint.address.value.host == peer[0] and port in (None, peer[1]):
                 return endpoint.name

@@ -34,6 +34,14 @@ routes:
 """
 """Every table of these tests begins like this; what follows are its routes, indented by two."""
 
+HEAD_OF_LISTENERS = (
+    HEAD.replace("kind: basestation}", "kind: basestation, listener: exact}")
+    .replace("source_port: 8001}", "source_port: 8001, listener: trimmed}")
+    .replace("source_port: 8002}", "source_port: 8002, listener: exact}")
+    .replace("  recorder:", "  impostor: {address: 192.168.0.10:9001, kind: tool, listener: trimmed}\n  recorder:")
+)
+"""With endpoints that are believed by one listener; `impostor` has the basestation's address on the other one."""
+
 SENSOR_BOARD = ("192.168.0.30", 8)
 DRIVING_BOARD = ("192.168.0.222", 8)
 BASESTATION = ("192.168.0.10", 9000)

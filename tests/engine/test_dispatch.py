@@ -19,6 +19,7 @@ from tests.engine.rig import (
     BASESTATION,
     DRIVING_BOARD,
     HEAD,
+    HEAD_OF_LISTENERS,
     LEFT_TOOL,
     RIGHT_TOOL,
     SENSOR_BOARD,
@@ -103,6 +104,48 @@ class Both:
 @pytest.fixture(scope="module")
 def both(made: Program) -> Both:
     return Both(made)
+
+
+@pytest.fixture(scope="module")
+def both_of_listeners(tmp_path_factory: pytest.TempPathFactory) -> Both:
+    """Where endpoints are believed by one listener each: two of them have one address."""
+    routes = """\
+  imu_info: {source: sensor_board, destinations: [recorder]}
+  manual_drive: {source: basestation, destinations: [driving_board]}
+  gps_info: {source: impostor, destinations: [basestation]}
+  arm_pos: {source: [left_tool, right_tool], destinations: [basestation]}
+  drive_diag: {source: any, destinations: [recorder]}
+"""
+    return Both(program(tmp_path_factory.mktemp("listeners"), routes, HEAD_OF_LISTENERS))
+
+
+@settings(max_examples=1000)
+@given(data=damaged(), peer=st.sampled_from(PEERS), listener=st.sampled_from(["trimmed", "exact"]))
+def test_both_paths_agree_on_who_is_believed_by_which_listener(
+    both_of_listeners: Both, data: bytes, peer: Peer, listener: str
+) -> None:
+    both_of_listeners.receive(data, peer, listener)
+
+
+@pytest.mark.parametrize(
+    ("case", "peer", "believed_by"),
+    [
+        (MANUAL_DRIVE, BASESTATION, "exact"),
+        (GPS, BASESTATION, "trimmed"),
+        (IMU, SENSOR_BOARD, "trimmed exact"),
+        (ARM_POS, LEFT_TOOL, "trimmed"),
+        (ARM_POS, RIGHT_TOOL, "exact"),
+        (DRIVE_DIAG, BASESTATION, "trimmed exact"),
+    ],
+)
+def test_an_endpoint_is_believed_by_its_listener(
+    both_of_listeners: Both, case: int, peer: Peer, believed_by: str
+) -> None:
+    for listener in ("trimmed", "exact"):
+        rig = Rig(both_of_listeners.rig.program)
+        rig.receive(framed(case, b""), peer, listener)
+        assert rig.rejected(listener) == (None if listener in believed_by else "source_mismatch")
+        assert bool(rig.sent) == (listener in believed_by)
 
 
 @settings(max_examples=1000)

@@ -17,11 +17,12 @@ import pytest
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.tools import doctor_host, doctor_network
+from router.tools import doctor_host, doctor_network, doctor_ros
 from router.tools.doctor import before_start, examine
 from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
-from router.tools.doctor_network import endpoints, ports
+from router.tools.doctor_network import endpoints, interfaces, ports
 from router.tools.doctor_report import Finding, Grade
+from router.tools.doctor_ros import open_domain
 from router.tools.doctor_running import health
 from tests.ports import free_port
 
@@ -105,6 +106,59 @@ def test_an_address_that_no_interface_has_is_told(table: Path) -> None:
     table.write_text(table.read_text().replace('address: "127.0.0.1:', 'address: "192.0.2.1:'))
     [found] = ports(compiled(table), running=False)
     assert (found.grade, "no interface of this computer has 192.0.2.1" in found.text) == (Grade.PROBLEM, True)
+
+
+@pytest.mark.parametrize(
+    ("variables", "networks", "warned"),
+    [
+        ({}, ["lo", "eth0", "wlan0"], "by eth0, wlan0"),
+        ({"ROS_DOMAIN_ID": "0", "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}, ["lo", "eth0"], "by eth0"),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, ["lo", "eth0"], None),
+        ({"ROS_DOMAIN_ID": "42"}, ["lo", "eth0"], None),
+        ({}, ["lo"], None),
+    ],
+)
+def test_an_open_ros_domain_is_a_warning(
+    table: Path, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], networks: list[str], warned: str | None
+) -> None:
+    monkeypatch.setattr(socket, "if_nameindex", lambda: list(enumerate(networks, 1)))
+    monkeypatch.setattr(doctor_ros, "interface_is_up", lambda _: True)
+    assert list(open_domain(compiled(table), variables)) == []  # without topics
+    table.write_text(
+        table.read_text().replace(
+            "ph_info: {source: sensor_board, destinations: [basestation]}",
+            "ph_info: {source: sensor_board, topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, fields: auto}]}",
+        )
+    )
+    found = list(open_domain(compiled(table), variables))
+    assert [(each.grade, each.text.partition("looked for ")[2]) for each in found] == (
+        [(Grade.WARNING, warned)] if warned else []
+    )
+
+
+def on_interface(table: Path, name: str) -> Program:
+    table.write_text(table.read_text().replace("receive_buffer:", f"interface: {name}, receive_buffer:"))
+    return compiled(table)
+
+
+def test_the_interface_of_a_listener_is_looked_at(table: Path) -> None:
+    program = on_interface(table, "lo")
+    assert texts(list(interfaces(program)), Grade.FINE) == ["listener 'rover': network interface lo is up"]
+    assert [each.grade for each in ports(program, running=False)] == [Grade.FINE]
+
+
+@pytest.mark.parametrize("look", [examine, before_start])
+def test_an_interface_that_is_not_there_is_a_problem(table: Path, look: type) -> None:
+    on_interface(table, "nowhere0")
+    found = [finding for finding in look(table, {}) if finding.grade is Grade.PROBLEM]
+    assert [finding.text for finding in found] == ["listener 'rover': network interface nowhere0 does not exist"]
+
+
+def test_an_interface_that_is_down_is_a_problem(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = on_interface(table, "dummy0")
+    monkeypatch.setattr(doctor_network, "interface_is_up", lambda _: False)
+    [found] = interfaces(program)
+    assert (found.grade, found.remedy) == (Grade.PROBLEM, "ip link set dummy0 up")
 
 
 def test_a_buffer_beyond_the_kernels_limit_is_a_warning(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from router.table.model import RouteTable
+from router.table.model import Address, RouteTable
 from router.tools import UsageError
 from router.tools.board import State
 from router.tools.places import LOOPBACK, open_udp, reachable
@@ -56,6 +56,23 @@ def test_each_endpoint_sends_its_cases_from_its_own_address(
     with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
         simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
         assert received(router, wire) == {"127.0.6.30": {"every_kind"}, "127.0.6.10": {"plain"}}
+
+
+def test_an_endpoint_sends_to_the_listener_that_believes_it(
+    wire: Wire, table_path: Callable[..., Path], router: socket.socket
+) -> None:
+    path = table_path()
+    radio = open_udp(Address(LOOPBACK, 0), "radio")
+    listen = f"  radio: {{address: '{Address(*radio.getsockname())}', interface: lo}}\nendpoints:"
+    text = (
+        path.read_text()
+        .replace("endpoints:", listen)
+        .replace("kind: basestation", "kind: basestation, listener: radio")
+    )
+    path.write_text(text)
+    with router, radio, closing(Simulator(wire, read_table(path), seed=1, rate_scale=FAST)) as simulator:
+        simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
+        assert received(radio, wire) == {"127.0.6.10": {"plain"}}
 
 
 def test_what_comes_back_is_counted_by_endpoint_and_case(wire: Wire, table: RouteTable) -> None:

@@ -16,7 +16,7 @@ from router.tools.table_tests_coverage import Coverage
 from router.tools.table_tests_model import TableTestFile
 from router.tools.table_tests_reading import read_test_file
 from router.tools.table_tests_shown import offset
-from tests.engine.rig import HEAD
+from tests.engine.rig import HEAD, HEAD_OF_LISTENERS
 
 DEFINITIONS = Definitions()
 IMU = """
@@ -149,6 +149,19 @@ def test_bytes_are_given_and_expected_as_hex(tmp_path: Path) -> None:
             dropped: {imu/data_raw: mapping_error}
         """
     assert not failures(tmp_path, IMU, tests)
+
+
+def test_a_datagram_arrives_where_its_sender_is_believed_unless_said(tmp_path: Path) -> None:
+    drive = "\nmanual_drive: {source: basestation, destinations: [driving_board], deadman: not part of this test}\n"
+    tests = """
+        believed:
+          given: {case: manual_drive, from: basestation}
+          expect: {sent: driving_board}
+        forged:
+          given: {case: manual_drive, from: basestation, listener: trimmed}
+          expect: {rejected: source_mismatch}
+        """
+    assert not failures(tmp_path, drive, tests, HEAD_OF_LISTENERS)
 
 
 def test_old_boards_trim_and_pad(tmp_path: Path) -> None:

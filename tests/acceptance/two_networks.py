@@ -1,0 +1,95 @@
+"""A rover with a LAN and a radio, each a network namespace with interfaces as real computers have, and attackers."""
+
+from __future__ import annotations
+
+import socket
+import urllib.request
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.acceptance.payloads import WIRE
+from tests.acceptance.site import ROOT, RouterProcess, key
+from tests.namespaces import Computer, cable, computers
+
+BASESTATION, BOARD = ("10.78.2.10", 9000), ("10.78.1.222", 8)
+LAN, RADIO = ("10.78.1.1", 5000), ("10.78.2.1", 5000)
+"""Where the rover is in each."""
+DRIVE = WIRE.encode(WIRE.case("manual_drive"), WIRE.case("manual_drive").message_class())
+BRAKE = WIRE.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
+
+
+@dataclass
+class Rover:
+    """The rover and its two networks; `board` and `basestation` are sockets there."""
+
+    folder: Path
+    rover: Computer
+    lan: Computer
+    radio: Computer
+    board: socket.socket
+    basestation: socket.socket
+
+    def table(self, text: str) -> Path:
+        path = self.folder / "table.yaml"
+        path.write_text(text.format(root=ROOT))
+        return path
+
+    @contextmanager
+    def router(self, text: str) -> Iterator[RouterProcess]:
+        path = self.table(text)
+        with self.rover.inside(lambda: RouterProcess(self.folder, path)) as router:
+            yield router
+
+    def samples(self) -> dict[str, float]:
+        def ask() -> str:
+            with urllib.request.urlopen("http://127.0.0.1:9108/metrics", timeout=5) as answer:
+                return str(answer.read().decode())
+
+        lines = (line.rpartition(" ") for line in self.rover.inside(ask).splitlines() if line.startswith("router_"))
+        return {name[len("router_") :]: float(value) for name, _, value in lines}
+
+    def board_gets(self) -> list[bytes]:
+        """What reached the board and was not looked at yet, but for what deadmen say to it."""
+        found = []
+        self.board.settimeout(0.2)
+        with suppress(TimeoutError):
+            while True:
+                found.append(self.board.recv(1000))
+        return [datagram for datagram in found if datagram != BRAKE]
+
+    def count(self, metric: str, **labels: str) -> float:
+        return self.samples()[key(metric, **labels)]
+
+    def mismatches(self, listener: str) -> float:
+        return self.count("datagrams_rejected_total", listener=listener, reason="source_mismatch")
+
+    def seen(self, endpoint: str) -> bool:
+        return self.count("endpoint_last_seen_timestamp_seconds", endpoint=endpoint) > 0
+
+
+def udp(computer: Computer, address: tuple[str, int]) -> socket.socket:
+    opened = computer.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    opened.bind(address)
+    opened.settimeout(5)
+    return opened
+
+
+@contextmanager
+def rover_with_networks(folder: Path) -> Iterator[Rover]:
+    with computers("rover", "lan", "radio") as (rover, lan, radio), ExitStack() as stack:
+        cable(rover, "lan0", "10.78.1.1/24", lan, "eth0", "10.78.1.222/24")
+        cable(rover, "radio0", "10.78.2.1/24", radio, "eth0", "10.78.2.10/24")
+        lan.ip("address", "add", "10.78.1.60/24", "dev", "eth0")
+        board = stack.enter_context(udp(lan, BOARD))
+        basestation = stack.enter_context(udp(radio, BASESTATION))
+        yield Rover(folder, rover, lan, radio, board, basestation)
+
+
+def attacker(site: Rover, stack: ExitStack, computer: Computer, address: tuple[str, int]) -> socket.socket:
+    """A socket with somebody else's address, in a network where that one is not."""
+    computer.ip("address", "add", f"{address[0]}/32", "dev", "eth0")
+    computer.ip("route", "replace", "10.78.0.0/16", "dev", "eth0")
+    # Or the router's answers, and its own ARP, would tell the two apart.
+    return stack.enter_context(udp(computer, (address[0], 0)))

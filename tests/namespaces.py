@@ -1,0 +1,81 @@
+"""Network namespaces for tests: computers with networks of their own, from which nothing gets out."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+T = TypeVar("T")
+
+CLONE_NEWNET = 0x40000000
+_numbers = itertools.count()
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class Computer:
+    """A network namespace. What `inside` opens there stays there, whoever uses it afterwards."""
+
+    def __init__(self, name: str) -> None:
+        self.namespace = f"router{os.getpid()}-{next(_numbers)}-{name}"
+
+    def run(self, *command: object, check: bool = True) -> str:
+        """Runs a command there, and returns what it printed."""
+        return _run("ip", "netns", "exec", self.namespace, *command, check=check)
+
+    def ip(self, *arguments: object) -> str:
+        return _run("ip", "-n", self.namespace, *arguments)
+
+    def inside(self, call: Callable[[], T]) -> T:
+        """What `call` returns in a thread that is there."""
+
+        def enter_and_call() -> T:
+            with Path("/run/netns", self.namespace).open() as namespace:
+                if _libc.setns(namespace.fileno(), CLONE_NEWNET):
+                    raise OSError(ctypes.get_errno(), "setns")
+            return call()
+
+        with ThreadPoolExecutor(1) as thread:
+            return thread.submit(enter_and_call).result()
+
+
+@contextmanager
+def computers(*names: str) -> Iterator[list[Computer]]:
+    """New ones, with nothing but a loopback interface that is up; skips the test where there can be none.
+
+    They believe every source address (rp_filter 0): that is the kernel's default, and what an attacker hopes for.
+    """
+    if os.geteuid() != 0 or shutil.which("ip") is None:
+        pytest.skip("needs root and `ip`, for network namespaces")
+    with ExitStack() as ending:
+        found = [Computer(name) for name in names]
+        for computer in found:
+            _run("ip", "netns", "add", computer.namespace)
+            ending.callback(_run, "ip", "netns", "del", computer.namespace)
+            computer.ip("link", "set", "lo", "up")
+            for which in ("all", "default"):
+                computer.run("sysctl", "-qw", f"net.ipv4.conf.{which}.rp_filter=0")
+        yield found
+
+
+def cable(one: Computer, end: str, address: str, other: Computer, other_end: str, other_address: str) -> None:
+    """A veth pair with an interface of that name and that address (`10.78.1.1/24`) at each end."""
+    one.ip("link", "add", end, "type", "veth", "peer", "name", other_end, "netns", other.namespace)
+    for computer, name, network in ((one, end, address), (other, other_end, other_address)):
+        computer.ip("address", "add", network, "dev", name)
+        computer.ip("link", "set", name, "up")
+
+
+def _run(*command: object, check: bool = True) -> str:
+    finished = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, timeout=60)
+    assert not check or finished.returncode == 0, f"{command}\n{finished.stdout}{finished.stderr}"
+    return finished.stdout + finished.stderr
