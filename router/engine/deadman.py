@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 from router.compiler.books import Books
 from router.compiler.program import DeadmanPlan
+from router.engine.delivery import Feed
 from router.engine.machine import Guard
 from router.engine.outcome import Report
-
-Feed = Callable[[int], None]
-"""Hears of a command that is about to be sent, at a time of the monotonic clock in ns."""
 
 FeedMaker = Callable[[str, Sequence[str]], Feed]
 """Makes of a route's name, and of the names in TargetPlan.deadmen, the call that tells all these deadmen at once."""
@@ -33,13 +31,14 @@ class _Destination:
 class Deadman:
     """A machine with three states.
 
-    unarmed: no command came yet, or others have taken over since, and nothing is due.
-    armed:   the next thing due is `timeout` after the last fresh command. Then it trips.
+    unarmed: no command was sent yet, or others have taken over since, and nothing is due.
+    armed:   the next thing due is `timeout` after the last command was sent. Then it trips.
     tripped: sends at once, then on the grid of the time at which it was due to trip.
 
-    A fresh command arms it, whatever its state (`feed`); one of a route that it hands over to disarms it
-    (`relieve`). Both are to be called before the command is sent, so that nothing the deadman sends comes behind the
-    command. `send` is by endpoint and may raise OSError, which ends nothing. `changed` hears the route's name and
+    A command that is sent arms it, whatever its state (`feed`); one of a route that it hands over to disarms it
+    (`relieve`). Both are to be called right before the command is sent, not when it begins to wait, so that nothing the
+    deadman sends comes behind the command. Called for a deadman that another one has replaced, they act on that one:
+    what waited since before a reload is sent after it. `send` is by endpoint and may raise OSError, which ends nothing. `changed` hears the route's name and
     whether the deadman is active now. All times in ns of the monotonic clock.
     """
 
@@ -53,6 +52,7 @@ class Deadman:
         changed: Callable[[str, bool], None],
     ) -> None:
         self.next_due: int | None = None
+        self._acting = [self]  # shared with all that it replaced: the one that took the place of them
         self._plan = plan
         self._tripped = False
         self._counts = counts
@@ -73,19 +73,23 @@ class Deadman:
 
     def feed(self, now: int) -> None:
         """A fresh command is about to be sent."""
-        self.next_due = now + self._plan.timeout
-        self._release()
+        acting = self._acting[0]
+        acting.next_due = now + acting._plan.timeout
+        acting._release()
 
     def relieve(self, now: int) -> None:
         """A fresh command of a route that it hands over to is about to be sent."""
-        self.next_due = None
-        self._release()
+        acting = self._acting[0]
+        acting.next_due = None
+        acting._release()
 
     def inherit(self, earlier: Deadman) -> None:
         """Takes the place of `earlier`, the same route's in another table: armed by its command, tripped if it was.
 
         `earlier` keeps the destinations that are not ours, for its last word.
         """
+        self._acting = earlier._acting
+        self._acting[0] = self
         ours = {(each.endpoint, each.send) for each in self._destinations}
         earlier._destinations = [each for each in earlier._destinations if (each.endpoint, each.send) not in ours]
         if earlier.next_due is None:
