@@ -42,15 +42,19 @@ def _duration(nanoseconds: int | None) -> Duration:
 Incompatible = Callable[[str, str, int], None]
 """Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and how many peers it kept away so far."""
 
+Met = Callable[[str], None]
+
 
 class PeerEvents:
     """The callbacks with which publishers and subscriptions tell of their peers. For one thread.
 
-    `subscribed` has the topics that somebody subscribes to; other threads may look whether it is empty.
+    `subscribed` has the topics that somebody subscribes to; other threads may look whether it is empty. `met(topic)` is
+    called when somebody new subscribes.
     """
 
-    def __init__(self, incompatible: Incompatible) -> None:
+    def __init__(self, incompatible: Incompatible, met: Met) -> None:
         self.subscribed: set[str] = set()
+        self._met = met
         self._incompatible = incompatible
         self._peers: Counter[tuple[str, str]] = Counter()
 
@@ -60,6 +64,8 @@ class PeerEvents:
         def on_matched(status: Any) -> None:
             (self.subscribed.add if status.current_count else self.subscribed.discard)(plan.topic)
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
+            if status.total_count_change > 0:
+                self._met(plan.topic)
 
         def on_incompatible_qos(status: Any) -> None:
             sentence = "a subscriber asks for a QoS that the table does not offer, and gets nothing"

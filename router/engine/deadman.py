@@ -16,6 +16,9 @@ FeedMaker = Callable[[str, Sequence[str]], Feed]
 
 _NEVER = 1 << 63
 
+START = 10_000_000_000
+"""How long after the start of the router who is met counts as one who was there before, in ns. Discovery takes less."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Destination:
@@ -38,8 +41,11 @@ class Deadman:
     A command that is sent arms it, whatever its state (`feed`); one of a route that it hands over to disarms it
     (`relieve`). Both are to be called right before the command is sent, not when it begins to wait, so that nothing the
     deadman sends comes behind the command. Called for a deadman that another one has replaced, they act on that one:
-    what waited since before a reload is sent after it. `send` is by endpoint and may raise OSError, which ends nothing. `changed` hears the route's name and
-    whether the deadman is active now. All times in ns of the monotonic clock.
+    what waited since before a reload is sent after it.
+
+    `begin` and `meet` send the payload at the start of the router, and change no state. `send` is by endpoint and may
+    raise OSError, which ends nothing. `changed` hears the route's name and whether the deadman is active now. All times
+    in ns of the monotonic clock.
     """
 
     def __init__(
@@ -52,6 +58,7 @@ class Deadman:
         changed: Callable[[str, bool], None],
     ) -> None:
         self.next_due: int | None = None
+        self._meets_until = 0
         self._acting = [self]  # shared with all that it replaced: the one that took the place of them
         self._plan = plan
         self._tripped = False
@@ -83,11 +90,28 @@ class Deadman:
         acting.next_due = None
         acting._release()
 
+    def begin(self) -> list[str]:
+        """The router starts: what moves may go on with the last command of a router that was killed.
+
+        Sends, before anything else is sent, unless the table says that it is silent. Returns the endpoints that it was
+        sent to.
+        """
+        return self._send() if self._plan.at_start else []
+
+    def wait_to_meet(self, now: int) -> None:
+        """The router starts: as `begin`, where nobody can be sent to before he is met."""
+        self._meets_until = now + START if self._plan.at_start else 0
+
+    def meet(self, now: int) -> list[str]:
+        """Somebody is there now to whom it sends. Sends, shortly after the start and as long as no command was sent."""
+        return self._send() if now < self._meets_until and self.next_due is None else []
+
     def inherit(self, earlier: Deadman) -> None:
         """Takes the place of `earlier`, the same route's in another table: armed by its command, tripped if it was.
 
         `earlier` keeps the destinations that are not ours, for its last word.
         """
+        self._meets_until = earlier._meets_until if self._plan.at_start else 0
         self._acting = earlier._acting
         self._acting[0] = self
         ours = {(each.endpoint, each.send) for each in self._destinations}
@@ -118,6 +142,7 @@ class Deadman:
 
     def end(self, now: int) -> None:
         """Orderly shutdown: sends a last time unless no command ever came. Then nothing is due any more."""
+        self._meets_until = 0
         if self.next_due is not None:
             self.next_due = None
             self._send()
@@ -128,7 +153,8 @@ class Deadman:
             self._counts[self._active] = 0
             self._changed(self._plan.route, False)
 
-    def _send(self) -> None:
+    def _send(self) -> list[str]:
+        sent = []
         for destination in self._destinations:
             try:
                 destination.send(destination.datagram)
@@ -137,6 +163,8 @@ class Deadman:
                 self._report(Report("deadman", self._plan.route, destination.endpoint, "send_error", error))
             else:
                 self._counts[destination.sent] += 1
+                sent.append(destination.endpoint)
+        return sent
 
 
 def feeder(deadmen: Mapping[str, Deadman], guard: Guard) -> FeedMaker:

@@ -90,7 +90,11 @@ class Edges:
     # -- another program -----------------------------------------------------------------------------------------
 
     def prepare(self, program: Program) -> Change:
-        """Opens what `program` wants and is not open, and changes nothing. Raises StartError."""
+        """Opens what `program` wants and is not open, and changes nothing. Raises StartError.
+
+        For the first program, deadmen send here what they send at the start: gateways hear clients as soon as they are
+        open.
+        """
         with ExitStack() as undo:
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
@@ -99,6 +103,8 @@ class Edges:
             state = State(self.wiring.state if self.wiring else None)
             undo.callback(lambda: self._around.keepers.release(list(state.made())))
             wiring = wire(program, self._around, sockets, self._ros, topics, state)
+            if self.wiring is None:  # the router starts, and nothing is received yet
+                wiring.begin(self._around.keepers)
             gateways = self._prepare_gateways(program, wiring, undo)
             return Change(sockets, topics, wiring, gateways, undo.pop_all())
 
@@ -156,7 +162,7 @@ class Edges:
         if self._ros is None and not wants_ros(program):
             return None
         if self._ros is None:
-            self._ros = open_ros(program, self._ros_args, self._incompatible)
+            self._ros = open_ros(program, self._ros_args, self._incompatible, self._met)
             undo.callback(self._close_ros)
             self._ros.start({}, self._around.reporter.failed)
         change = self._ros.prepare(program.publishers, program.subscriptions, places(program))
@@ -192,6 +198,11 @@ class Edges:
         program = self.wiring.program
         for name in who_names(program).get(topic, ()):
             self._around.accounts.events[program.books.slot("qos_incompatible", name, topic, policy)] = peers
+
+    def _met(self, topic: str) -> None:
+        """Somebody new subscribes to a topic of ours."""
+        if self.wiring is not None:
+            self.wiring.meet(topic, self._around.keepers)
 
     def _enough(self) -> int:
         return FOR_SUBSCRIBERS if self._ros is not None and self._ros.subscribed else FOR_SOCKETS

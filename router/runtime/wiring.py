@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from router.compiler.program import DeadmanPlan, Program
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.intake import Receive
+from router.edges.log import logger
 from router.edges.reports import Reporter
 from router.edges.timekeeper import Timekeeper
 from router.engine import Engine, OutboundEngine
@@ -68,6 +69,22 @@ class Wiring:
     deadmen: Mapping[str, Deadman]
     pacers: Mapping[str, Pacer]
     cuts: Sequence[Callable[[], None]]
+
+    def begin(self, keepers: Keepers) -> None:
+        """The router starts: has deadmen send, those that publish as soon as a subscriber is met."""
+        for plan in self.program.deadmen:
+            deadman = self.deadmen[plan.route]
+            _tell_start(plan.route, keepers.deadman.guard(deadman, deadman.begin)())
+        for plan in _inbound_deadmen(self.program):
+            deadman = self.deadmen[plan.route]
+            keepers.deadman.guard(deadman, deadman.wait_to_meet)(monotonic_ns())
+
+    def meet(self, topic: str, keepers: Keepers) -> None:
+        """Somebody new subscribes to `topic`."""
+        for plan in _inbound_deadmen(self.program):
+            if topic in dict(plan.datagrams):
+                deadman = self.deadmen[plan.route]
+                _tell_start(plan.route, keepers.deadman.guard(deadman, deadman.meet)(monotonic_ns()))
 
     def forget(self) -> None:
         """Nobody calls the functions any more. Each is in a ring with its globals; cut, they are gone at once."""
@@ -136,7 +153,7 @@ def _deadmen(
     program: Program, around: Surroundings, send: Mapping[str, Send], ros: RosEdge | None, state: State
 ) -> dict[str, Deadman]:
     """By route; those of what gateways let in send to topics."""
-    inbound = [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
+    inbound = _inbound_deadmen(program)
     outlets = dict(send)
     if ros is not None:
         for topic in {topic for plan in inbound for topic, _ in plan.datagrams}:
@@ -152,6 +169,16 @@ def _deadmen(
         )
         for plan in (*program.deadmen, *inbound)
     }
+
+
+def _inbound_deadmen(program: Program) -> list[DeadmanPlan]:
+    """Of what gateways let in."""
+    return [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
+
+
+def _tell_start(route: str, sent_to: Sequence[str]) -> None:
+    if sent_to:
+        logger.info("the deadman has sent its payload, since the router starts", route=route, to=list(sent_to))
 
 
 def _pacers(program: Program, keeper: Timekeeper, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:

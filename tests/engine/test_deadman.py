@@ -272,3 +272,14 @@ def test_one_that_tripped_hands_on_when_it_sent_last() -> None:
     before.run(TIMEOUT)
     after = succession(before, DeadmanPlan("drive", 10 * TIMEOUT, REPEAT // 4, PLAN.datagrams))
     assert after.deadman.next_due == TIMEOUT + REPEAT // 4
+
+
+def test_a_command_that_waited_since_before_a_reload_feeds_the_one_that_acts_now() -> None:
+    before = Watched()
+    between = succession(before, PLAN)
+    after = succession(between, DeadmanPlan("drive", 2 * TIMEOUT, REPEAT, PLAN.datagrams))
+    for number, deadman in enumerate((before.deadman, between.deadman, after.deadman)):
+        deadman.feed(number)
+        assert after.deadman.next_due == number + 2 * TIMEOUT
+    before.deadman.relieve(0)
+    assert [each.deadman.next_due for each in (before, between, after)] == [None, None, None]
