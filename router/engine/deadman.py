@@ -17,7 +17,10 @@ FeedMaker = Callable[[str, Sequence[str]], Feed]
 _NEVER = 1 << 63
 
 START = 10_000_000_000
-"""How long after the start of the router who is met counts as one who was there before, in ns. Discovery takes less."""
+"""How long after the router's start a new subscriber may be one who was there before (ns): discovery takes less."""
+
+GREETING = 500_000_000
+"""How long after that the subscriber knows the publisher as well, in ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,7 @@ class Deadman:
     ) -> None:
         self.next_due: int | None = None
         self._meets_until = 0
+        self._greets = False  # what is due is no trip, but the second message to a new subscriber
         self._acting = [self]  # shared with all that it replaced: the one that took the place of them
         self._plan = plan
         self._tripped = False
@@ -82,6 +86,7 @@ class Deadman:
         """A fresh command is about to be sent."""
         acting = self._acting[0]
         acting.next_due = now + acting._plan.timeout
+        acting._greets = False
         acting._release()
 
     def relieve(self, now: int) -> None:
@@ -103,8 +108,15 @@ class Deadman:
         self._meets_until = now + START if self._plan.at_start else 0
 
     def meet(self, now: int) -> list[str]:
-        """Somebody is there now to whom it sends. Sends, shortly after the start and as long as no command was sent."""
-        return self._send() if now < self._meets_until and self.next_due is None else []
+        """A new subscriber is there. Sends, shortly after the start and as long as no command was sent.
+
+        Sends again after GREETING: subscriber and publisher do not learn of each other at the same time, and best
+        effort loses what is sent between.
+        """
+        if now >= self._meets_until or (self.next_due is not None and not self._greets):
+            return []
+        self._greets, self.next_due = True, now + GREETING
+        return self._send()
 
     def inherit(self, earlier: Deadman) -> None:
         """Takes the place of `earlier`, the same route's in another table: armed by its command, tripped if it was.
@@ -116,7 +128,8 @@ class Deadman:
         self._acting[0] = self
         ours = {(each.endpoint, each.send) for each in self._destinations}
         earlier._destinations = [each for each in earlier._destinations if (each.endpoint, each.send) not in ours]
-        if earlier.next_due is None:
+        if earlier.next_due is None or earlier._greets:
+            earlier.next_due = None
             return
         due, earlier.next_due = earlier.next_due, _NEVER  # it does nothing any more but end
         if self.next_due is not None:  # it has heard of a command already, which was a later one
@@ -128,6 +141,10 @@ class Deadman:
     def due(self, now: int) -> None:
         due, repeat = self.next_due, self._plan.repeat
         if due is None or now < due:
+            return
+        if self._greets:
+            self._greets, self.next_due = False, None
+            self._send()
             return
         # Before anything can fail; and what a stalled process has missed is left out, not made up for in a burst.
         self.next_due = due + repeat * ((now - due) // repeat + 1)
@@ -142,9 +159,9 @@ class Deadman:
 
     def end(self, now: int) -> None:
         """Orderly shutdown: sends a last time unless no command ever came. Then nothing is due any more."""
-        self._meets_until = 0
-        if self.next_due is not None:
-            self.next_due = None
+        self._meets_until, is_armed = 0, self.next_due is not None and not self._greets
+        self.next_due = None
+        if is_armed:
             self._send()
 
     def _release(self) -> None:
