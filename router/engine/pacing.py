@@ -68,13 +68,17 @@ class Pacer(Machine):
             self._forfeit(now)
             lane.append(_Waiting(outcome, send, data, expires, self._time_of(len(data))))
             self._room -= len(data)
-            self.due(now)
+            self._serve(now)
             while self._room < 0:
                 self._drop_one()
 
         return deliver
 
     def due(self, now: int) -> None:
+        self._forfeit(now)
+        self._serve(now)
+
+    def _serve(self, now: int) -> None:
         self.next_due = None
         for lane in self._lanes.values():
             while lane:
@@ -96,6 +100,7 @@ class Pacer(Machine):
 
     def serve_only(self, now: int, places: Container[Place]) -> None:
         """Sends what waits for other targets, whatever the budget: later, nobody would count it."""
+        self._forfeit(now)
         for lane in self._lanes.values():
             for _ in range(len(lane)):
                 if lane[0].outcome.place in places:
@@ -104,19 +109,23 @@ class Pacer(Machine):
                     self._send_first(lane, now)
 
     def _send_first(self, lane: deque[_Waiting], now: int) -> None:
-        self._forfeit(now)
         outcome, send, data, expires, takes = lane.popleft()
         self._room += len(data)
         if is_stale(now, expires):
             outcome.dropped("stale")
+            self._forfeit(now)
         else:
             self._paid_at += takes
             send(now, data, expires)
 
     def _forfeit(self, now: int) -> None:
-        """Limits what is saved up. To be called before another datagram waits first."""
-        first = max((lane[0].takes for lane in self._others if lane), default=0)
-        self._paid_at = max(self._paid_at, now - BURST - first)
+        """Limits what is saved up. To be called before others wait first than did until now."""
+        first = 0
+        for lane in self._others:
+            if lane and lane[0].takes > first:
+                first = lane[0].takes
+        if self._paid_at < now - BURST - first:
+            self._paid_at = now - BURST - first
 
     def _drop_one(self) -> None:
         lowest = next(lane for lane in reversed(self._lanes.values()) if lane)
