@@ -124,8 +124,7 @@ class Pacer(Machine):
         for lane in self._others:
             if lane and lane[0].takes > first:
                 first = lane[0].takes
-        if self._paid_at < now - BURST - first:
-            self._paid_at = now - BURST - first
+        self._paid_at = max(self._paid_at, now - BURST - first)
 
     def _drop_one(self) -> None:
         lowest = next(lane for lane in reversed(self._lanes.values()) if lane)

@@ -117,7 +117,8 @@ def wire(
     """For the sockets and topics that `program` is to have."""
     accounts, keepers = around.accounts, around.keepers
     send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
-    deadmen = _deadmen(program, around, send, ros, state)
+    looking = {endpoint: sender.send_and_look for endpoint, sender in sockets.senders.items()}
+    deadmen = _deadmen(program, around, looking, ros, state)
     feed = feeder(deadmen, keepers.deadman.guard)
     pacers = _pacers(program, keepers.pacing, send, state)
     outlets = Outlets(

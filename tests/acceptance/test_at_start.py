@@ -15,7 +15,7 @@ import pytest
 
 from tests.acceptance.payloads import WIRE, sample
 from tests.acceptance.service_manager import ServiceManager
-from tests.acceptance.site import RouterProcess, Site, key, site, total
+from tests.acceptance.site import RouterProcess, Site, key, site, total, udp
 from tests.ports import free_port
 
 TABLE = """\
@@ -148,6 +148,20 @@ def test_a_router_that_cannot_reach_the_board_starts_all_the_same(tmp_path: Path
         [lost] = router.events("the deadman could not send")
         assert (lost["route"], lost["target"], lost["reason"]) == ("manual_drive", "driving_board", "send_error")
         assert router.events(SENT) == []
+
+
+def test_that_nobody_listens_yet_is_no_loss_of_the_first_command(place: Site) -> None:
+    table = place.table(TABLE)
+    address = place.endpoints["driving_board"].getsockname()
+    place.endpoints["driving_board"].close()
+    with RouterProcess(place.folder, table) as router, udp(*address) as board:
+        [lost] = router.events("the deadman could not send")
+        assert (lost["route"], lost["target"]) == ("manual_drive", "driving_board")
+        place.send("basestation", DRIVE)
+        assert board.recv(1000) == DRIVE
+        counts = place.scrape()
+        assert total(counts, "deadman_send_errors") == total(counts, "datagrams_sent") == 1
+        assert total(counts, "messages_dropped") == total(counts, "deadman_datagrams_sent") == 0
 
 
 @pytest.mark.parametrize("qos", ["reliable", "best_effort"])
