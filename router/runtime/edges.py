@@ -20,7 +20,7 @@ from router.engine import MAX_DATAGRAM
 from router.engine.state import State
 from router.runtime.sockets import SocketChange, Sockets
 from router.runtime.topics import open_ros, places, wants_ros, who_names
-from router.runtime.wiring import Surroundings, Wiring, wire
+from router.runtime.wiring import Surroundings, Wiring, begin, wire
 
 if TYPE_CHECKING:
     from router.edges.ros import RosEdge
@@ -92,18 +92,20 @@ class Edges:
     def prepare(self, program: Program) -> Change:
         """Opens what `program` wants and is not open, and changes nothing. Raises StartError.
 
-        For the first program, deadmen send here what they send at the start: gateways hear clients as soon as they are
-        open.
+        For the first program, deadmen send here what they send at the start: nothing is received yet, but gateways hear
+        clients as soon as they are open.
         """
         with ExitStack() as undo:
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
-            topics = self._prepare_topics(program, undo)
             self._around.accounts.make_room(program.books)
             state = State(self.wiring.state if self.wiring else None)
+            if self.wiring is None:
+                begin(program, self._around, sockets, state)
+            topics = self._prepare_topics(program, undo)
             undo.callback(lambda: self._around.keepers.release(list(state.made())))
             wiring = wire(program, self._around, sockets, self._ros, topics, state)
-            if self.wiring is None:  # the router starts, and nothing is received yet
+            if self.wiring is None:
                 wiring.begin(self._around.keepers)
             gateways = self._prepare_gateways(program, wiring, undo)
             return Change(sockets, topics, wiring, gateways, undo.pop_all())

@@ -71,10 +71,7 @@ class Wiring:
     cuts: Sequence[Callable[[], None]]
 
     def begin(self, keepers: Keepers) -> None:
-        """The router starts: has deadmen send, those that publish as soon as a subscriber is met."""
-        for plan in self.program.deadmen:
-            deadman = self.deadmen[plan.route]
-            _tell_start(plan.route, keepers.deadman.guard(deadman, deadman.begin)())
+        """The router starts: has deadmen that publish do so as soon as a subscriber is met."""
         for plan in _inbound_deadmen(self.program):
             deadman = self.deadmen[plan.route]
             keepers.deadman.guard(deadman, deadman.wait_to_meet)(monotonic_ns())
@@ -106,6 +103,13 @@ class Wiring:
             keepers.pacing.guard(pacer, pacer.serve_only)(monotonic_ns(), places)
 
 
+def begin(program: Program, around: Surroundings, sockets: SocketChange, state: State) -> None:
+    """The router starts: has the deadmen of routes send. That needs the sockets only; ROS takes seconds to open."""
+    for plan in program.deadmen:
+        deadman = _deadman(plan, program, around, _looking(sockets), state)
+        _tell_start(plan.route, around.keepers.deadman.guard(deadman, deadman.begin)())
+
+
 def wire(
     program: Program,
     around: Surroundings,
@@ -117,8 +121,7 @@ def wire(
     """For the sockets and topics that `program` is to have."""
     accounts, keepers = around.accounts, around.keepers
     send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
-    looking = {endpoint: sender.send_and_look for endpoint, sender in sockets.senders.items()}
-    deadmen = _deadmen(program, around, looking, ros, state)
+    deadmen = _deadmen(program, around, _looking(sockets), ros, state)
     feed = feeder(deadmen, keepers.deadman.guard)
     pacers = _pacers(program, keepers.pacing, send, state)
     outlets = Outlets(
@@ -159,17 +162,22 @@ def _deadmen(
     if ros is not None:
         for topic in {topic for plan in inbound for topic, _ in plan.datagrams}:
             outlets[topic] = state.keep(("sender to topic", topic), partial(_sender_to, ros, topic))
+    return {plan.route: _deadman(plan, program, around, outlets, state) for plan in (*program.deadmen, *inbound)}
 
-    def deadman(plan: DeadmanPlan) -> Deadman:
+
+def _deadman(
+    plan: DeadmanPlan, program: Program, around: Surroundings, outlets: Mapping[str, Send], state: State
+) -> Deadman:
+    def deadman() -> Deadman:
         counts = around.accounts.deadman
         return Deadman(plan, program.books, counts, outlets, around.reporter.report, around.deadman_changed)
 
-    return {
-        plan.route: state.keep(
-            ("deadman", plan, tuple(outlets[name] for name, _ in plan.datagrams)), partial(deadman, plan)
-        )
-        for plan in (*program.deadmen, *inbound)
-    }
+    return state.keep(("deadman", plan, tuple(outlets[name] for name, _ in plan.datagrams)), deadman)
+
+
+def _looking(sockets: SocketChange) -> dict[str, Send]:
+    """How deadmen send, by endpoint."""
+    return {endpoint: sender.send_and_look for endpoint, sender in sockets.senders.items()}
 
 
 def _inbound_deadmen(program: Program) -> list[DeadmanPlan]:
