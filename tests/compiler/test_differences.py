@@ -65,8 +65,10 @@ def test_a_table_differs_in_nothing_from_itself(told: Told) -> None:
         ("endpoints: {x: {address: 10.0.0.9:99, kind: tool}}", ["endpoint x: added, 10.0.0.9:99"]),
         ("routes: {drive_motor: {ttl: 50ms}}", ["route drive_motor: ttl is 50 ms, was 200 ms"]),
         (
-            "routes: {manual_arm: {deadman: {timeout: 400ms, send: {manual_arm: {speed: 1}}, to: [arm_board], "
-            "at_start: silent}}}",
+            (
+                "routes: {manual_arm: {deadman: "
+                "{timeout: 400ms, send: {manual_arm: {speed: 1}}, to: [arm_board], at_start: silent}}}"
+            ),
             [
                 "route manual_arm, deadman: timeout is 400 ms, was 500 ms",
                 "route manual_arm, deadman: send is {manual_arm: {speed: 1}}, was {manual_arm: {}}",
