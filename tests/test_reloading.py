@@ -56,12 +56,13 @@ FROM_ROS = """\
 DRIVE, BRAKE = bytes.fromhex("c201021005"), bytes.fromhex("ca01020801")
 
 
-def turns(timeout: str) -> str:
+def turns(timeout: str, at_start: str = "silent") -> str:
+    deadman = f"timeout: {timeout}, send: {{manual_brake: {{brake: true}}}}, to: [basestation], repeat: 10ms"
     return f"""\
   manual_drive:
     source: sensor_board
     destinations: [basestation]
-    deadman: {{timeout: {timeout}, send: {{manual_brake: {{brake: true}}}}, to: [basestation], repeat: 10ms}}
+    deadman: {{{deadman}, at_start: {at_start}}}
 """
 
 
@@ -288,7 +289,7 @@ def test_a_deadman_that_goes_has_the_last_word_if_it_was_armed(site: Site) -> No
     with site.router(turns("1h") + PH) as router:
         site.write(PH)
         assert router.reload().ok  # nothing to say: no command came
-        site.write(turns("1h") + PH)
+        site.write(turns("1h", "send") + PH)  # a reload is no start
         assert router.reload().ok
         site.send(DRIVE)
         assert site.basestation.recv(1000) == DRIVE

@@ -142,9 +142,10 @@ def test_what_has_arrived_is_routed_before_the_router_stops(site: Site) -> None:
 
 def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> None:
     with capture_logs() as logged, Router(site.program(TURNS)) as router:
+        assert site.basestation.recv(1000) == BRAKE  # since the router starts
         site.send(DRIVE)
-        while (received := site.basestation.recv(1000)) != BRAKE:
-            assert received == DRIVE
+        assert site.basestation.recv(1000) == DRIVE
+        assert site.basestation.recv(1000) == BRAKE
         site.send(PH)
         while (received := site.basestation.recv(1000)) != PH:
             assert received == BRAKE
@@ -154,6 +155,7 @@ def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> N
         assert (router.total("deadman_active"), router.total("deadman_trips")) == (0, 1)
     told = [entry["event"] for entry in logged if entry.get("route") == "manual_drive"]
     assert told == [
+        "the deadman has sent its payload, since the router starts",
         "commands stopped coming: the deadman sends in their place",
         "commands come again: the deadman is released",
     ]
@@ -166,13 +168,13 @@ def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
     close = Recorder.close
 
     def close_late(recorder: Recorder) -> None:
-        said.extend(site.basestation.recv(1000) for _ in range(101))
+        said.extend(site.basestation.recv(1000) for _ in range(102))
         close(recorder)
 
     monkeypatch.setattr(Recorder, "close", close_late)
     with Router(site.program(TURNS.replace("20ms", "1h") + "record: {directory: recordings}\n")):
         site.send(*[DRIVE] * 100)
-    assert said == [*[DRIVE] * 100, BRAKE]
+    assert said == [BRAKE, *[DRIVE] * 100, BRAKE]
     [recording] = (site.folder / "recordings").iterdir()
     assert [each.data for each in read(recording)] == [DRIVE] * 100
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.explain_differences import print_differences
 from router.cli.explain_gateway import explained_gateway, ignored_gateway, known_topics, seen_topics
-from router.cli.explain_words import quality
+from router.cli.explain_words import at_start, quality
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import positive
 from router.compiler import Checked, check_table
@@ -132,7 +132,7 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
     if deadman is not None:
         yield (
             f"  deadman: {deadman.case.name} to {', '.join(deadman.to)} when no command came for "
-            f"{duration(deadman.timeout)}, again every {duration(deadman.repeat)}"
+            f"{duration(deadman.timeout)}, again every {duration(deadman.repeat)}, {at_start(deadman.at_start)}"
         )
         if deadman.hands_over_to:
             yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from time import sleep
 
-from router.cli.explain_words import quality
+from router.cli.explain_words import at_start, quality
 from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import resolved
@@ -134,7 +134,8 @@ def _inbound(entry: CheckedInbound) -> Iterator[str]:
         yield f"    at most {inbound.max_rate.value:g} Hz"
     if inbound.deadman is not None and entry.stop is not None:
         timeout, repeat = duration(inbound.deadman.timeout.value), duration(inbound.deadman.repeat.value)
-        yield f"    deadman: {_constants(entry)} when no message came for {timeout}, again every {repeat}"
+        start = at_start(inbound.deadman.at_start)
+        yield f"    deadman: {_constants(entry)} when no message came for {timeout}, again every {repeat}, {start}"
 
 
 def _constants(entry: CheckedInbound) -> str:

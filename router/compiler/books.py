@@ -41,7 +41,12 @@ METRICS = (
     Metric("endpoint_stale_after_seconds", "number", ("endpoint",), "Silent for longer, it is stale."),
     Metric("deadman_active", "number", ("route",), "1 while the route's deadman sends in place of its commands."),
     Metric("deadman_trips", "counter", ("route",), "How often commands stopped coming."),
-    Metric("deadman_datagrams_sent", "counter", ("route", "destination"), "Datagrams that the deadman sent."),
+    Metric(
+        "deadman_datagrams_sent",
+        "counter",
+        ("route", "destination"),
+        "Datagrams that the deadman sent, also at the start.",
+    ),
     Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
     Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
     Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),

@@ -63,6 +63,7 @@ class CheckedDeadman:
     """What is sent when commands stop coming: the envelope, with its zeros, of a `case`.
 
     `to` are endpoint names, `timeout` and `repeat` in ns. `hands_over_to` are routes, not the cases of the table.
+    `at_start` as in the table's Deadman.
     """
 
     timeout: int
@@ -71,6 +72,7 @@ class CheckedDeadman:
     datagram: bytes
     to: tuple[str, ...]
     hands_over_to: tuple[str, ...]
+    at_start: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,7 +45,8 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
     if datagram is None:
         return None
     to = tuple(name.value for name in deadman.to)
-    return CheckedDeadman(deadman.timeout.value, deadman.repeat.value, case, datagram, to, hands_over_to)
+    timeout, repeat = deadman.timeout.value, deadman.repeat.value
+    return CheckedDeadman(timeout, repeat, case, datagram, to, hands_over_to, deadman.at_start)
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
@@ -86,14 +87,14 @@ def timing_findings(deadman: Deadman | InboundDeadman, max_rate: float | None, s
 
 
 def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
-    """A command that waits to be sent must be stale before the deadman speaks, or it would undo that."""
+    """A command that waits must be stale when it is older than the timeout: sent, it would undo the deadman."""
     if route.ttl is not None and route.ttl.value <= deadman.timeout.value:
         return
     for destination in route.destinations:
         endpoint = lookup.table.endpoints.get(destination.endpoint.value)
         waits_for = "`keep: latest`" if keep(destination) is Keep.LATEST else "the endpoint's budget"
         if keep(destination) is Keep.LATEST or (endpoint is not None and endpoint.budget is not None):
-            message = f"a command that waits for {waits_for} could be sent after the deadman has tripped"
+            message = f"a command that waited for {waits_for} could undo the deadman when it is older than its timeout"
             span = route.ttl.span if route.ttl else destination.endpoint.span
             lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
             return

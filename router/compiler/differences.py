@@ -16,7 +16,7 @@ from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.settings_text import field_map, flat
 from router.compiler.topics import qos_of
 from router.errors import SourceSpan, shown_path
-from router.table.model import Deadman, Destination, Gateway, Route, RouteTable, Topic
+from router.table.model import Deadman, Destination, Gateway, InboundDeadman, Route, RouteTable, Topic
 from router.table.quantities import duration
 
 NONE = "none"
@@ -148,7 +148,12 @@ def _deadman(deadman: Deadman) -> dict[str, str]:
         "send": f"{{{deadman.case.value}: {field_map(deadman.fields)}}}",
         "to": ", ".join(endpoint.value for endpoint in deadman.to),
         "hands_over_to": ", ".join(case.value for case in deadman.hands_over_to) or NONE,
+        "at_start": _at_start(deadman),
     }
+
+
+def _at_start(deadman: Deadman | InboundDeadman) -> str:
+    return "send" if deadman.at_start else "silent"
 
 
 def _targets(targets: Iterable[CheckedTarget], route: Route, origin: str) -> Iterator[tuple[str, Part]]:
@@ -168,7 +173,8 @@ def _gateway_parts(gateway: Gateway) -> Iterator[tuple[str, Part]]:
     for inbound in gateway.inbound:
         settings = {**_topic(inbound.topic), **flat(inbound.ttl, "ttl")}
         if (deadman := inbound.deadman) is not None:
-            settings |= flat({"timeout": deadman.timeout, "send": deadman.fields, "repeat": deadman.repeat}, "deadman")
+            keys = {"timeout": deadman.timeout, "send": deadman.fields, "repeat": deadman.repeat}
+            settings |= flat(keys, "deadman") | {"deadman.at_start": _at_start(deadman)}
         yield f"inbound {inbound.topic.topic.value}", Part(inbound.span, inbound.topic.type.value, settings)
 
 

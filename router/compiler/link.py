@@ -208,4 +208,5 @@ def _deadman(route: str, deadman: CheckedDeadman, table: RouteTable, books: Book
             (name, deadman.datagram.rstrip(b"\0") if table.endpoints[name].trim_trailing_zeros else deadman.datagram)
             for name in deadman.to
         ),
+        at_start=deadman.at_start,
     )

@@ -51,7 +51,7 @@ def _deadman(name: str, deadman: InboundDeadman, topic: str, stop: bytes, books:
         books.slot(metric, name)
     for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
         books.slot(metric, name, topic)
-    return DeadmanPlan(name, deadman.timeout.value, deadman.repeat.value, ((topic, stop),))
+    return DeadmanPlan(name, deadman.timeout.value, deadman.repeat.value, ((topic, stop),), deadman.at_start)
 
 
 def _open_books(books: Books, gateway: Gateway) -> None:

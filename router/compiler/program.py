@@ -108,12 +108,16 @@ class TargetPlan:
 
 @dataclass(frozen=True, slots=True)
 class DeadmanPlan:
-    """A route's deadman: what is sent to which endpoints when no fresh command came for `timeout` (all ns)."""
+    """A route's deadman: what is sent to which endpoints when no fresh command was sent for `timeout` (all ns).
+
+    `at_start` says that it is sent when the router starts as well.
+    """
 
     route: str
     timeout: int
     repeat: int
     datagrams: tuple[tuple[str, bytes], ...]
+    at_start: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,7 +135,8 @@ class ServingSource:
 
     def _send(self, name: str, target: Target) -> None:
         data = self._data(name, target)
-        self._feed(name, target)
+        if target.deadmen:  # before the command is sent, so that nothing which a deadman sends can follow it
+            self.out.line(f"feed_{name}(now)", target.span)
         slot = self.books.slot("sent_bytes", self.route.name, target.name)
         self.out.line(f"counts[{slot}] += send_{name}({data})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
@@ -145,13 +146,7 @@ class ServingSource:
         self._count("messages_published", target)
 
     def _deliver(self, name: str, target: Target) -> None:
-        """Sent or published now or later, and counted there."""
+        """Sent or published now or later; counted there, and deadmen are told there."""
         data = self._data(name, target)
-        self._feed(name, target)
         expires = "expires" if self.route.ttl else "None"
         self.out.line(f"deliver_{name}(now, {data}, {expires})", target.span)
-
-    def _feed(self, name: str, target: Target) -> None:
-        """Before the command is sent, so that nothing which a deadman sends can follow it."""
-        if target.deadmen:
-            self.out.line(f"feed_{name}(now)", target.span)

@@ -15,7 +15,7 @@ from router.compiler.program import TopicPlan
 from router.edges.ros_change import RosChange, hand_over, left_by, opened_beside
 from router.edges.ros_node import RCL_ERRORS, close_node, open_node
 from router.edges.ros_opened import Publication, Subscription
-from router.edges.ros_qos import Incompatible, PeerEvents
+from router.edges.ros_qos import Incompatible, Met, PeerEvents
 from router.edges.ros_threads import EventThread, MessageThread, Receive
 from router.edges.ros_topics import RosTopics
 from router.errors import SourceSpan, StartError
@@ -29,7 +29,8 @@ class RosEdge:
     anybody listens, or may want it later. `subscribed` has the topics with a subscriber now.
     `incompatible(topic, policy, peers)` is called by a thread of events, from opening on: peers whose QoS does not go
     with ours, now. It is called once per second for a topic that has such peers, and for some seconds after that.
-    Nothing is received before `start`. `topics` are those that the node sees.
+    `met(topic)` is called there too, when somebody new subscribes to it. Nothing is received before `start`. `topics`
+    are those that the node sees.
 
     What is open can be replaced: `prepare` opens what is new, `apply` has it used, `finish` closes what is not used
     any more. Or `abandon` closes what was opened.
@@ -46,6 +47,7 @@ class RosEdge:
         spans: Mapping[str, SourceSpan],
         ros_args: Sequence[str],
         incompatible: Incompatible,
+        met: Met = lambda _: None,
     ) -> None:
         self.publish: dict[str, Callable[[bytes], None]] = {}
         self.wanted: dict[str, list[bool]] = {}
@@ -53,7 +55,7 @@ class RosEdge:
         self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
         self._failed: Callable[[Exception], None] | None = None
-        self._peers = PeerEvents(incompatible)
+        self._peers = PeerEvents(incompatible, met)
         self.subscribed: Collection[str] = self._peers.subscribed
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)

@@ -103,15 +103,19 @@ _EMPTY_LOOKS = 10
 """A topic is looked at so often after the last incompatible peer: not every middleware has a peer in its graph before
 it reports the event."""
 
+Met = Callable[[str], None]
+
 
 class PeerEvents:
     """The callbacks with which publishers and subscriptions tell of their peers. For one thread.
 
-    `subscribed` has the topics that somebody subscribes to; other threads may look whether it is empty.
+    `subscribed` has the topics that somebody subscribes to; other threads may look whether it is empty. `met(topic)` is
+    called when somebody new subscribes.
     """
 
-    def __init__(self, incompatible: Incompatible) -> None:
+    def __init__(self, incompatible: Incompatible, met: Met) -> None:
         self.subscribed: set[str] = set()
+        self._met = met
         self._incompatible = incompatible
         self._looks: dict[str, int] = {}  # topics with incompatible peers: how often to look until none counts as gone
 
@@ -121,6 +125,8 @@ class PeerEvents:
         def on_matched(status: Any) -> None:
             (self.subscribed.add if status.current_count else self.subscribed.discard)(plan.topic)
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
+            if status.total_count_change > 0:
+                self._met(plan.topic)
 
         def on_incompatible_qos(status: Any) -> None:
             sentence = "a subscriber asks for a QoS that the table does not offer, and gets nothing"

@@ -154,6 +154,16 @@ class Sender:
             logger.warning("no network leads to this endpoint yet", endpoint=plan.endpoint, address=str(plan.address))
         self.send = _careful_send(self.socket, plan.address)
 
+    def send_and_look(self, data: bytes) -> int:
+        """As `send`, but raises also what is known at once of this datagram: nobody listens there, on this computer.
+
+        With `send`, the next datagram would stand for that loss, which may be another sender's.
+        """
+        sent = self.send(data)
+        if error := self.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            raise OSError(error, os.strerror(error))
+        return sent
+
     def close(self) -> None:
         self.socket.close()
 

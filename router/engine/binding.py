@@ -10,8 +10,7 @@ from typing import Any
 from router.compiler.books import Books
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
-from router.engine.deadman import Feed
-from router.engine.delivery import Deliver, immediately
+from router.engine.delivery import Deliver, Feed, immediately
 from router.engine.freshness import Freshness
 from router.engine.latest import Latest
 from router.engine.limiter import RateLimit
@@ -95,8 +94,8 @@ def _bound(target: TargetPlan, handler: Handler, books: Books, outlets: Outlets)
         bound[f"publish_{name}"] = outlets.publish[target.target]
     else:
         bound[f"send_{name}"] = outlets.send[target.target]
-    if target.deadmen:
-        bound[f"feed_{name}"] = outlets.feed(route, target.deadmen)
+        if target.deadmen:
+            bound[f"feed_{name}"] = outlets.feed(route, target.deadmen)
     if target.max_rate is not None and target.keep is Keep.FIRST:
         rate = target.max_rate
         bound[f"limit_{name}"] = outlets.state.keep(("limit", *place), lambda: RateLimit(rate)).may_pass
@@ -121,18 +120,22 @@ Place = tuple[str, "str | None", TargetPlan]
 
 
 def _deliver(place: Place, outcome: Outcome, outlets: Outlets) -> Deliver:
-    """Through what holds the target's messages back, to where they go and are counted."""
-    target, guard = place[-1], outlets.pacing.guard
+    """Through what holds the target's messages back, to where they go and are counted.
+
+    Deadmen are told there as well: their lock is taken while that of pacing is held, never the other way round.
+    """
+    (route, _, target), guard = place, outlets.pacing.guard
+    feed = outlets.feed(route, target.deadmen) if target.deadmen else None
     end: object  # where they go, whatever is between
     pacer = None if target.is_topic else outlets.pacers.get(target.target)
     if pacer is not None:
-        end, deliver = pacer, pacer.queue(target.priority, outcome)
+        end, deliver = pacer, pacer.queue(target.priority, outcome, feed)
     elif target.is_topic:
         end = publish = outlets.publish[target.target]
         deliver = immediately(publish, outcome, outlets.publish_errors)
     else:
         end = send = outlets.send[target.target]
-        deliver = immediately(send, outcome)
+        deliver = immediately(send, outcome, feed=feed)
     if target.keep is Keep.LATEST and target.max_rate is not None:
         rate = target.max_rate
         latest = outlets.state.keep(("latest", *place, end), lambda: Latest(rate, deliver, outcome))

@@ -12,13 +12,21 @@ Deliver = Callable[[int, bytes, int | None], None]
 Monotonic times in ns. What becomes of the message is counted by then or later; it raises nothing of that.
 """
 
+Feed = Callable[[int], None]
+"""Tells deadmen that a command is about to be sent, at a time of the monotonic clock in ns."""
+
 
 def immediately(
-    hand_over: Callable[[bytes], object], outcome: Outcome, failures: tuple[type[Exception], ...] = (OSError,)
+    hand_over: Callable[[bytes], object],
+    outcome: Outcome,
+    failures: tuple[type[Exception], ...] = (OSError,),
+    feed: Feed | None = None,
 ) -> Deliver:
-    """Hands over whatever it gets; `hand_over` may raise `failures`."""
+    """Hands over whatever it gets; `hand_over` may raise `failures`. `feed` is called before that."""
 
     def deliver(now: int, data: bytes, expires: int | None) -> None:
+        if feed is not None:
+            feed(now)
         try:
             hand_over(data)
         except failures as error:

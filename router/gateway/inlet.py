@@ -9,7 +9,7 @@ from typing import NamedTuple
 from router.compiler.books import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Books
 from router.compiler.program import GatewayPlan, InboundPlan
 from router.engine import Report
-from router.engine.deadman import Feed as FeedDeadman
+from router.engine.delivery import Feed as FeedDeadman
 from router.engine.freshness import Freshness
 from router.engine.limiter import RateLimit
 from router.gateway.documents import PublishRequest

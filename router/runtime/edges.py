@@ -20,7 +20,7 @@ from router.engine import MAX_DATAGRAM
 from router.engine.state import State
 from router.runtime.sockets import SocketChange, Sockets
 from router.runtime.topics import open_ros, places, wants_ros, who_names
-from router.runtime.wiring import Surroundings, Wiring, wire
+from router.runtime.wiring import Surroundings, Wiring, begin, wire
 
 if TYPE_CHECKING:
     from router.edges.ros import RosEdge
@@ -90,15 +90,23 @@ class Edges:
     # -- another program -----------------------------------------------------------------------------------------
 
     def prepare(self, program: Program) -> Change:
-        """Opens what `program` wants and is not open, and changes nothing. Raises StartError."""
+        """Opens what `program` wants and is not open, and changes nothing. Raises StartError.
+
+        For the first program, deadmen send here what they send at the start: nothing is received yet, but gateways hear
+        clients as soon as they are open.
+        """
         with ExitStack() as undo:
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
-            topics = self._prepare_topics(program, undo)
             self._around.accounts.make_room(program.books)
             state = State(self.wiring.state if self.wiring else None)
+            if self.wiring is None:
+                begin(program, self._around, sockets, state)
+            topics = self._prepare_topics(program, undo)
             undo.callback(lambda: self._around.keepers.release(list(state.made())))
             wiring = wire(program, self._around, sockets, self._ros, topics, state)
+            if self.wiring is None:
+                wiring.begin(self._around.keepers)
             gateways = self._prepare_gateways(program, wiring, undo)
             return Change(sockets, topics, wiring, gateways, undo.pop_all())
 
@@ -156,7 +164,7 @@ class Edges:
         if self._ros is None and not wants_ros(program):
             return None
         if self._ros is None:
-            self._ros = open_ros(program, self._ros_args, self._incompatible)
+            self._ros = open_ros(program, self._ros_args, self._incompatible, self._met)
             undo.callback(self._close_ros)
             self._ros.start({}, self._around.reporter.failed)
         change = self._ros.prepare(program.publishers, program.subscriptions, places(program))
@@ -192,6 +200,11 @@ class Edges:
         program = self.wiring.program
         for name in who_names(program).get(topic, ()):
             self._around.accounts.events[program.books.slot("qos_incompatible", name, topic, policy)] = peers
+
+    def _met(self, topic: str) -> None:
+        """Somebody new subscribes to a topic of ours."""
+        if self.wiring is not None:
+            self.wiring.meet(topic, self._around.keepers)
 
     def _enough(self) -> int:
         return FOR_SUBSCRIBERS if self._ros is not None and self._ros.subscribed else FOR_SOCKETS

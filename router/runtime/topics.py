@@ -19,7 +19,12 @@ def wants_ros(program: Program) -> bool:
     return bool(program.publishers or program.subscriptions or program.gateways)
 
 
-def open_ros(program: Program, ros_args: Sequence[str], incompatible: Callable[[str, str, int], None]) -> RosEdge:
+def open_ros(
+    program: Program,
+    ros_args: Sequence[str],
+    incompatible: Callable[[str, str, int], None],
+    met: Callable[[str], None],
+) -> RosEdge:
     """A node without any topic. Raises StartError."""
     check_environment(os.environ)
     try:
@@ -27,7 +32,7 @@ def open_ros(program: Program, ros_args: Sequence[str], incompatible: Callable[[
     except ImportError as error:
         remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
         raise StartError(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
-    return RosEdge(program.table.node, (), (), {}, ros_args, incompatible)
+    return RosEdge(program.table.node, (), (), {}, ros_args, incompatible, met)
 
 
 def places(program: Program) -> Mapping[str, SourceSpan]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from router.compiler.program import DeadmanPlan, Program
 from router.edges.clock import monotonic_ns, wall_ns
 from router.edges.intake import Receive
+from router.edges.log import logger
 from router.edges.reports import Reporter
 from router.edges.timekeeper import Timekeeper
 from router.engine import Engine, OutboundEngine
@@ -69,6 +70,19 @@ class Wiring:
     pacers: Mapping[str, Pacer]
     cuts: Sequence[Callable[[], None]]
 
+    def begin(self, keepers: Keepers) -> None:
+        """The router starts: has deadmen that publish do so as soon as a subscriber is met."""
+        for plan in _inbound_deadmen(self.program):
+            deadman = self.deadmen[plan.route]
+            keepers.deadman.guard(deadman, deadman.wait_to_meet)(monotonic_ns())
+
+    def meet(self, topic: str, keepers: Keepers) -> None:
+        """Somebody new subscribes to `topic`."""
+        for plan in _inbound_deadmen(self.program):
+            if topic in dict(plan.datagrams):
+                deadman = self.deadmen[plan.route]
+                _tell_start(plan.route, keepers.deadman.guard(deadman, deadman.meet)(monotonic_ns()))
+
     def forget(self) -> None:
         """Nobody calls the functions any more. Each is in a ring with its globals; cut, they are gone at once."""
         for cut in self.cuts:
@@ -89,6 +103,13 @@ class Wiring:
             keepers.pacing.guard(pacer, pacer.serve_only)(monotonic_ns(), places)
 
 
+def begin(program: Program, around: Surroundings, sockets: SocketChange, state: State) -> None:
+    """The router starts: has the deadmen of routes send. That needs the sockets only; ROS takes seconds to open."""
+    for plan in program.deadmen:
+        deadman = _deadman(plan, program, around, _looking(sockets), state)
+        _tell_start(plan.route, around.keepers.deadman.guard(deadman, deadman.begin)())
+
+
 def wire(
     program: Program,
     around: Surroundings,
@@ -100,7 +121,7 @@ def wire(
     """For the sockets and topics that `program` is to have."""
     accounts, keepers = around.accounts, around.keepers
     send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
-    deadmen = _deadmen(program, around, send, ros, state)
+    deadmen = _deadmen(program, around, _looking(sockets), ros, state)
     feed = feeder(deadmen, keepers.deadman.guard)
     pacers = _pacers(program, keepers.pacing, send, state)
     outlets = Outlets(
@@ -136,22 +157,37 @@ def _deadmen(
     program: Program, around: Surroundings, send: Mapping[str, Send], ros: RosEdge | None, state: State
 ) -> dict[str, Deadman]:
     """By route; those of what gateways let in send to topics."""
-    inbound = [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
+    inbound = _inbound_deadmen(program)
     outlets = dict(send)
     if ros is not None:
         for topic in {topic for plan in inbound for topic, _ in plan.datagrams}:
             outlets[topic] = state.keep(("sender to topic", topic), partial(_sender_to, ros, topic))
+    return {plan.route: _deadman(plan, program, around, outlets, state) for plan in (*program.deadmen, *inbound)}
 
-    def deadman(plan: DeadmanPlan) -> Deadman:
+
+def _deadman(
+    plan: DeadmanPlan, program: Program, around: Surroundings, outlets: Mapping[str, Send], state: State
+) -> Deadman:
+    def deadman() -> Deadman:
         counts = around.accounts.deadman
         return Deadman(plan, program.books, counts, outlets, around.reporter.report, around.deadman_changed)
 
-    return {
-        plan.route: state.keep(
-            ("deadman", plan, tuple(outlets[name] for name, _ in plan.datagrams)), partial(deadman, plan)
-        )
-        for plan in (*program.deadmen, *inbound)
-    }
+    return state.keep(("deadman", plan, tuple(outlets[name] for name, _ in plan.datagrams)), deadman)
+
+
+def _looking(sockets: SocketChange) -> dict[str, Send]:
+    """How deadmen send, by endpoint."""
+    return {endpoint: sender.send_and_look for endpoint, sender in sockets.senders.items()}
+
+
+def _inbound_deadmen(program: Program) -> list[DeadmanPlan]:
+    """Of what gateways let in."""
+    return [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
+
+
+def _tell_start(route: str, sent_to: Sequence[str]) -> None:
+    if sent_to:
+        logger.info("the deadman has sent its payload, since the router starts", route=route, to=list(sent_to))
 
 
 def _pacers(program: Program, keeper: Timekeeper, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 
 from router.table.build_addresses import local_address, remote_address
 from router.table.build_fields import constants
-from router.table.build_routes import DEFAULT_REPEAT
+from router.table.build_routes import DEFAULT_REPEAT, sends_at_start
 from router.table.build_targets import item_span, topic
 from router.table.model import (
     Address,
@@ -156,4 +156,5 @@ def _deadman(entry: Entry) -> InboundDeadman:
         timeout=needed_duration(settings, "timeout"),
         fields=constants(settings.entries["send"]),
         repeat=duration(settings, "repeat") or Located(DEFAULT_REPEAT, entry.key.span),
+        at_start=sends_at_start(settings),
     )

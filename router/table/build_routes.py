@@ -87,7 +87,13 @@ def _deadman(entry: Entry) -> Deadman:
         to=tuple(map(located, items(settings, "to"))),
         repeat=duration(settings, "repeat") or Located(DEFAULT_REPEAT, entry.key.span),
         hands_over_to=tuple(map(located, items(settings, "hands_over_to"))),
+        at_start=sends_at_start(settings),
     )
+
+
+def sends_at_start(deadman: MappingNode) -> bool:
+    written = optional_text(deadman, "at_start")
+    return written is None or written.value == "send"
 
 
 def _collect(entry: Entry) -> Collect:

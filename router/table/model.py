@@ -232,7 +232,8 @@ class Topic:
 class Deadman:
     """What is sent in place of commands that stopped coming: the payload `case` with `fields`, to `to`.
 
-    `span` is the key `deadman`. Durations in ns. `hands_over_to` are payload cases.
+    `span` is the key `deadman`. Durations in ns. `hands_over_to` are payload cases. `at_start` says whether it is sent
+    when the router starts as well.
     """
 
     span: SourceSpan
@@ -242,6 +243,7 @@ class Deadman:
     to: tuple[Located[str], ...]
     repeat: Located[int]
     hands_over_to: tuple[Located[str], ...] = ()
+    at_start: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,12 +353,16 @@ class ZenohSettings:
 
 @dataclass(frozen=True, slots=True)
 class InboundDeadman:
-    """What is published in place of a client's messages that stopped coming. `span` is the key `deadman`; in ns."""
+    """What is published in place of a client's messages that stopped coming, and at the start if `at_start` says so.
+
+    `span` is the key `deadman`. Durations in ns.
+    """
 
     span: SourceSpan
     timeout: Located[int]
     fields: FieldMap
     repeat: Located[int]
+    at_start: bool = True
 
 
 @dataclass(frozen=True, slots=True)

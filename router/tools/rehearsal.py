@@ -2,7 +2,7 @@
 
 Engines, deadmen, pacers and frames are the router's own, wired as the router wires them; every topic has a subscriber,
 and the network takes everything. Knows no socket, no rclpy, no thread, and no test: `router test` and `router replay
---against` are built on it. Gateways have no part in it.
+--against` are built on it. Gateways have no part in it, nor has what deadmen send when the router starts.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ DASHBOARD = """\
     discovery_period: 200ms
     inbound:
       - {topic: /gw/cmd_vel, type: geometry_msgs/msg/Twist, ttl: 2s,
-         deadman: {timeout: 300ms, send: {linear.x: -1.0}, repeat: 100ms}}
+         deadman: {timeout: 300ms, send: {linear.x: -1.0}, repeat: 100ms, at_start: silent}}
       - {topic: gw/limited, type: std_msgs/msg/String, max_rate: 1 Hz}
 """
 

@@ -75,7 +75,8 @@ def test_a_hand_over_is_told_on_both_sides(table: Path, capsys: pytest.CaptureFi
     with table.open("a") as more:
         more.write(f"  arm_ctrl:\n    source: basestation\n    destinations: [laptop]\n    {says}\n")
     assert (
-        "  deadman: arm_ctrl to laptop when no command came for 500 ms, again every 100 ms\n"
+        "  deadman: arm_ctrl to laptop when no command came for 500 ms, again every 100 ms, "
+        "and once when the router starts\n"
         "    disarmed by commands of imu_info\n"
     ) in explained(capsys, table, "arm_ctrl")
     code = explained(capsys, table, "imu_info")

@@ -26,7 +26,7 @@ gateways:
         ttl: 300ms
         max_rate: 20 Hz
         deadman: {{timeout: 500ms, send: {{linear.x: 0.0}}}}
-      - {{topic: /stop, type: std_msgs/msg/Empty, deadman: {{timeout: 1s, send: {{}}}}}}
+      - {{topic: /stop, type: std_msgs/msg/Empty, deadman: {{timeout: 1s, send: {{}}, at_start: silent}}}}
   dashboard: {{transport: {{websocket: 127.0.0.1:8765}}, publish_period: each}}
   net: {{transport: {{zenoh: {{key: a/b, connect: [tcp/127.0.0.1:7447]}}}}, topics: {{include: [/greeting]}}}}
 """
@@ -60,11 +60,13 @@ def test_a_gateway_is_told_with_its_patterns_what_they_match_and_what_it_lets_in
         "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
         "    dropped when older than 300 ms\n"
         "    at most 20 Hz\n"
-        "    deadman: linear.x 0.0 when no message came for 500 ms, again every 100 ms\n"
+        "    deadman: linear.x 0.0 when no message came for 500 ms, again every 100 ms, "
+        "and once when the router starts\n"
         "\n"
         f"  from clients /stop: std_msgs/msg/Empty  ({table}:16:10)\n"
         "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
-        "    deadman: all fields at their defaults when no message came for 1 s, again every 100 ms\n"
+        "    deadman: all fields at their defaults when no message came for 1 s, again every 100 ms, "
+        "but not when the router starts\n"
         "\n"
     )
 

@@ -65,10 +65,14 @@ def test_a_table_differs_in_nothing_from_itself(told: Told) -> None:
         ("endpoints: {x: {address: 10.0.0.9:99, kind: tool}}", ["endpoint x: added, 10.0.0.9:99"]),
         ("routes: {drive_motor: {ttl: 50ms}}", ["route drive_motor: ttl is 50 ms, was 200 ms"]),
         (
-            "routes: {manual_arm: {deadman: {timeout: 400ms, send: {manual_arm: {speed: 1}}, to: [arm_board]}}}",
+            (
+                "routes: {manual_arm: {deadman: "
+                "{timeout: 400ms, send: {manual_arm: {speed: 1}}, to: [arm_board], at_start: silent}}}"
+            ),
             [
                 "route manual_arm, deadman: timeout is 400 ms, was 500 ms",
                 "route manual_arm, deadman: send is {manual_arm: {speed: 1}}, was {manual_arm: {}}",
+                "route manual_arm, deadman: at_start is silent, was send",
             ],
         ),
         (
@@ -133,11 +137,12 @@ gateways:
     inbound: [{{topic: a, type: std_msgs/msg/Float32, deadman: {{timeout: TIME, send: {{data: 1}}}}}}]
 """
     (tmp_path / "old.yaml").write_text(text.replace("TIME", "500ms"))
-    (tmp_path / "new.yaml").write_text(text.replace("TIME", "2s").replace("data: 1", "data: 2"))
+    (tmp_path / "new.yaml").write_text(text.replace("TIME", "2s, at_start: silent").replace("data: 1", "data: 2"))
     found = differences(checked(tmp_path / "old.yaml"), checked(tmp_path / "new.yaml"))
     assert [each.text for each in found] == [
         "deadman.timeout is 2 s, was 500 ms",
         "deadman.send is {data: 2}, was {data: 1}",
+        "deadman.at_start is silent, was send",
     ]
 
 

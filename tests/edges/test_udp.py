@@ -436,6 +436,21 @@ def test_news_of_an_old_loss_does_not_cost_a_healthy_datagram(stack: ExitStack) 
         assert [late.recv(LIMIT), late.recv(LIMIT)] == [b"arrives", b"arrives too"]
 
 
+def test_who_looks_hears_of_his_own_loss_and_the_next_datagram_of_none(stack: ExitStack) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+        closed.bind(("127.0.0.1", 0))
+        address = Address(*closed.getsockname())
+    sender = stack.enter_context(closing(Sender(SenderPlan("board", address), SPAN)))
+    with pytest.raises(ConnectionRefusedError):
+        sender.send_and_look(b"brake")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
+        board.bind(address)
+        board.settimeout(10)
+        assert sender.send(b"drive") == 5
+        assert sender.send_and_look(b"brake") == 5
+        assert [board.recv(100) for _ in range(2)] == [b"drive", b"brake"]
+
+
 def test_losses_are_counted_one_for_one(stack: ExitStack) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
         absent.bind(("127.0.0.1", 0))

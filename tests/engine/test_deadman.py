@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable
+from dataclasses import replace
 from typing import ParamSpec, TypeVar
 
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from router.compiler.books import Books
 from router.compiler.program import DeadmanPlan
-from router.engine.deadman import Deadman, feeder
+from router.engine.deadman import GREETING, START, Deadman, feeder
 from router.engine.machine import Machine
 from router.engine.outcome import Report
 
@@ -272,3 +273,71 @@ def test_one_that_tripped_hands_on_when_it_sent_last() -> None:
     before.run(TIMEOUT)
     after = succession(before, DeadmanPlan("drive", 10 * TIMEOUT, REPEAT // 4, PLAN.datagrams))
     assert after.deadman.next_due == TIMEOUT + REPEAT // 4
+
+
+def test_a_command_that_waited_since_before_a_reload_feeds_the_one_that_acts_now() -> None:
+    before = Watched()
+    between = succession(before, PLAN)
+    after = succession(between, DeadmanPlan("drive", 2 * TIMEOUT, REPEAT, PLAN.datagrams))
+    for number, deadman in enumerate((before.deadman, between.deadman, after.deadman)):
+        deadman.feed(number)
+        assert after.deadman.next_due == number + 2 * TIMEOUT
+    before.deadman.relieve(0)
+    assert [each.deadman.next_due for each in (before, between, after)] == [None, None, None]
+
+
+def test_at_the_start_it_sends_once_and_is_neither_armed_nor_tripped() -> None:
+    watched = Watched()
+    watched.failures["arm_board"] = FAULT
+    assert watched.deadman.begin() == ["driving_board"]
+    watched.run(10**12)
+    watched.deadman.end(0)
+    assert watched.sent == [(0, "driving_board", b"brake")]
+    assert watched.reports == [Report("deadman", "drive", "arm_board", "send_error", FAULT)]
+    assert (watched.told, watched.deadman.next_due, watched.count("deadman_trips")) == ([], None, 0)
+
+
+def test_one_that_is_silent_at_the_start_sends_nothing() -> None:
+    watched = Watched(replace(PLAN, at_start=False))
+    assert watched.deadman.begin() == []
+    watched.deadman.wait_to_meet(0)
+    assert watched.deadman.meet(1) == []
+    assert (watched.sent, watched.deadman.next_due) == ([], None)
+
+
+def test_shortly_after_the_start_each_new_subscriber_is_sent_to_twice_until_a_command_comes() -> None:
+    watched = Watched()
+    watched.deadman.wait_to_meet(0)
+    meetings = (5, START - 1, START, START + 1)
+    for now in meetings:
+        watched.run(now)
+        watched.now = now
+        watched.deadman.meet(now)
+    watched.run(10 * START)
+    assert watched.times() == [5, 5 + GREETING, START - 1, START - 1 + GREETING]
+    assert watched.told == []
+
+
+def test_a_command_ends_the_meetings_of_the_start() -> None:
+    watched = Watched()
+    watched.deadman.wait_to_meet(0)
+    watched.deadman.meet(5)
+    watched.feed(10)
+    assert watched.deadman.meet(20) == []
+    watched.run(10 + TIMEOUT)
+    assert watched.times() == [0, 10 + TIMEOUT]
+    assert watched.count("deadman_trips") == 1
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_at_the_end_a_meeting_is_no_command(is_replaced: bool) -> None:
+    watched = Watched()
+    watched.deadman.wait_to_meet(0)
+    watched.deadman.meet(5)
+    if is_replaced:
+        after = succession(watched, PLAN).deadman
+        assert (after.next_due, watched.deadman.next_due) == (None, None)
+        assert after.meet(10) == ["driving_board", "arm_board"]
+    watched.sent.clear()
+    watched.deadman.end(20)
+    assert (watched.sent, watched.deadman.next_due) == ([], None)
