@@ -57,8 +57,11 @@ class Watcher:
 
 
 def watched_files(program: Program) -> list[Path]:
-    """The table, what it extends, and everything beside its protos, files that are new there among them."""
-    return [*program.table.files, *program.table.envelope.protos.value.rglob("*")]
+    """The table, what it extends, files for Zenoh, and everything beside its protos, new files there among them."""
+    table = program.table
+    configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
+    paths = [config.path for config in configs if config.path is not None]
+    return [*table.files, *paths, *table.envelope.protos.value.rglob("*")]
 
 
 def _look(files: Iterable[Path]) -> _Look:
