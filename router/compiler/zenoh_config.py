@@ -87,10 +87,11 @@ def _refusal(config: ZenohConfig, error: zenoh.ZError) -> Diagnostic:
 
 def _blamed(value: Any, here: Path, message: str) -> Path:
     """The path of the innermost member of `value` that the library refuses in the same words without the others."""
-    members: Any = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for step, member in members:
-        if _refused((*here, step), member) == message:
-            return _blamed(member, (*here, step), message)
+    if isinstance(value, (dict, list)) and _refused(here, type(value)()) != message:
+        for step, member in value.items() if isinstance(value, dict) else enumerate(value):
+            is_missing = message.startswith("missing field") and not isinstance(member, (dict, list))
+            if not is_missing and _refused((*here, step), member) == message:
+                return _blamed(member, (*here, step), message)
     return here
 
 

@@ -7,6 +7,7 @@ import json
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 import zenoh
@@ -15,8 +16,9 @@ from structlog.testing import capture_logs
 from router.edges import gateway_zenoh, gateway_zenoh_inbox
 from router.edges.gateway_transport import HIGH_WATER, Client, Frame
 from router.edges.gateway_zenoh import ZenohTransport
+from router.edges.gateway_zenoh_config import session_config
 from router.errors import SourceSpan, StartError
-from router.table.model import Located, ZenohSettings
+from router.table.model import Located, ZenohConfig, ZenohSettings
 from tests.edges.gateway_ears import Ears, data, opened, until
 from tests.ports import free_port
 
@@ -296,5 +298,65 @@ def test_a_locator_that_zenoh_does_not_know_is_refused(where: str) -> None:
         with pytest.raises(StartError):
             await transport.open()
         await transport.close()
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("enabled", ["true", "false", None])
+def test_what_the_config_says_of_scouting_goes_before_what_the_gateway_would(enabled: str | None) -> None:
+    text = f'{{"scouting": {{"multicast": {{"enabled": {enabled}}}}}}}' if enabled else "{}"
+    given = ZenohConfig(SourceSpan("routes/rover.yaml"), text)
+    config = session_config(replace(settings(listen=("tcp/127.0.0.1:7447",)), config=given))
+    assert config.get_json("scouting/multicast/enabled") == (enabled or "false")
+    assert config.get_json("mode") == '"peer"'
+    assert config.get_json("listen/endpoints") == '["tcp/127.0.0.1:7447"]'
+
+
+RULE = {"id": "a", "permission": "allow", "messages": ["put"], "key_exprs": ["**"]}
+SUBJECT = {"id": "b", "usernames": ["me"]}
+POLICY = {"rules": ["a"], "subjects": ["c"]}
+ACCESS = {"enabled": True, "default_permission": "deny", "rules": [RULE], "subjects": [SUBJECT], "policies": [POLICY]}
+
+
+@pytest.mark.parametrize(
+    ("config", "where", "why"),
+    [
+        (None, "tls/127.0.0.1:0", "Zenoh needs a `config` for this: .*TLS"),
+        (
+            {"transport": {"link": {"tls": {"listen_private_key": "/nowhere.key"}}}},
+            "tls/127.0.0.1:0",
+            "rover.yaml:7:9: .*TLS",
+        ),
+        (
+            {"transport": {"auth": {"usrpwd": {"dictionary_file": "/nowhere"}}}},
+            "tcp/127.0.0.1:0",
+            "rover.yaml:7:9: .*dictionary",
+        ),
+        ({"access_control": ACCESS}, "tcp/127.0.0.1:0", "rover.yaml:7:9: .*[Ss]ubject"),
+    ],
+)
+def test_a_config_that_zenoh_refuses_when_it_opens_is_refused_with_its_line(
+    config: object, where: str, why: str
+) -> None:
+    async def story() -> None:
+        given = ZenohConfig(SourceSpan("rover.yaml", 7, 9), json.dumps(config)) if config else None
+        transport = ZenohTransport(replace(settings(listen=(where,)), config=given), Ears())
+        with pytest.raises(StartError, match=why):
+            await transport.open()
+
+    asyncio.run(story())
+
+
+def test_who_has_no_password_yet_is_tried_again() -> None:
+    """Zenoh says no more of a refused password than of a router that is not there."""
+
+    async def story() -> None:
+        where = locator()
+        given = ZenohConfig(SourceSpan("rover.yaml"), "{}")
+        transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), Ears())
+        with capture_logs() as logs:
+            async with opened(transport):
+                assert not transport.is_ready
+        assert [log["log_level"] for log in logs] == ["warning"]
 
     asyncio.run(story())

@@ -1,4 +1,4 @@
-"""Two gateways under one key, each in a process of its own, and a Zenoh router between them on the loopback interface."""
+"""Two gateways under one key: processes of their own, with a Zenoh router between them on the loopback interface."""
 
 from __future__ import annotations
 
