@@ -62,6 +62,7 @@ class ZenohTransport:
         self._client: ZenohClient | None = None
         self._owner: Owner | None = None
         self._others: set[Owner] = set()
+        self._met: set[Owner] = set()
         self._told: set[Owner] = set()
         self._others_changed = asyncio.Event()
         self._declared: list[_Declared] = []
@@ -111,30 +112,17 @@ class ZenohTransport:
 
     async def _connect(self, config: zenoh.Config) -> None:
         """Raises ZError."""
-        opened = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
-        if opened is None:
-            return
-        self._session, others = opened
-        self._others |= others
-        await self._settle(self._session)
-        self._tasks.append(self._loop.create_task(self._mind(self._session)))
+        self._session = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
+        if self._session is not None:
+            self._tasks.append(self._loop.create_task(self._mind(self._session)))
 
-    def _open_session(self, config: zenoh.Config) -> tuple[zenoh.Session, set[Owner]] | None:
+    def _open_session(self, config: zenoh.Config) -> zenoh.Session | None:
         """In its thread. Raises ZError. None when nobody wants it any more."""
         session = zenoh.open(config)
         if self._is_closed:
             session.close()  # type: ignore[no-untyped-call]  # as Zenoh's stubs have it
             return None
-        own = str(session.zid())
-
-        def hear(sample: zenoh.Sample) -> None:
-            owner = owner_of(sample.key_expr)
-            if owner is not None and owner.session != own:
-                is_there = sample.kind == zenoh.SampleKind.PUT
-                self._loop.call_soon_threadsafe(self._heard_of, owner, is_there)
-
-        session.liveliness().declare_subscriber(all_tokens(self._key), hear, history=True)
-        return session, owners(session, self._key) or set()
+        return session
 
     async def _retry(self, config: zenoh.Config) -> None:
         while self._session is None:
@@ -151,41 +139,67 @@ class ZenohTransport:
     def _heard_of(self, owner: Owner, is_there: bool) -> None:
         if not is_there:
             self._others.discard(owner)
-        elif len(self._others) < MOST_OTHERS:
-            self._others.add(owner)
+        elif len(self._others | self._met) < MOST_OTHERS:
+            self._meet({owner})
         self._others_changed.set()
 
+    def _meet(self, others: set[Owner]) -> None:
+        self._others |= others
+        self._met |= others
+
     async def _mind(self, session: zenoh.Session) -> None:
-        """Has `_settle` follow what is heard of others. While it waits for the key, it asks as well."""
+        """Asks who has the key, and has `_settle` follow what is heard. While it waits for the key, it asks again."""
+        look = self._watch
         while True:
+            try:
+                if self._client is None and not self._others_changed.is_set():
+                    others = await self._loop.run_in_executor(self._session_thread, look, session)
+                    look = self._look
+                    if others is not None:
+                        self._others.clear()
+                        self._meet(others)
+                self._others_changed.clear()
+                await self._settle(session)
+            except zenoh.ZError as error:
+                self._ears.failed(None, error, 0)
+            await asyncio.sleep(PAUSE_SECONDS)
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._others_changed.wait(), None if self._client else LOOK_AGAIN_SECONDS)
-            if not self._client and not self._others_changed.is_set():
-                others = await self._loop.run_in_executor(self._session_thread, owners, session, self._key)
-                self._others = self._others if others is None else others
-            self._others_changed.clear()
-            await self._settle(session)
-            await asyncio.sleep(PAUSE_SECONDS)
+
+    def _watch(self, session: zenoh.Session) -> set[Owner] | None:
+        """In the session's thread: looks, and has `_heard_of` told of what changes afterwards. Raises ZError."""
+        own = str(session.zid())
+
+        def hear(sample: zenoh.Sample) -> None:
+            owner = owner_of(sample.key_expr)
+            if owner is not None and owner.session != own:
+                is_there = sample.kind == zenoh.SampleKind.PUT
+                self._loop.call_soon_threadsafe(self._heard_of, owner, is_there)
+
+        others = self._look(session)  # first: beside a subscriber Zenoh answers from what that has heard until then
+        session.liveliness().declare_subscriber(all_tokens(self._key), hear, history=True)
+        return others
+
+    def _look(self, session: zenoh.Session) -> set[Owner] | None:
+        """In the session's thread. Raises ZError."""
+        return owners(session, self._key)
 
     async def _settle(self, session: zenoh.Session) -> None:
-        """Takes the key when nobody else has it, gives it up to one that had it before, and tells of others once."""
+        """Takes the key when nobody has it, gives it up to one that had it before, tells of others. Raises ZError."""
         first = min(self._others, default=None)
-        try:
-            if self._owner is None and first is None:
-                first = await self._take(session)
-            has_to_wait = first is not None and (self._owner is None or first < self._owner)
-            if self._owner is not None and has_to_wait:
-                await self._give_up()
-        except zenoh.ZError as error:  # tried again with the next look
-            self._ears.failed(None, error, 0)
-            return
-        if first is not None and first not in self._told:
+        if self._owner is None and first is None:
+            first = await self._take(session)
+        has_to_wait = first is not None and (self._owner is None or first < self._owner)
+        if self._owner is not None and has_to_wait:
+            await self._give_up()
+        if untold := self._met - self._told:
             what = "this gateway waits until it is free" if has_to_wait else "that came later, and has to give way"
-            logger.error(f"another gateway has the Zenoh key: {what}", key=self._key, other=str(first))
+            logger.error(f"another gateway has the Zenoh key: {what}", key=self._key, other=str(min(untold)))
             self._ears.contended()
-        elif self._told and first is None:
+        elif self._told and not self._others:
             logger.info("no other gateway has the Zenoh key any more", key=self._key)
         self._told = set(self._others)
+        self._met.clear()
 
     async def _take(self, session: zenoh.Session) -> Owner | None:
         """Takes the key, and serves unless another took it in the same moment and was first. Raises ZError."""
@@ -194,7 +208,7 @@ class ZenohTransport:
         owner = this_owner(session)
         others = await self._loop.run_in_executor(self._session_thread, self._declare, session, owner)
         self._owner = owner
-        self._others |= others
+        self._meet(others)
         first = min(self._others, default=owner)
         if first < owner:
             return first

@@ -12,7 +12,7 @@ import zenoh
 
 from router.edges.clock import wall_ns
 
-LOOK_SECONDS = 1.0
+LOOK_SECONDS = 5.0
 """How long tokens are asked for. All that are reachable answer at once, unless one of them stands still."""
 
 _LONGEST = 64

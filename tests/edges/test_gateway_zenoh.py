@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 
 import pytest
@@ -45,6 +45,14 @@ def session(mode: str, **endpoints: str) -> Iterator[zenoh.Session]:
         yield joined
 
 
+@asynccontextmanager
+async def serving(transport: ZenohTransport) -> AsyncIterator[None]:
+    """Open, and sure that nobody else has its key."""
+    async with opened(transport):
+        await until(lambda: transport.is_ready)
+        yield
+
+
 class Listener:
     """What a session hears, as (key, payload)."""
 
@@ -64,7 +72,7 @@ def test_data_is_found_by_topic_and_schemas_by_type() -> None:
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             assert transport.is_ready
             [client] = ears.clients
             assert client.label == f"zenoh {KEY}"
@@ -116,7 +124,7 @@ def test_what_is_put_under_inbound_is_heard() -> None:
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears, most=100)
-        async with opened(transport):
+        async with serving(transport):
             with session("peer", connect=where) as far:
                 await _hears(ears, far)
                 far.put(f"{KEY}/inbound/cmd_vel", b"go")
@@ -140,7 +148,7 @@ def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypat
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             with session("peer", connect=where) as far:
                 await _hears(ears, far)
                 for number in range(2000):
@@ -159,7 +167,7 @@ def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -> None
         ears, where = Ears(), locator()
         ears.shown = [schema("std_msgs/msg/Bool"), data(b"true", "/on"), data(b"false", "/off")]
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             with session("client", connect=where) as far:
 
                 def ask(key: str) -> list[tuple[str, bytes]]:
@@ -190,7 +198,7 @@ def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> 
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             [client] = ears.clients
             with session("client", connect=where) as far:
                 listener = Listener(far, f"{KEY}/**")
@@ -209,7 +217,7 @@ def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             [client] = ears.clients
             with session("client", connect=where) as far:
                 listener = Listener(far, f"{KEY}/**")
@@ -229,7 +237,7 @@ def test_much_that_is_written_at_once_is_put_and_the_client_drains() -> None:
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             [client] = ears.clients
             client.write([data(b"x" * 10_000)] * 100)
             assert client.backlog() > HIGH_WATER

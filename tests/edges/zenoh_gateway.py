@@ -10,6 +10,7 @@ import json
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,11 @@ HERE = SourceSpan("routes/rover.yaml")
 
 
 class Gateway:
-    """As a client of the router at the locator `where`. Close it."""
+    """As a client that connects to the locator `where`, or in another mode. Close it."""
 
-    def __init__(self, key: str, where: str, config: dict[str, Any] | None = None) -> None:
+    def __init__(self, key: str, where: str, config: dict[str, Any] | None = None, mode: str = "client") -> None:
         self.process = subprocess.Popen(
-            [sys.executable, __file__, key, where, json.dumps(config or {})],
+            [sys.executable, __file__, key, where, json.dumps(config or {}), mode],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -79,9 +80,12 @@ class Gateway:
     close = kill
 
 
-async def main(key: str, where: str, config: str) -> None:
+async def main(key: str, where: str, config: str, mode: str) -> None:
+    """A peer whose mode is "listening" listens at `where`."""
     ears = Ears()
-    settings = ZenohSettings(Located(key, HERE), "client", (where,), (), ZenohConfig(HERE, config))
+    settings = ZenohSettings(Located(key, HERE), mode, (where,), (), ZenohConfig(HERE, config))
+    if mode == "listening":
+        settings = replace(settings, mode="peer", connect=(), listen=(where,))
     transport = ZenohTransport(settings, ears)
     print(json.dumps({"ready": False, "others": [], "contentions": 0}), flush=True)
     await asyncio.to_thread(sys.stdin.readline)
