@@ -12,8 +12,9 @@ import zenoh
 
 from router.edges.clock import wall_ns
 
-LOOK_SECONDS = 5.0
-"""How long tokens are asked for. All that are reachable answer at once, unless one of them stands still."""
+LOOK_SECONDS = 1.5
+"""How long tokens are asked for. All that are reachable answer at once, unless one of them stands still. Less than a
+session has to end: closing waits for it."""
 
 _LONGEST = 64
 """Characters of a host's name that are told."""
