@@ -23,6 +23,7 @@ from router.compiler import check_table
 from router.compiler.books import Books
 from router.edges import watching
 from router.edges.receiver import ReceiveThread
+from router.edges.watching import watched_files
 from router.runtime import Router, reloading
 from router.runtime.accounts import Accounts
 from router.runtime.edges import Edges
@@ -599,3 +600,25 @@ def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:
     accounts.make_room(then)
     accounts.settle(then)
     assert accounts.total("datagrams_received") == 0
+
+
+def test_a_gateway_in_a_zenoh_network_goes_on_unless_its_config_changes(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    settings = f"{{key: rovers/one, listen: [tcp/127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}], config: zenoh.json5}}"
+    gateways = f"gateways:\n  %s: {{transport: {{zenoh: {settings}}}}}\n"
+    config = site.folder / "zenoh.json5"
+    config.write_text("{queries_default_timeout: 1000}")
+    with site.router(PH + gateways % "earth") as router:
+        assert config in watched_files(router.program.table)
+        site.write(PH + "# a line more\n" + gateways % "earth")
+        assert router.reload().text == "nothing changed"
+        config.write_text("{queries_default_timeout: 2000}")
+        assert router.reload().text == "gateway earth changed"
+        config.write_text("{queries_default_timeout: soon}")
+        assert router.reload().text == "the table has 1 error"
+        config.write_text("{queries_default_timeout: 2000}")
+        site.write(PH + gateways % "mars")
+        assert router.reload().text == "gateway earth removed, gateway mars added"
+        wait_until(lambda: client_count(router) == 1, "its turn")
+        conflicts = [value for name, _, value in router.samples() if name == "router_gateway_key_conflicts_total"]
+        assert set(conflicts) == {0}

@@ -14,9 +14,18 @@ from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import resolved
 from router.edges.ros_environment import check_environment
-from router.errors import StartError
+from router.errors import StartError, shown_path
 from router.gateway.following import by_frequency
-from router.table.model import EACH, Gateway, GatewayFormat, IgnoredGateway, RouteTable, TopicPattern, Transport
+from router.table.model import (
+    EACH,
+    Gateway,
+    GatewayFormat,
+    IgnoredGateway,
+    RouteTable,
+    TopicPattern,
+    Transport,
+    ZenohSettings,
+)
 from router.table.quantities import duration
 
 Topics = Mapping[str, str]
@@ -75,12 +84,22 @@ def _transport(gateway: Gateway) -> str:
     if gateway.zenoh is not None:
         places = [f"connects to {', '.join(gateway.zenoh.connect)}"] if gateway.zenoh.connect else []
         places += [f"listens on {', '.join(gateway.zenoh.listen)}"] if gateway.zenoh.listen else []
+        places += _configured(gateway.zenoh)
         return ", ".join([f"zenoh {gateway.zenoh.mode} under {gateway.zenoh.key.value}", *places])
     assert gateway.address is not None  # noqa: S101 - only Zenoh has none
     if gateway.transport.value is not Transport.UDP:
         return f"{gateway.transport.value.value} on {gateway.address.value}, {gateway.max_clients} clients at most"
     heard = f"on {gateway.receive.value}" if gateway.receive else "from any port"
     return f"udp to {gateway.address.value} {heard}"
+
+
+def _configured(zenoh: ZenohSettings) -> list[str]:
+    """By what: never the values, of which some are secret."""
+    if zenoh.config is None:
+        return []
+    if zenoh.config.path is not None:
+        return [f"configured by {shown_path(zenoh.config.path)}"]
+    return [f"configures {' and '.join(str(path[0]) for path in zenoh.config.places if len(path) == 1)}"]
 
 
 def _period(period: int) -> str:

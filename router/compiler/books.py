@@ -49,6 +49,7 @@ METRICS = (
     ),
     Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
     Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
+    Metric("gateway_key_conflicts", "counter", ("route",), "Times that another gateway had the same Zenoh key."),
     Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),
     Metric(
         "gateway_client_lag_seconds", "number", ("route", "client"), "For how long a client has not had everything."

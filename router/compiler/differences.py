@@ -180,9 +180,13 @@ def _gateway_parts(gateway: Gateway) -> Iterator[tuple[str, Part]]:
 
 def _gateway_settings(gateway: Gateway) -> dict[str, str]:
     keys = {"include": "topics.include", "exclude": "topics.exclude", "compression": "compression.zstd"}
-    settings = flat(replace(gateway, inbound=()))
+    zenoh = gateway.zenoh
+    settings = flat(replace(gateway, inbound=(), zenoh=replace(zenoh, config=None) if zenoh else None))
     if not gateway.compression:
         del settings["compression"]
+    if zenoh and zenoh.config:
+        # Different for different configurations, and tells nothing of what is in them: it may be secret.
+        settings["zenoh.config"] = f"{zenoh.config.path or 'here'} ({hash(zenoh.config.text) & 0xFFFFFF:06x})"
     return {keys.get(key, key): text for key, text in settings.items()}
 
 

@@ -20,6 +20,10 @@ def check_gateways(lookup: Lookup) -> tuple[CheckedGateway, ...]:
     checked = []
     for gateway in lookup.table.gateways.values():
         lookup.findings += [*_name_findings(lookup.table, gateway), *_pattern_findings(gateway)]
+        if gateway.zenoh is not None and gateway.zenoh.config is not None:
+            from router.compiler.zenoh_config import config_findings  # the library takes 50 ms to import
+
+            lookup.findings += config_findings(gateway.zenoh.config)
         checked.append(CheckedGateway(gateway, check_client_topics(lookup, gateway)))
     return tuple(checked)
 

@@ -69,6 +69,8 @@ def _open_books(books: Books, gateway: Gateway) -> None:
         books.slot("messages_dropped", name, CLIENTS, reason)
     for metric in ("datagrams_sent", "sent_bytes"):
         books.slot(metric, name, gateway.transport.value.value)
+    if gateway.zenoh is not None:
+        books.slot("gateway_key_conflicts", name)
     for state in TOPIC_STATES:
         books.slot("gateway_topics", name, state)
     for reason in CLIENT_DROP_REASONS:

@@ -65,6 +65,9 @@ class Ears(Protocol):
     def failed(self, client: Client | None, error: Exception, lost: int) -> None:
         """Sending or receiving failed; `lost` frames of it will not arrive."""
 
+    def contended(self) -> None:
+        """Another gateway was found that has this one's place in the network."""
+
     def snapshot(self) -> Sequence[Frame]:
         """Schemas and latest values, for whoever asks for them; schemas first."""
 

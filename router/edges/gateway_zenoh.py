@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from typing import Protocol
 
 import zenoh
 
@@ -17,6 +18,7 @@ from router.edges.gateway_binding import RETRY_SECONDS
 from router.edges.gateway_transport import HIGH_WATER, LOW_WATER, Client, Ears, Frame
 from router.edges.gateway_zenoh_config import session_config, short, why_in_vain
 from router.edges.gateway_zenoh_inbox import Inbox, Queries
+from router.edges.gateway_zenoh_owner import Owner, all_tokens, owner_of, owners, this_owner
 from router.edges.gateway_zenoh_puts import Lost, Putter, key_of
 from router.edges.log import logger
 from router.errors import StartError
@@ -28,9 +30,23 @@ MOST = 16 << 20
 CLOSING_SECONDS = 2.0
 """How long a session has to end."""
 
+PAUSE_SECONDS = 0.2
+"""Between two times that it begins or gives up, however often others come and go."""
+
+LOOK_AGAIN_SECONDS = 2.0
+"""While it waits for the key: in case that it was not heard how the last other one went."""
+
+MOST_OTHERS = 100
+"""Others of its key that a gateway remembers."""
+
+
+class _Declared(Protocol):
+    def undeclare(self) -> None: ...
+
 
 class ZenohTransport:
-    """Its one client is the network, from when the session is open. `most` bounds in bytes what is received as one.
+    """Its one client is the network, from when the session is open and the key is free. `most` bounds in bytes what
+    is received as one.
 
     Where the table names locators, they are all that is connected; only without any, others are looked for by
     multicast.
@@ -38,63 +54,67 @@ class ZenohTransport:
 
     def __init__(self, settings: ZenohSettings, ears: Ears, most: int = MOST) -> None:
         self.address: Address | None = None
-        self.is_ready = False
         self._settings = settings
         self._ears = ears
         self._most = most
         self._key = settings.key.value
         self._session: zenoh.Session | None = None
         self._client: ZenohClient | None = None
+        self._owner: Owner | None = None
+        self._others: set[Owner] = set()
+        self._met: set[Owner] = set()
+        self._told: set[Owner] = set()
+        self._others_changed = asyncio.Event()
+        self._declared: list[_Declared] = []
         self._session_thread = DaemonThread("zenoh session")
         self._answering = DaemonThread("zenoh answers")
         self._is_closed = False
-        self._retrying: asyncio.Task[None] | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+
+    @property
+    def is_ready(self) -> bool:
+        return self._client is not None
 
     async def open(self) -> None:
         config = session_config(self._settings)
         self._loop = asyncio.get_running_loop()
-        self._inbox = Inbox(self._ears, self._most)
-        self._queries = Queries(self._answer)
         try:
             await self._connect(config)
         except zenoh.ZError as error:
             if why := why_in_vain(self._settings, str(error)):
                 await self.close()
-                raise StartError(why) from error
+                raise StartError(why) from None  # the library's error may quote passwords
             logger.warning("Zenoh cannot be reached yet: trying each second", key=self._key, why=short(error))
-            self._retrying = self._loop.create_task(self._retry(config))
+            self._tasks.append(self._loop.create_task(self._retry(config)))
 
     async def close(self) -> None:
         self._is_closed = True
-        self.is_ready = False
-        if self._retrying is not None:
-            self._retrying.cancel()
+        for task in self._tasks:
+            task.cancel()
             with suppress(asyncio.CancelledError):
-                await self._retrying
+                await task
         if self._client is not None:
             self._inbox.stop()
             self._client.close()
+        self._client = None
         if self._session is not None:
             closing = self._loop.run_in_executor(self._session_thread, self._session.close)
             await asyncio.wait([closing], timeout=CLOSING_SECONDS)
         for thread in (self._session_thread, self._answering):
             thread.shutdown()
-        self._client = self._session = None
+        self._session = None
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
         for client in clients:
             client.write(frames)
 
+    # -- the session ---------------------------------------------------------------------------------------------
+
     async def _connect(self, config: zenoh.Config) -> None:
         """Raises ZError."""
-        session = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
-        if session is None:
-            return
-        self._session = session
-        self._client = ZenohClient(self._key, Putter(session, self._key), self._ears)
-        self.is_ready = True
-        self._ears.joined(self._client)
-        self._inbox.start(self._client)
+        self._session = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
+        if self._session is not None:
+            self._tasks.append(self._loop.create_task(self._mind(self._session)))
 
     def _open_session(self, config: zenoh.Config) -> zenoh.Session | None:
         """In its thread. Raises ZError. None when nobody wants it any more."""
@@ -102,12 +122,10 @@ class ZenohTransport:
         if self._is_closed:
             session.close()  # type: ignore[no-untyped-call]  # as Zenoh's stubs have it
             return None
-        session.declare_subscriber(f"{self._key}/inbound/**", self._inbox.hear)
-        session.declare_queryable(f"{self._key}/**", self._queries.hear)
         return session
 
     async def _retry(self, config: zenoh.Config) -> None:
-        while not self.is_ready:
+        while self._session is None:
             await asyncio.sleep(RETRY_SECONDS)
             try:
                 await self._connect(config)
@@ -116,9 +134,115 @@ class ZenohTransport:
             else:
                 logger.info("Zenoh is reached", key=self._key)
 
+    # -- who has the key -----------------------------------------------------------------------------------------
+
+    def _heard_of(self, owner: Owner, is_there: bool) -> None:
+        if not is_there:
+            self._others.discard(owner)
+        elif len(self._others | self._met) < MOST_OTHERS:
+            self._meet({owner})
+        self._others_changed.set()
+
+    def _meet(self, others: set[Owner]) -> None:
+        self._others |= others
+        self._met |= others
+
+    async def _mind(self, session: zenoh.Session) -> None:
+        """Asks who has the key, and has `_settle` follow what is heard. While it waits for the key, it asks again."""
+        look = self._watch
+        while True:
+            try:
+                if self._client is None and not self._others_changed.is_set():
+                    others = await self._loop.run_in_executor(self._session_thread, look, session)
+                    look = self._look
+                    if others is not None:
+                        self._others.clear()
+                        self._meet(others)
+                self._others_changed.clear()
+                await self._settle(session)
+            except zenoh.ZError as error:
+                self._ears.failed(None, error, 0)
+            await asyncio.sleep(PAUSE_SECONDS)
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._others_changed.wait(), None if self._client else LOOK_AGAIN_SECONDS)
+
+    def _watch(self, session: zenoh.Session) -> set[Owner] | None:
+        """In the session's thread: looks, and has `_heard_of` told of what changes afterwards. Raises ZError."""
+        own = str(session.zid())
+
+        def hear(sample: zenoh.Sample) -> None:
+            owner = owner_of(sample.key_expr)
+            if owner is not None and owner.session != own:
+                is_there = sample.kind == zenoh.SampleKind.PUT
+                self._loop.call_soon_threadsafe(self._heard_of, owner, is_there)
+
+        others = self._look(session)  # first: beside a subscriber Zenoh answers from what that has heard until then
+        session.liveliness().declare_subscriber(all_tokens(self._key), hear, history=True)
+        return others
+
+    def _look(self, session: zenoh.Session) -> set[Owner] | None:
+        """In the session's thread. Raises ZError."""
+        return owners(session, self._key)
+
+    async def _settle(self, session: zenoh.Session) -> None:
+        """Takes the key when nobody has it, gives it up to one that had it before, tells of others. Raises ZError."""
+        first = min(self._others, default=None)
+        if self._owner is None and first is None:
+            first = await self._take(session)
+        has_to_wait = first is not None and (self._owner is None or first < self._owner)
+        if self._owner is not None and has_to_wait:
+            await self._give_up()
+        if untold := self._met - self._told:
+            what = "this gateway waits until it is free" if has_to_wait else "that came later, and has to give way"
+            logger.error(f"another gateway has the Zenoh key: {what}", key=self._key, other=str(min(untold)))
+            self._ears.contended()
+        elif self._told and not self._others:
+            logger.info("no other gateway has the Zenoh key any more", key=self._key)
+        self._told = set(self._others)
+        self._met.clear()
+
+    async def _take(self, session: zenoh.Session) -> Owner | None:
+        """Takes the key, and serves unless another took it in the same moment and was first. Raises ZError."""
+        self._inbox = Inbox(self._ears, self._most)
+        self._queries = Queries(self._answer)
+        owner = this_owner(session)
+        others = await self._loop.run_in_executor(self._session_thread, self._declare, session, owner)
+        self._owner = owner
+        self._meet(others)
+        first = min(self._others, default=owner)
+        if first < owner:
+            return first
+        self._client = ZenohClient(self._key, Putter(session, self._key), self._ears)
+        self._ears.joined(self._client)
+        self._inbox.start(self._client)
+        return min(self._others, default=None)
+
+    def _declare(self, session: zenoh.Session, owner: Owner) -> set[Owner]:
+        """In the session's thread: returns who else has the key. Raises ZError."""
+        self._declared = [
+            session.liveliness().declare_token(owner.token(self._key)),
+            session.declare_subscriber(f"{self._key}/inbound/**", self._inbox.hear),
+            session.declare_queryable(f"{self._key}/**", self._queries.hear),
+        ]
+        return owners(session, self._key) or set()
+
+    async def _give_up(self) -> None:
+        """Serves nobody any more. What waits is lost: it may be old when the key is free."""
+        self._owner = None
+        if self._client is not None:
+            self._inbox.stop()
+            self._client.close()
+            self._client = None
+        await self._loop.run_in_executor(self._session_thread, self._release)
+
+    def _release(self) -> None:
+        """In the session's thread. Raises ZError."""
+        while self._declared:
+            self._declared.pop().undeclare()  # the token last
+
     def _answer(self) -> None:
         """What is asked for at the same time is looked up once."""
-        if self._is_closed:
+        if self._client is None:
             return
         queries, frames = self._queries.take(), self._ears.snapshot()
         answering = self._loop.run_in_executor(self._answering, _reply, queries, self._key, frames)

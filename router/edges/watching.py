@@ -98,8 +98,10 @@ class InterfaceWatcher:
 
 
 def watched_files(table: RouteTable) -> list[Path]:
-    """The table, what it extends, and everything beside its protos, files that are new there among them."""
-    return [*table.files, *table.envelope.protos.value.rglob("*")]
+    """The table, what it extends, files for Zenoh, and everything beside its protos, new files there among them."""
+    configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
+    paths = [config.path for config in configs if config.path is not None]
+    return [*table.files, *paths, *table.envelope.protos.value.rglob("*")]
 
 
 def wait_for_rest(files: Iterable[Path], until: int) -> bool:

@@ -1,6 +1,6 @@
-"""What comes in on one ROS topic, once for all gateways: one subscription, however many follow it.
+"""Subscriptions that gateways share: one for all that want each message of a topic, one for all that want the latest.
 
-Knows no client, and no gateway but as a callback. All of it is for the loop's thread.
+All of it is for the loop's thread.
 """
 
 from __future__ import annotations
@@ -23,12 +23,16 @@ TURN = 32
 
 
 class Feed:
-    """What comes in on one topic as one type, for all who follow it: the latest value, or each message.
+    """What comes in on one topic as one type: the latest value, or each message, for all who follow it in this way.
 
-    Where the latest value is enough, the middleware keeps one message, and what nobody asks for costs no Python.
+    A follower that wants it in the other way has another feed: to subscribe anew would have publishers deliver again
+    what they keep for late joiners. Where the latest value is enough, the middleware keeps one message, and what
+    nobody asks for costs no Python.
     """
 
-    def __init__(self, topic: str, ready: ReadyType, topics: RosTopics, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, topic: str, ready: ReadyType, topics: RosTopics, loop: asyncio.AbstractEventLoop, *, is_each: bool
+    ) -> None:
         self.topic = topic
         self.type_name = ready.message.name
         self.message = ready.message
@@ -40,7 +44,7 @@ class Feed:
         self._eaches: tuple[Each, ...] = ()
         self._tap: TopicTap | None = None
         self._is_reliable = self._keeps = False
-        self._depth = 1
+        self._depth = DEPTH if is_each else 1
         self._arrived = self._taken = self._missed = 0
         self._is_even = False  # `_taken` counts from when it was level with `_arrived`
         self._waits = False  # something has come that was not taken
@@ -78,23 +82,24 @@ class Feed:
         return self._last
 
     def follow(self, wanted: Choice, each: Each | None) -> None:
-        """One follower more. Subscribes, anew if that was with another QoS or not deep enough.
+        """Add a follower, with an `each` where every message is wanted. Subscribe, anew if that was with another QoS.
 
         What had come by then is for those who followed before. Raises StartError.
         """
-        # It stays deep: to go back would lose what comes meanwhile.
-        depth = DEPTH if each or self._eaches else self._depth
-        if (wanted.is_reliable, wanted.keeps, depth) != (self._is_reliable, self._keeps, self._depth):
+        if (wanted.is_reliable, wanted.keeps) != (self._is_reliable, self._keeps):
             self._take(self._depth)
             self.close()
         if self._tap is None:
             self._tap = self._topics.tap(
-                self.topic, self._type.message_class, is_reliable=wanted.is_reliable, keeps=wanted.keeps, depth=depth
+                self.topic,
+                self._type.message_class,
+                is_reliable=wanted.is_reliable,
+                keeps=wanted.keeps,
+                depth=self._depth,
             )
-            self._is_reliable, self._keeps, self._depth = wanted.is_reliable, wanted.keeps, depth
+            self._is_reliable, self._keeps = wanted.is_reliable, wanted.keeps
         self._followers += 1
         if each:
-            self._is_even = self._is_even and bool(self._eaches)
             self._eaches += (each,)
         self._listen(self._tap)
 
@@ -152,12 +157,18 @@ class Feed:
             self._waits = True
 
     def _take(self, most: int) -> int:
-        """How many messages were taken. Each is handed on to those who want that, and the last one is remembered."""
+        """Return how many messages were taken. Hand on each to those who want that, and remember the last one.
+
+        Drop one that equals the last: its publisher keeps it, and delivered it again to a new subscription.
+        """
         taken = 0
         while taken < most and self._tap and (message := self._tap.take()):
             taken += 1
             self._taken += 1
-            self._last = Sample(self.topic, self._type, *message)
+            cdr, sent_ns = message
+            if self._last and (sent_ns, cdr) == (self._last.sent_ns, self._last.cdr):
+                continue
+            self._last = Sample(self.topic, self._type, cdr, sent_ns)
             for each in self._eaches:
                 self._hand_on(each, self._last)
         return taken

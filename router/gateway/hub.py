@@ -1,6 +1,6 @@
-"""The ROS topics that gateways can follow, and one feed for each that is followed, with its type made ready.
+"""The ROS topics that gateways can follow, and the feeds of those that are followed, with their types made ready.
 
-Knows no client and no gateway. All of it is for the loop's thread, unless it says otherwise.
+All of it is for the loop's thread, unless it says otherwise.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ if TYPE_CHECKING:  # which imports rclpy
 
 
 class Hub:
-    """The topics that can be followed, and a feed for each that is. Close it."""
+    """The topics that can be followed, and a feed for each way in which one is. Close it."""
 
     def __init__(self, ros: RosTopics, interfaces: RosInterfaces, loop: asyncio.AbstractEventLoop) -> None:
         self._topics = ros
         self._interfaces = interfaces
         self._loop = loop
-        self._feeds: dict[str, Feed] = {}
+        self._feeds: dict[tuple[str, bool], Feed] = {}  # by topic, and whether each message is wanted
         self._types: dict[str, ReadyType | str] = {}  # or why not
         self._loader = ThreadPoolExecutor(1, thread_name_prefix="gateway types")
 
@@ -57,16 +57,17 @@ class Hub:
         another type ends here, whoever follows it. Raises StartError, and then nobody follows.
         """
         ready = self._ready(wanted.type_name)
-        feed = self._feeds.get(topic)
-        if feed and feed.type_name != wanted.type_name:
-            feed.close()  # first: DDS has one type for a topic in a process
-            feed = None
-        if feed is None:
-            feed = self._feeds[topic] = Feed(topic, ready, self._topics, self._loop)
+        for way in ((topic, False), (topic, True)):
+            if (other := self._feeds.get(way)) and other.type_name != wanted.type_name:
+                other.close()  # first: DDS has one type for a topic in a process
+                del self._feeds[way]
+        key = topic, each is not None
+        if (feed := self._feeds.get(key)) is None:
+            feed = self._feeds[key] = Feed(topic, ready, self._topics, self._loop, is_each=each is not None)
         try:
             feed.follow(wanted, each)
         except StartError:
-            del self._feeds[topic]
+            del self._feeds[key]
             raise
         return feed
 
@@ -75,8 +76,8 @@ class Hub:
         feed.unfollow(each)
         if not feed.is_followed:
             feed.close()
-            if self._feeds.get(feed.topic) is feed:
-                del self._feeds[feed.topic]
+            if self._feeds.get(key := (feed.topic, each is not None)) is feed:
+                del self._feeds[key]
 
     def close(self) -> None:
         for feed in self._feeds.values():

@@ -41,6 +41,7 @@ class Ledger:
         self._arrived_bytes = books.slot("received_bytes", name)
         self._clients = books.slot("gateway_clients", name)
         self._topics = [books.slot("gateway_topics", name, state) for state in TOPIC_STATES]
+        self._contended = books.slot("gateway_key_conflicts", name) if settings.zenoh else None
         self._lost = {reason: books.slot("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
 
     def received(self, times: int) -> None:
@@ -84,6 +85,11 @@ class Ledger:
     def send_error(self, error: Exception, times: int) -> None:
         self._counts[self._lost["send_error"]] += times
         self._report(Report("drop", self._name, CLIENTS, "send_error", error))
+
+    def contended(self) -> None:
+        """Another gateway has the same key. Only Zenoh has keys."""
+        if self._contended is not None:
+            self._counts[self._contended] += 1
 
     def clients(self, number: int) -> None:
         self._counts[self._clients] = number

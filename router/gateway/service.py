@@ -112,6 +112,9 @@ class GatewayService:
     def failed(self, client: Client | None, error: Exception, lost: int) -> None:
         self._ledger.send_error(error, lost)
 
+    def contended(self) -> None:
+        self._ledger.contended()
+
     def snapshot(self) -> list[Frame]:
         return self._topics.snapshot()
 

@@ -197,6 +197,8 @@ class GatewayThread:
 
 def _meet(one: Gateway, other: Gateway) -> bool:
     """Whether both can be open at a time is not known here, so only those are kept apart that could not."""
+    if one.zenoh and other.zenoh and one.zenoh.key.value == other.zenoh.key.value:
+        return True
     wanted = {where.value for where in (other.address, other.receive) if where}
     return one.name == other.name or any(where.value in wanted for where in (one.address, one.receive) if where)
 

@@ -146,7 +146,9 @@ class Topics:
             return
         if before:
             self._forget(topic)
-        self._served[topic] = Served.fresh(feed, choice, period, next(self._numbers))
+        served = self._served[topic] = Served.fresh(feed, choice, period, next(self._numbers))
+        if each and choice.keeps and (kept := feed.latest()):
+            self._outlet.take(served, kept)  # publishers do not send it again to a feed that is there already
         if choice.others:
             logger.warning(
                 "a topic has several types, and is served as that of most publishers",

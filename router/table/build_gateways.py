@@ -5,8 +5,11 @@ Knows the schema's shape; which topics and types exist is the compiler's busines
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 
+from router.errors import Code, Diagnostic, SourceSpan, shown_path
 from router.table.build_addresses import local_address, remote_address
 from router.table.build_fields import constants
 from router.table.build_routes import DEFAULT_REPEAT, sends_at_start
@@ -22,9 +25,11 @@ from router.table.model import (
     TopicPattern,
     TopicRate,
     Transport,
+    ZenohConfig,
     ZenohSettings,
 )
-from router.table.nodes import Entry, MappingNode, Node
+from router.table.nodes import Entry, MappingNode, Node, SequenceNode, to_data
+from router.table.nodes import Path as Steps
 from router.table.reading import (
     UnsoundError,
     duration,
@@ -107,7 +112,36 @@ def _zenoh(settings: MappingNode) -> ZenohSettings:
         mode=text_or(settings, "mode", DEFAULT_MODE),
         connect=tuple(located(node).value for node in items(settings, "connect")),
         listen=tuple(located(node).value for node in items(settings, "listen")),
+        config=_zenoh_config(settings.entries["config"]) if "config" in settings.entries else None,
     )
+
+
+def _zenoh_config(entry: Entry) -> ZenohConfig:
+    if isinstance(entry.value, MappingNode):
+        return ZenohConfig(entry.key.span, json.dumps(to_data(entry.value)), places=dict(_places(entry.value)))
+    written = located(entry.value)
+    path = Path(written.span.file).absolute().parent / written.value
+    try:
+        if path.exists() and not path.is_file():
+            raise OSError(0, "it is no ordinary file")
+        return ZenohConfig(written.span, path.read_text(encoding="utf-8"), path)
+    except (OSError, UnicodeDecodeError) as error:
+        why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"
+        what = f"'{written.value}' cannot be read: {why}"
+        hint = f"looked for {shown_path(path)}" if isinstance(error, FileNotFoundError) else ""
+        raise UnsoundError(Diagnostic(written.span, Code.BAD_FILE, what, hint)) from error
+
+
+def _places(node: Node, here: Steps = ()) -> Iterator[tuple[Steps, SourceSpan]]:
+    """Of each key, and of each item of a list, by its path."""
+    if isinstance(node, MappingNode):
+        for key, entry in node.entries.items():
+            yield (*here, key), entry.key.span
+            yield from _places(entry.value, (*here, key))
+    elif isinstance(node, SequenceNode):
+        for index, item in enumerate(node.items):
+            yield (*here, index), item.span
+            yield from _places(item, (*here, index))
 
 
 def _patterns(settings: MappingNode | None, key: str) -> tuple[TopicPattern, ...]:

@@ -134,8 +134,9 @@ class _Composer:
         if event.style or broken:
             return ScalarNode(span, text, text, place, broken)
         if found := surprise(text):
-            what = f"'{text}' is {found.meaning} to some YAML readers and something else to others"
-            hint = (f"{found.remedy}, or " if found.remedy else "") + f'quote it: "{text}"'
+            # A variable by its name: its value may be secret.
+            what = f"'{event.value}' is {found.meaning} to some YAML readers and something else to others"
+            hint = (f"{found.remedy}, or " if found.remedy else "") + f'quote it: "{event.value}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
         return ScalarNode(span, text, resolve(text), place, broken)

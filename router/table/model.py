@@ -340,6 +340,20 @@ class TopicRate:
 
 
 @dataclass(frozen=True, slots=True)
+class ZenohConfig:
+    """What the Zenoh library is configured with: the file at `path`, or a mapping in the table (`path` None).
+
+    `text` is the content of the file, or the mapping as JSON. It may hold passwords: never print it. `places` are
+    those of the keys and list items of the mapping, by path.
+    """
+
+    span: SourceSpan
+    text: str = field(repr=False)
+    path: Path | None = None
+    places: Mapping[tuple[str | int, ...], SourceSpan] = field(default_factory=dict, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
 class ZenohSettings:
     """Where a gateway meets its Zenoh network. `key` is what its key expressions begin with; locators as Zenoh has
     them, `tcp/192.168.0.10:7447`. `mode` is peer, client or router.
@@ -349,6 +363,7 @@ class ZenohSettings:
     mode: str = "peer"
     connect: tuple[str, ...] = ()
     listen: tuple[str, ...] = ()
+    config: ZenohConfig | None = None
 
 
 @dataclass(frozen=True, slots=True)

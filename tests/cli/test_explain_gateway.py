@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,22 @@ gateways:
       - {{topic: /stop, type: std_msgs/msg/Empty, deadman: {{timeout: 1s, send: {{}}, at_start: silent}}}}
   dashboard: {{transport: {{websocket: 127.0.0.1:8765}}, publish_period: each}}
   net: {{transport: {{zenoh: {{key: a/b, connect: [tcp/127.0.0.1:7447]}}}}, topics: {{include: [/greeting]}}}}
+"""
+
+
+UNQUOTED = f"""\
+extends: {BASE}
+gateways:
+  far:
+    transport:
+      zenoh:
+        key: rovers/one
+        config:
+          transport:
+            auth:
+              usrpwd:
+                user: me
+                password: ${{ZENOH_PASSWORD}}
 """
 
 
@@ -94,6 +111,42 @@ def test_a_gateway_may_match_nothing(table: Path, capsys: pytest.CaptureFixture[
         "  sends /greeting\n"
         "\n"
     )
+
+
+def test_what_zenoh_is_configured_with_is_told_without_its_values(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secret = "fjord-4711"  # noqa: S105 - of nobody
+    monkeypatch.setenv("ZENOH_PASSWORD", secret)
+    here = 'config: {transport: {auth: {usrpwd: {user: me, password: "${ZENOH_PASSWORD}"}}}, id: "12"}'
+    (tmp_path / "zenoh.json5").write_text(f'{{transport: {{auth: {{usrpwd: {{user: "me", password: "{secret}"}}}}}}}}')
+    before = table.read_text()
+    tables = []
+    for name, config in (("plain", ""), ("mapping", here), ("file", "config: zenoh.json5")):
+        tables.append(tmp_path / f"{name}.yaml")
+        tables[-1].write_text(before.replace("key: a/b", f"key: a/b, {config}" if config else "key: a/b"))
+    _, mapping, file = tables
+    assert explained(capsys, mapping, "net").startswith(
+        "net: gateway, zenoh peer under a/b, connects to tcp/127.0.0.1:7447, configures transport and id, gateway_v1  ("
+    )
+    assert f", configured by {tmp_path / 'zenoh.json5'}, gateway_v1  (" in explained(capsys, file, "net")
+    for one, other in permutations(tables, 2):
+        assert main(["explain", "--diff", str(one), str(other)]) == OK
+        told = capsys.readouterr().out
+        assert "zenoh.config" in told
+        assert secret not in told
+
+
+def test_a_variable_that_is_no_text_is_told_by_its_name(
+    table: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table.write_text(UNQUOTED)
+    for password, hint in (("20261122", "put the value in quotes"), ("0471", "quote it"), ("yes", "quote it")):
+        monkeypatch.setenv("ZENOH_PASSWORD", password)
+        assert main(["validate", str(table)]) == BAD_TABLE
+        told = capsys.readouterr().out
+        assert hint in told
+        assert password not in told
 
 
 def test_without_a_name_routes_and_gateways_are_told(table: Path, capsys: pytest.CaptureFixture[str]) -> None:

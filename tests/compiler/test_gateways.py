@@ -261,6 +261,13 @@ def test_an_ignored_gateway_has_no_series_no_address_and_no_name(check_text: Che
     assert names == {"it"}
 
 
+def test_conflicts_about_its_key_are_counted_of_a_zenoh_gateway_alone(check_text: CheckText) -> None:
+    found = checked(check_text, f"far: {{transport: {{zenoh: {{key: a}}}}}}, it: {{{TCP}}}")
+    assert found.program
+    conflicts = [each.labels for each, _ in found.program.books.series() if each.metric == "gateway_key_conflicts"]
+    assert conflicts == [("far",)]
+
+
 def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText) -> None:
     deadman = "deadman: {timeout: 1s, send: {}}"
     program = checked(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, {deadman}}}]}}").program

@@ -34,6 +34,7 @@ class Ears:
     refusals: list[str] = field(default_factory=list)
     failures: list[tuple[Client | None, Exception, int]] = field(default_factory=list)
     shown: list[Frame] = field(default_factory=list)
+    contentions: int = 0
     on_drained: Callable[[Client], None] | None = None
 
     def joined(self, client: Client) -> None:
@@ -60,6 +61,9 @@ class Ears:
 
     def failed(self, client: Client | None, error: Exception, lost: int) -> None:
         self.failures.append((client, error, lost))
+
+    def contended(self) -> None:
+        self.contentions += 1
 
     def snapshot(self) -> Sequence[Frame]:
         return self.shown

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import replace
 
 import pytest
 import zenoh
@@ -15,8 +16,9 @@ from structlog.testing import capture_logs
 from router.edges import gateway_zenoh, gateway_zenoh_inbox
 from router.edges.gateway_transport import HIGH_WATER, Client, Frame
 from router.edges.gateway_zenoh import ZenohTransport
+from router.edges.gateway_zenoh_config import session_config
 from router.errors import SourceSpan, StartError
-from router.table.model import Located, ZenohSettings
+from router.table.model import Located, ZenohConfig, ZenohSettings
 from tests.edges.gateway_ears import Ears, data, opened, until
 from tests.ports import free_port
 
@@ -43,6 +45,14 @@ def session(mode: str, **endpoints: str) -> Iterator[zenoh.Session]:
         yield joined
 
 
+@asynccontextmanager
+async def serving(transport: ZenohTransport) -> AsyncIterator[None]:
+    """Open, and sure that nobody else has its key."""
+    async with opened(transport):
+        await until(lambda: transport.is_ready)
+        yield
+
+
 class Listener:
     """What a session hears, as (key, payload)."""
 
@@ -62,7 +72,7 @@ def test_data_is_found_by_topic_and_schemas_by_type() -> None:
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             assert transport.is_ready
             [client] = ears.clients
             assert client.label == f"zenoh {KEY}"
@@ -114,7 +124,7 @@ def test_what_is_put_under_inbound_is_heard() -> None:
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears, most=100)
-        async with opened(transport):
+        async with serving(transport):
             with session("peer", connect=where) as far:
                 await _hears(ears, far)
                 far.put(f"{KEY}/inbound/cmd_vel", b"go")
@@ -138,7 +148,7 @@ def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypat
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             with session("peer", connect=where) as far:
                 await _hears(ears, far)
                 for number in range(2000):
@@ -157,7 +167,7 @@ def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -> None
         ears, where = Ears(), locator()
         ears.shown = [schema("std_msgs/msg/Bool"), data(b"true", "/on"), data(b"false", "/off")]
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             with session("client", connect=where) as far:
 
                 def ask(key: str) -> list[tuple[str, bytes]]:
@@ -188,7 +198,7 @@ def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> 
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             [client] = ears.clients
             with session("client", connect=where) as far:
                 listener = Listener(far, f"{KEY}/**")
@@ -207,7 +217,7 @@ def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             [client] = ears.clients
             with session("client", connect=where) as far:
                 listener = Listener(far, f"{KEY}/**")
@@ -227,7 +237,7 @@ def test_much_that_is_written_at_once_is_put_and_the_client_drains() -> None:
     async def story() -> None:
         ears, where = Ears(), locator()
         transport = ZenohTransport(settings(listen=(where,)), ears)
-        async with opened(transport):
+        async with serving(transport):
             [client] = ears.clients
             client.write([data(b"x" * 10_000)] * 100)
             assert client.backlog() > HIGH_WATER
@@ -296,5 +306,65 @@ def test_a_locator_that_zenoh_does_not_know_is_refused(where: str) -> None:
         with pytest.raises(StartError):
             await transport.open()
         await transport.close()
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("enabled", ["true", "false", None])
+def test_what_the_config_says_of_scouting_goes_before_what_the_gateway_would(enabled: str | None) -> None:
+    text = f'{{"scouting": {{"multicast": {{"enabled": {enabled}}}}}}}' if enabled else "{}"
+    given = ZenohConfig(SourceSpan("routes/rover.yaml"), text)
+    config = session_config(replace(settings(listen=("tcp/127.0.0.1:7447",)), config=given))
+    assert config.get_json("scouting/multicast/enabled") == (enabled or "false")
+    assert config.get_json("mode") == '"peer"'
+    assert config.get_json("listen/endpoints") == '["tcp/127.0.0.1:7447"]'
+
+
+RULE = {"id": "a", "permission": "allow", "messages": ["put"], "key_exprs": ["**"]}
+SUBJECT = {"id": "b", "usernames": ["me"]}
+POLICY = {"rules": ["a"], "subjects": ["c"]}
+ACCESS = {"enabled": True, "default_permission": "deny", "rules": [RULE], "subjects": [SUBJECT], "policies": [POLICY]}
+
+
+@pytest.mark.parametrize(
+    ("config", "where", "why"),
+    [
+        (None, "tls/127.0.0.1:0", "Zenoh needs a `config` for this: .*TLS"),
+        (
+            {"transport": {"link": {"tls": {"listen_private_key": "/nowhere.key"}}}},
+            "tls/127.0.0.1:0",
+            "rover.yaml:7:9: .*TLS",
+        ),
+        (
+            {"transport": {"auth": {"usrpwd": {"dictionary_file": "/nowhere"}}}},
+            "tcp/127.0.0.1:0",
+            "rover.yaml:7:9: .*dictionary",
+        ),
+        ({"access_control": ACCESS}, "tcp/127.0.0.1:0", "rover.yaml:7:9: .*[Ss]ubject"),
+    ],
+)
+def test_a_config_that_zenoh_refuses_when_it_opens_is_refused_with_its_line(
+    config: object, where: str, why: str
+) -> None:
+    async def story() -> None:
+        given = ZenohConfig(SourceSpan("rover.yaml", 7, 9), json.dumps(config)) if config else None
+        transport = ZenohTransport(replace(settings(listen=(where,)), config=given), Ears())
+        with pytest.raises(StartError, match=why):
+            await transport.open()
+
+    asyncio.run(story())
+
+
+def test_who_has_no_password_yet_is_tried_again() -> None:
+    """Zenoh says no more of a refused password than of a router that is not there."""
+
+    async def story() -> None:
+        where = locator()
+        given = ZenohConfig(SourceSpan("rover.yaml"), "{}")
+        transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), Ears())
+        with capture_logs() as logs:
+            async with opened(transport):
+                assert not transport.is_ready
+        assert [log["log_level"] for log in logs] == ["warning"]
 
     asyncio.run(story())

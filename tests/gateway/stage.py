@@ -151,7 +151,7 @@ class PlayedTransport:
 class Stage:
     """The gateways of a program, one `Played` each, which share topics: `async with Stage(program, graph)`."""
 
-    def __init__(self, made: Program, graph: Graph) -> None:
+    def __init__(self, made: Program, graph: Graph | RosTopics) -> None:
         self.faults: list[Exception] = []
         self.reports: list[Report] = []
         self.published: list[tuple[str, bytes]] = []

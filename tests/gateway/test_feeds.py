@@ -190,7 +190,7 @@ def test_every_message_is_handed_on_in_order_and_a_turn_is_short(publisher: Publ
     run(story())
 
 
-def test_one_feed_serves_those_who_want_each_message_and_those_who_want_the_latest(publisher: Publish) -> None:
+def test_all_who_want_each_message_share_a_feed_and_all_who_want_the_latest_another(publisher: Publish) -> None:
     first: list[tuple[Feed, Sample]] = []
     second: list[tuple[Feed, Sample]] = []
 
@@ -199,17 +199,14 @@ def test_one_feed_serves_those_who_want_each_message_and_those_who_want_the_late
 
     async def story() -> None:
         async with opened() as hub:
-            feed = hub.join("/greeting", PLAIN, None)
-            peer = publisher(STRING)
-            await matched(peer)
-            peer.publish([HELLO])
-            await until(lambda: latest(feed) == HELLO)
-            assert hub.join("/greeting", PLAIN, each) is feed
+            calm = hub.join("/greeting", PLAIN, None)
+            feed = hub.join("/greeting", PLAIN, each)
             assert hub.join("/greeting", PLAIN, lambda *handed: second.append(handed)) is feed
-            assert latest(feed) == HELLO
+            assert hub.join("/greeting", PLAIN, None) is calm is not feed
+            peer = publisher(STRING)
             await heard(peer, cdr("one"), feed)
             peer.publish([cdr("two"), cdr("three")])
-            await until(lambda: latest(feed) == cdr("three"))
+            await until(lambda: latest(feed) == latest(calm) == cdr("three"))
             assert first == second
             assert all(handed is feed for handed, _ in first)
             assert [sample.cdr for _, sample in first][-2:] == [cdr("two"), cdr("three")]
@@ -222,7 +219,7 @@ def test_one_feed_serves_those_who_want_each_message_and_those_who_want_the_late
     run(story())
 
 
-def test_when_nobody_wants_each_message_any_more_the_latest_is_still_there(publisher: Publish) -> None:
+def test_what_is_kept_comes_once_though_publishers_of_less_quality_come_and_go(publisher: Publish) -> None:
     samples: list[bytes] = []
 
     def each(_: Feed, sample: Sample) -> None:
@@ -230,15 +227,17 @@ def test_when_nobody_wants_each_message_any_more_the_latest_is_still_there(publi
 
     async def story() -> None:
         async with opened() as hub:
-            feed = hub.join("/greeting", PLAIN, each)
-            hub.join("/greeting", PLAIN, None)
-            hub.leave(feed, each)
-            peer = publisher(STRING)
-            await matched(peer)
-            peer.publish([HELLO, cdr("newer")])
-            await until(lambda: feed.arrived == 2)
-            hub.join("/greeting", PLAIN, each)  # gets what nobody has taken yet
-            await until(lambda: samples == [HELLO, cdr("newer")])
+            publisher(STRING, "--transient-local").publish([HELLO])
+            kept = await seen(hub)
+            feed = hub.join("/greeting", kept, each)
+            await until(lambda: samples == [HELLO])
+            for wanted in (kept._replace(keeps=False), kept):
+                assert hub.join("/greeting", wanted, each) is feed
+                hub.leave(feed, each)
+            await until(lambda: feed.arrived == 2)  # delivered again
+            await asyncio.sleep(0.1)
+            assert samples == [HELLO]
+            assert feed.missed == 0
 
     run(story())
 

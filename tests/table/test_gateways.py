@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,44 @@ def test_zenoh_has_no_address_but_a_network(tmp_path: Path) -> None:
     assert found.zenoh
     assert found.zenoh.key.value == "a/b"
     assert found.zenoh == ZenohSettings(found.zenoh.key, "client", ("tcp/10.0.0.1:7447",), ())
+
+
+def test_a_mapping_for_zenoh_has_the_places_of_its_keys_and_items(tmp_path: Path) -> None:
+    settings = "transport: {zenoh: {key: a, config: {qos: {publication: [{key_exprs: [b]}]}, id: '12'}}}"
+    config = (found := gateway(tmp_path, settings)).zenoh and found.zenoh.config
+    assert config
+    assert json.loads(config.text) == {"qos": {"publication": [{"key_exprs": ["b"]}]}, "id": "12"}
+    assert config.path is None
+    written = f"  it: {{{settings}}}"
+    columns = {path: place.column for path, place in config.places.items()}
+    assert columns == {
+        ("qos",): written.index("qos") + 1,
+        ("qos", "publication"): written.index("publication") + 1,
+        ("qos", "publication", 0): written.index("{key_exprs") + 1,
+        ("qos", "publication", 0, "key_exprs"): written.index("key_exprs") + 1,
+        ("qos", "publication", 0, "key_exprs", 0): written.index("b]") + 1,
+        ("id",): written.index("id:") + 1,
+    }
+
+
+def test_a_file_for_zenoh_is_beside_the_table_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "zenoh.json5").write_text("{id: '12'}")
+    found = gateway(tmp_path, "transport: {zenoh: {key: a, config: below/zenoh.json5}}").zenoh
+    assert found
+    assert found.config
+    assert (found.config.path, found.config.text) == (tmp_path / "below" / "zenoh.json5", "{id: '12'}")
+    assert "12" not in repr(found)
+
+
+@pytest.mark.parametrize(("name", "why"), [("none", "no such file"), (".", "no ordinary file"), ("latin", "UTF-8")])
+def test_a_file_for_zenoh_that_cannot_be_read_is_blamed_on_the_line_that_names_it(
+    tmp_path: Path, name: str, why: str
+) -> None:
+    (tmp_path / "latin").write_bytes("{id: 'ü'}".encode("latin-1"))
+    [finding] = table_with(tmp_path, f"  it: {{transport: {{zenoh: {{key: a, config: {name}}}}}}}\n")[1]
+    assert (finding.code, finding.span.line) == (Code.BAD_FILE, 6)
+    assert why in finding.message
 
 
 UDP = "transport: {udp: 127.0.0.1:8502}"

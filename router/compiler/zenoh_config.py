@@ -1,0 +1,105 @@
+"""Checks the `config` of Zenoh gateways by the library itself, which opens nothing for that. Prints no value of it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import zenoh
+
+from router.errors import Code, Diagnostic, did_you_mean
+from router.table.model import ZenohConfig
+from router.table.nodes import Path
+
+OWN_KEYS = {"mode": "mode", "connect/endpoints": "connect", "listen/endpoints": "listen"}
+"""Keys of the library that the table has beside `config`, and how it calls them."""
+
+
+def library_config(config: ZenohConfig | None) -> zenoh.Config:
+    """Raises ZError, whose text may hold what is secret: see `reason`."""
+    made: zenoh.Config
+    if config is None:
+        made = zenoh.Config()
+    elif config.path is not None:
+        made = zenoh.Config.from_file(config.path)
+    else:
+        made = zenoh.Config.from_json5(config.text)
+    return made
+
+
+def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
+    try:
+        made = library_config(config)
+    except zenoh.ZError as error:
+        yield _refusal(config, error)
+        return
+    for key, ours in OWN_KEYS.items():
+        if not is_default(made, key):
+            span = config.places.get(tuple(key.split("/")), config.span)
+            where = f"'{key}' in '{config.path.name}'" if config.path else f"'{key}'"
+            message = f"{where} has no place in the 'config' of a gateway"
+            yield Diagnostic(span, Code.BAD_VALUE, message, f"write it as '{ours}' beside 'config'")
+
+
+def is_default(config: zenoh.Config, key: str) -> bool:
+    """Whether it says of `key` what the library says by itself."""
+    return bool(config.get_json(key) == zenoh.Config().get_json(key))
+
+
+def reason(error: object) -> str:
+    """What an error of the library says, without the values that it quotes and the places in its own source."""
+    text = re.sub(r" at /\S+:\d+\.?$", "", str(error).strip())
+    if '{"access_control":' in text or "is invalid" in text:
+        return "its values contradict each other, as a user without a password does"
+    for pattern in _PLACED:
+        if match := re.search(pattern, text, re.DOTALL):
+            return f"line {match['line']}, column {match['column']}: {_without_values(match['what'])}"
+    return _without_values(text.partition("\n")[0])
+
+
+_PLACED = (
+    r"--> (?P<line>\d+):(?P<column>\d+)\n.*= (?P<what>[^\n]*)$",
+    r"msg: \"(?P<what>.*)\", location: .*line: (?P<line>\d+), column: (?P<column>\d+)",
+    r"Error\(\"(?P<what>.*)\", line: (?P<line>\d+), column: (?P<column>\d+)\)",
+    r"problem: \"(?P<what>[^\"]*)\", problem_mark: Mark { line: (?P<line>\d+), column: (?P<column>\d+)",
+)
+"""How the library tells places in JSON5 and in YAML. JSON5's has the line itself between place and sentence."""
+
+
+def _without_values(text: str) -> str:
+    return re.sub(r"(invalid (?:type|value): [a-z ]*[a-z]) ?[`\"\\].*[`\"], expected", r"\1, expected", text)
+
+
+def _refusal(config: ZenohConfig, error: zenoh.ZError) -> Diagnostic:
+    why, hint = reason(error), ""
+    if unknown := re.search(r"unknown field `([^`]*)`, expected (.*)", why):
+        why = f"{why[: unknown.start()]}it has no key '{unknown[1]}' there"
+        hint = did_you_mean(unknown[1], re.findall(r"`([^`]+)`", unknown[2]))
+    elif "expected a string" in why:
+        hint = "put the value in quotes"
+    if config.path is not None:
+        return Diagnostic(config.span, Code.BAD_FILE, f"Zenoh does not take '{config.path.name}': {why}", hint)
+    span = config.places.get(_blamed(json.loads(config.text), (), str(error)), config.span)
+    return Diagnostic(span, Code.BAD_VALUE, f"Zenoh does not take this: {why}", hint)
+
+
+def _blamed(value: Any, here: Path, message: str) -> Path:
+    """The path of the innermost member of `value` that the library refuses in the same words without the others."""
+    if isinstance(value, (dict, list)) and _refused(here, type(value)()) != message:
+        for step, member in value.items() if isinstance(value, dict) else enumerate(value):
+            is_missing = message.startswith("missing field") and not isinstance(member, (dict, list))
+            if not is_missing and _refused((*here, step), member) == message:
+                return _blamed(member, (*here, step), message)
+    return here
+
+
+def _refused(path: Path, value: Any) -> str:
+    for step in reversed(path):
+        value = [value] if isinstance(step, int) else {step: value}
+    try:
+        zenoh.Config.from_json5(json.dumps(value))
+    except zenoh.ZError as error:
+        return str(error)
+    return ""
