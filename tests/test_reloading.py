@@ -516,6 +516,41 @@ gateways:
         assert router.total("deadman_datagrams_sent") == 1
 
 
+def test_a_deadman_brakes_while_the_middleware_blocks_that_of_a_gateway(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateway = f"""\
+gateways:
+  operator:
+    transport: {{tcp: 127.0.0.1:{port}}}
+    format: json_lines
+    inbound:
+      - topic: word
+        type: std_msgs/msg/Bool
+        deadman: {{timeout: 10ms, send: {{data: false}}}}
+"""
+    with site.router(turns("500ms") + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
+        is_in, go_on = threading.Event(), threading.Event()
+
+        def blocked(_: bytes) -> None:
+            is_in.set()
+            go_on.wait()
+
+        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
+        wait_until(lambda: router.total("messages_published") == 1)
+        assert router._edges._ros is not None
+        monkeypatch.setitem(router._edges._ros.publish, "/word", blocked)
+        assert is_in.wait(20)
+        site.send(DRIVE)
+        site.basestation.settimeout(20)
+        try:
+            assert [site.basestation.recv(64) for _ in range(3)] == [DRIVE, BRAKE, BRAKE]
+        finally:
+            go_on.set()
+
+
 def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -79,7 +79,7 @@ class Edges:
     def end_with(self, closing: ExitStack) -> None:
         """Has `closing` end what sends by itself: gateways, open frames, what waits, and deadmen last."""
         keepers = self._around.keepers
-        for keeper in (keepers.deadman, keepers.pacing, keepers.collecting):
+        for keeper in (keepers.deadman, keepers.inbound_deadman, keepers.pacing, keepers.collecting):
             closing.callback(keeper.stop)
         closing.callback(self._stop_gateways)
 

@@ -30,20 +30,22 @@ Send = Callable[[bytes], int]
 
 
 class Keepers:
-    """One for deadmen, which never wait for other machines, one for what waits to be sent, one for open frames."""
+    """One for deadmen, which never wait for other machines; those of what gateways let in publish, which may block in
+    the middleware, so they have one of their own. One for what waits to be sent, one for open frames.
+    """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
-        self.deadman, self.pacing, self.collecting = (
-            Timekeeper(name, monotonic_ns, failed) for name in ("deadman", "pacing", "collect")
+        self.deadman, self.inbound_deadman, self.pacing, self.collecting = (
+            Timekeeper(name, monotonic_ns, failed) for name in ("deadman", "inbound deadman", "pacing", "collect")
         )
 
     def start(self) -> None:
-        for keeper in (self.deadman, self.pacing, self.collecting):
+        for keeper in (self.deadman, self.inbound_deadman, self.pacing, self.collecting):
             keeper.start()
 
     def release(self, machines: Sequence[object]) -> None:
         """Ends those that are machines: frames first, then what waits to be sent; a deadman has the last word."""
-        for keeper in (self.collecting, self.pacing, self.deadman):
+        for keeper in (self.collecting, self.pacing, self.inbound_deadman, self.deadman):
             keeper.release(machines)
 
 
@@ -59,7 +61,7 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """A program's functions: `receive` by listener, `take` by topic. `feed` makes what tells deadmen of a command."""
+    """A program's functions: `receive` by listener, `take` by topic. `feed` makes what tells deadmen of what clients send."""
 
     program: Program
     receive: Mapping[str, Receive]
@@ -74,14 +76,14 @@ class Wiring:
         """The router starts: has deadmen that publish do so as soon as a subscriber is met."""
         for plan in _inbound_deadmen(self.program):
             deadman = self.deadmen[plan.route]
-            keepers.deadman.guard(deadman, deadman.wait_to_meet)(monotonic_ns())
+            keepers.inbound_deadman.guard(deadman, deadman.wait_to_meet)(monotonic_ns())
 
     def meet(self, topic: str, keepers: Keepers) -> None:
         """Somebody new subscribes to `topic`."""
         for plan in _inbound_deadmen(self.program):
             if topic in dict(plan.datagrams):
                 deadman = self.deadmen[plan.route]
-                _tell_start(plan.route, keepers.deadman.guard(deadman, deadman.meet)(monotonic_ns()))
+                _tell_start(plan.route, keepers.inbound_deadman.guard(deadman, deadman.meet)(monotonic_ns()))
 
     def forget(self) -> None:
         """Nobody calls the functions any more. Each is in a ring with its globals; cut, they are gone at once."""
@@ -93,10 +95,12 @@ class Wiring:
 
         Each deadman with other settings than before takes its predecessor's place first.
         """
+        inbound = {plan.route for plan in _inbound_deadmen(self.program)}
         for route, deadman in self.deadmen.items():
             before = earlier.deadmen.get(route) if earlier else None
             if before is not None and before is not deadman:
-                keepers.deadman.guard(deadman, deadman.inherit)(before)
+                keeper = keepers.inbound_deadman if route in inbound else keepers.deadman
+                keeper.guard(deadman, deadman.inherit)(before)
         keepers.release(list(self.state.left()))
         places = {(each.route, target.target) for each in self.program.handlers for target in each.targets}
         for pacer in self.pacers.values():
@@ -122,7 +126,6 @@ def wire(
     accounts, keepers = around.accounts, around.keepers
     send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
     deadmen = _deadmen(program, around, _looking(sockets), ros, state)
-    feed = feeder(deadmen, keepers.deadman.guard)
     pacers = _pacers(program, keepers.pacing, send, state)
     outlets = Outlets(
         counts=accounts.receive,
@@ -134,7 +137,7 @@ def wire(
         wall_ns=wall_ns,
         pacing=Guarded(accounts.pacing, keepers.pacing.guard),
         collecting=Guarded(accounts.collecting, keepers.collecting.guard),
-        feed=feed,
+        feed=feeder(deadmen, keepers.deadman.guard),
         publish_errors=ros.publish_errors if ros else (),
         pacers=pacers,
         state=state,
@@ -145,7 +148,7 @@ def wire(
         program=program,
         receive={name: inbound.receiver(name) for name in sockets.listeners},
         take={plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions},
-        feed=feed,
+        feed=feeder(deadmen, keepers.inbound_deadman.guard),
         state=state,
         deadmen=deadmen,
         pacers=pacers,
