@@ -76,6 +76,7 @@ FLOODS = {
     "unread-gzip": Flood(_get("/metrics", "Accept-Encoding: gzip") * 50),
     "unread-hosts": Flood(_get("/metrics") * 50, hosts=50),
     "read": Flood(_get("/metrics") * 50, takes=1 << 20),
+    "read-hosts": Flood(_get("/metrics") * 50, takes=1 << 20, hosts=50),
     "read-gzip": Flood(_get("/metrics", "Accept-Encoding: gzip") * 50, takes=1 << 20),
     "ready": Flood(_get("/ready") * 50, takes=1 << 20),
     "formats": Flood(
@@ -89,6 +90,7 @@ FLOODS = {
     "tap": Flood(_get("/tap")),
     "tap-read": Flood(_get("/tap"), takes=1 << 20),
     "orders": Flood(_get("/-/nothing", "Content-Length: 0", method="POST"), takes=1 << 20),
+    "reloads": Flood(_get("/-/reload", "Content-Length: 0", method="POST"), takes=1 << 20),
     "silent": Flood(b""),
     "bytes": Flood(b"GET /ready HTTP/1.1\r\nA: ", pause=0.1),
     "trickle": Flood(_get("/metrics") * 50, takes=1, pause=1.0),
@@ -96,6 +98,7 @@ FLOODS = {
     "storm": Flood(b"", closes=True),
     "storm-hosts": Flood(b"", closes=True, hosts=200),
     "storm-asks": Flood(_get("/metrics"), closes=True),
+    "storm-asks-hosts": Flood(_get("/metrics"), closes=True, hosts=200),
 }
 
 

@@ -118,12 +118,8 @@ class Answers:
         return text(HTTPStatus.NOT_FOUND, "there are /, /metrics, /healthz, /ready and /tap")
 
     def metrics(self, accepts: str) -> Answer:
-        """In one of two formats: what a caller may ask for beyond that is without bounds."""
-        try:
-            _, kind = choose_encoder(accepts)
-        except ValueError:  # a version that is no number
-            kind = ""
-        asked = OPEN_METRICS if kind.startswith(OPEN_METRICS) else ""
+        """In one of two formats: versions and escapings, which callers may make up, would each be encoded anew."""
+        asked = OPEN_METRICS if OPEN_METRICS in accepts else ""
         return self._kept.get(f"metrics {asked}", partial(self._collected, asked))
 
     def _collected(self, asked: str) -> Answer:

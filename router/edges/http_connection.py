@@ -6,6 +6,7 @@ Knows the protocol; what is answered comes from `http_answers` and `http_tap`.
 from __future__ import annotations
 
 import re
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -37,6 +38,9 @@ MOST_ANSWERING = 4
 MOST_ORDERS = 4
 LONGEST_REQUEST = 1 << 16
 
+MOST_IN_KERNEL = 1 << 17
+"""Bytes that wait there for a slow other end."""
+
 _END = re.compile(rb"\r?\n\r?\n")
 
 
@@ -62,6 +66,7 @@ class Connection(BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         self.connection = self.request
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MOST_IN_KERNEL)
 
     def finish(self) -> None:
         """There is nothing to flush."""

@@ -63,13 +63,15 @@ def wait_until(condition: Callable[[], bool], what: str = "it") -> None:
 class RouterProcess:
     """`router run ARGUMENT...` as a child process, whose log goes to a file."""
 
+    module = "tests.acceptance.uncached_router"
+
     def __init__(self, folder: Path, *arguments: object, **environment: str) -> None:
         self._log = folder / "router.log"
         folders = (environment.pop("PYTHONPATH", None), str(ROOT), os.environ.get("PYTHONPATH"))
         environment.setdefault("FOXGLOVE", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")  # the rover's has one
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "router", "run", *map(str, arguments)],
+                [sys.executable, "-m", self.module, "run", *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 stderr=log,
                 env={**os.environ, **environment, "PYTHONPATH": os.pathsep.join(filter(None, folders))},
