@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from time import monotonic, sleep
 
@@ -102,7 +102,7 @@ class Places:
     def _of(self, is_meant: Callable[[str], bool]) -> frozenset[socket.socket]:
         return frozenset(each for each, host in self._host.items() if is_meant(host))
 
-    def _makes_room(self, among: Set[socket.socket], most: int, stalled: float = 0.0) -> bool:
+    def _makes_room(self, among: Collection[socket.socket], most: int, stalled: float = 0.0) -> bool:
         if len(among) < most:
             return True
         longest = next((each for each in self._progress if each in among and each not in self._busy), None)
