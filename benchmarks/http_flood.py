@@ -84,6 +84,8 @@ FLOODS = {
     ),
     "status": Flood(_get("/status.json") * 50),
     "map": Flood((_get("/map.json") + _get("/map.json?width=narrow")) * 50, takes=1 << 20),
+    "query": Flood(_get("/map.json?" + "a=1&" * 4000) * 50, takes=1 << 20),
+    "headers": Flood(_get("/ready", *(f"A{n}: {'b;' * 70}" for n in range(95))) * 50, takes=1 << 20),
     "page": Flood(_get("/", "Accept-Encoding: gzip") * 50, takes=1 << 20),
     "health": Flood(_get("/healthz") * 50, takes=1 << 20),
     "head": Flood(_get("/metrics", method="HEAD") * 50, takes=1 << 20),

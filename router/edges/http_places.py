@@ -21,8 +21,8 @@ MOST_FROM_OTHERS = 48
 
 MOST_TAPS = 6
 
-STALLED_SECONDS = 1.0
-"""A tap goes for another one only if its reader has taken nothing for so long."""
+STALLED_SECONDS = 3.0
+"""A tap, which has something to say each second, is ended for another connection if nothing is taken for so long."""
 
 REST_SECONDS = 0.002
 
@@ -63,7 +63,7 @@ class Places:
     def enter_tap(self, connection: socket.socket) -> bool:
         """Return whether a connection may become a tap."""
         with self._lock:
-            if not self._makes_room(self._taps, MOST_TAPS, STALLED_SECONDS):
+            if not self._makes_room(self._taps, MOST_TAPS):
                 return False
             self._taps.add(connection)
             return True
@@ -102,17 +102,22 @@ class Places:
     def _of(self, is_meant: Callable[[str], bool]) -> frozenset[socket.socket]:
         return frozenset(each for each, host in self._host.items() if is_meant(host))
 
-    def _makes_room(self, among: Collection[socket.socket], most: int, stalled: float = 0.0) -> bool:
+    def _makes_room(self, among: Collection[socket.socket], most: int) -> bool:
         if len(among) < most:
             return True
-        longest = next((each for each in self._progress if each in among and each not in self._busy), None)
-        if longest is None or monotonic() - self._progress[longest] < stalled:
+        longest = next((each for each in self._progress if each in among and not self._keeps_its_place(each)), None)
+        if longest is None:
             return False
         self._forget(longest)
         reset(longest)
         with suppress(OSError):  # its other end has gone already
             longest.shutdown(socket.SHUT_RDWR)
         return True
+
+    def _keeps_its_place(self, connection: socket.socket) -> bool:
+        if connection in self._taps:
+            return monotonic() - self._progress[connection] < STALLED_SECONDS
+        return connection in self._busy
 
     def _forget(self, connection: socket.socket) -> None:
         self._host.pop(connection, None)
