@@ -13,7 +13,7 @@ from contextlib import closing
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from io import BytesIO
-from time import monotonic, sleep, thread_time
+from time import monotonic, sleep
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -33,9 +33,6 @@ ANSWER_SECONDS = 10.0
 
 REST_SECONDS = 0.05
 """Between two requests on a connection, so that who asks without end costs routing little."""
-
-REST_PER_PARSING = 4.0
-"""Times what it took to parse a request, the only work whose amount a caller chooses."""
 
 MOST_ANSWERING = 4
 MOST_ORDERS = 4
@@ -115,13 +112,6 @@ class Connection(BaseHTTPRequestHandler):
             reset(self.connection)
             raise
         self._places.progress(self.connection)
-
-    def parse_request(self) -> bool:
-        """As http.server does, and keep MOST_ANSWERING threads that parse from taking a whole processor."""
-        begin = thread_time()
-        is_valid = super().parse_request()
-        sleep(REST_PER_PARSING * (thread_time() - begin))
-        return is_valid
 
     def do_GET(self) -> None:
         path, _, asked = self.path.partition("?")
