@@ -77,8 +77,9 @@ class Connection(BaseHTTPRequestHandler):
         while (request := self._request()) is not None:
             self.rfile = BytesIO(request)
             self.wfile = self._out = BytesIO()
+            self._places.asks(self.connection)
             with self._answering:
-                if not self._places.progress(self.connection):
+                if not self._places.asks(self.connection):
                     return  # somebody else has its place, so nobody would take the answer
                 self.handle_one_request()
             if (takes_long := self._takes_long) is not None:
@@ -106,12 +107,13 @@ class Connection(BaseHTTPRequestHandler):
 
     def _send(self) -> None:
         self.connection.settimeout(ANSWER_SECONDS)
+        self._places.is_answered(self.connection)
         try:
             self.connection.sendall(self._out.getvalue())  # the timeout is that of the whole
         except TimeoutError:
             reset(self.connection)
             raise
-        self._places.progress(self.connection)
+        self._places.is_answered(self.connection)
 
     def do_GET(self) -> None:
         path, _, asked = self.path.partition("?")
@@ -189,7 +191,7 @@ class Connection(BaseHTTPRequestHandler):
             left = memoryview(piece)
             while left:
                 left = left[self.connection.send(left) :]
-            self._places.progress(self.connection)
+            self._places.is_answered(self.connection)
 
     def version_string(self) -> str:
         return "router"

@@ -1,7 +1,8 @@
 """Which connections over HTTP are open, how many each host may have, and which one goes where another needs its place.
 
-A newcomer gets in: of the connections that share its limit, the one without progress for longest is ended. So whoever
-connects, takes nothing and asks nothing keeps nobody out, also on the same host.
+A newcomer gets in, also on the host of those that have all places: of the connections that share its limit, one ends
+that was answered, or else that has not asked, or else that waits for its answer; of these the one without progress for
+longest.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import struct
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
+from enum import IntEnum
 from time import monotonic, sleep
 
 MOST_PER_HOST = 16
@@ -31,12 +33,21 @@ _RESET = struct.pack("ii", 1, 0)
 OWN_COMPUTER = "own"
 
 
+class _Stage(IntEnum):
+    """In the order in which connections end for newcomers."""
+
+    ANSWERED = 0
+    NEW = 1
+    ASKING = 2
+
+
 class Places:
     """Any thread may call it."""
 
     def __init__(self) -> None:
         self._host: dict[socket.socket, str] = {}
         self._progress: dict[socket.socket, float] = {}  # monotonic, s; longest without progress first
+        self._stage: dict[socket.socket, _Stage] = {}
         self._busy: set[socket.socket] = set()
         self._taps: set[socket.socket] = set()
         self._lock = threading.Lock()
@@ -56,6 +67,7 @@ class Places:
             if has_place:
                 self._host[connection] = host
                 self._progress[connection] = monotonic()
+                self._stage[connection] = _Stage.NEW
         if is_crowded:
             sleep(REST_SECONDS)
         return has_place
@@ -68,12 +80,20 @@ class Places:
             self._taps.add(connection)
             return True
 
-    def progress(self, connection: socket.socket) -> bool:
-        """Note that the other end asked, or took, something. Return whether the connection has its place still."""
+    def asks(self, connection: socket.socket) -> bool:
+        """Note that there is a whole request. Return whether the connection has its place still."""
+        return self._proceeds(connection, _Stage.ASKING)
+
+    def is_answered(self, connection: socket.socket) -> None:
+        """Note that an answer begins, or that some of it was taken."""
+        self._proceeds(connection, _Stage.ANSWERED)
+
+    def _proceeds(self, connection: socket.socket, stage: _Stage) -> bool:
         with self._lock:
             if self._progress.pop(connection, None) is None:
                 return False
             self._progress[connection] = monotonic()
+            self._stage[connection] = stage
             return True
 
     @contextmanager
@@ -86,7 +106,6 @@ class Places:
         finally:
             with self._lock:
                 self._busy.discard(connection)
-            self.progress(connection)
 
     def leave(self, connection: socket.socket) -> None:
         with self._lock:
@@ -105,7 +124,8 @@ class Places:
     def _makes_room(self, among: Collection[socket.socket], most: int) -> bool:
         if len(among) < most:
             return True
-        longest = next((each for each in self._progress if each in among and not self._keeps_its_place(each)), None)
+        can_end = [each for each in self._progress if each in among and not self._keeps_its_place(each)]
+        longest = min(can_end, key=self._stage.__getitem__, default=None)  # the first of equals
         if longest is None:
             return False
         self._forget(longest)
@@ -122,6 +142,7 @@ class Places:
     def _forget(self, connection: socket.socket) -> None:
         self._host.pop(connection, None)
         self._progress.pop(connection, None)
+        self._stage.pop(connection, None)
         self._taps.discard(connection)
 
 

@@ -242,6 +242,19 @@ def test_who_has_all_places_of_a_host_makes_room_for_one_more(server: HttpServer
         assert not is_ended(silent[-1])
 
 
+def test_who_has_an_answer_goes_before_who_has_not_asked_yet(server: HttpServer) -> None:
+    with ExitStack() as stack:
+        silent = opened(server, stack, MOST_PER_HOST - 1)
+        answered = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+        answered.request("GET", "/ready")
+        assert answered.getresponse().read() == b"ready\n"
+        for _ in range(3):
+            assert answers(server)
+        assert not any(map(is_ended, silent))
+        assert answered.sock is not None
+        wait_until(lambda: is_ended(answered.sock), "the end of the one that has its answer")
+
+
 def test_all_addresses_of_the_own_computer_are_one_host(server: HttpServer) -> None:
     with ExitStack() as stack:
         silent = [opened(server, stack, 1, f"127.0.0.{number}")[0] for number in range(1, MOST_PER_HOST + 2)]
