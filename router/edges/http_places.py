@@ -26,7 +26,7 @@ MOST_TAPS = 6
 STALLED_SECONDS = 3.0
 """A tap, which has something to say each second, is ended for another connection if nothing is taken for so long."""
 
-REST_SECONDS = 0.002
+REST_SECONDS = 0.003
 
 _RESET = struct.pack("ii", 1, 0)
 
