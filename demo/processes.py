@@ -115,7 +115,7 @@ class Demo:
     def _snapshot(self) -> Snapshot:
         self._check()
         try:
-            return parse_metrics(metrics(self._url), time.monotonic())
+            return parse_metrics(*metrics(self._url))
         except TransportError:
             self._check()  # a router that has ended has better words than a refused connection
             raise

@@ -47,9 +47,9 @@ def _look(url: str) -> Snapshot:
     from router.tools.live import parse_metrics
     from router.tools.running_router import metrics
 
-    text = metrics(url)
+    text, at = metrics(url)
     try:
-        look = parse_metrics(text, time.time())
+        look = parse_metrics(text, at)
     except (ValueError, KeyError) as error:
         raise TransportError(f"what answers at {url}/metrics is no router") from error
     if not look.values:

@@ -18,26 +18,21 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from http.server import ThreadingHTTPServer
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 from router.edges.http_answers import Answers
+from router.edges.http_callers import is_own_computer
 from router.edges.http_connection import Connection
+from router.edges.http_places import OWN_COMPUTER, Places
 from router.edges.log import logger
 from router.edges.port_holder import port_holder
 from router.edges.running import Running
 from router.edges.status import Status
 from router.errors import SourceSpan, StartError
 from router.table.model import Address
-
-MOST_CONNECTIONS = 64
-
-PATIENCE = 5.0
-"""Seconds after which a connection that has asked nothing, or is still asking, goes where another one needs room."""
 
 
 class HttpServer:
@@ -67,23 +62,21 @@ class HttpServer:
         self._server.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
         self._thread.join()
-        self._server.end_connections()
+        self._server.places.end_all()
         self._server.server_close()
         self._status.close()
 
 
 class _Server(ThreadingHTTPServer):
-    """Of a bounded number of connections; those beyond it are closed at once, unless there is one that only waits."""
+    """A thread for each connection that has one of `Places`; others are closed at once."""
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 64
+    request_queue_size = 256
 
     def __init__(self, address: Address, answers: Answers) -> None:
-        self._connections: set[socket.socket] = set()
-        self._waiting: dict[socket.socket, float] = {}  # since when (monotonic, s): those that wait longest come first
-        self._changing = threading.Lock()
-        super().__init__(address, partial(Connection, answers, self._waits, self._asks))
+        self.places = Places()
+        super().__init__(address, partial(Connection, answers, self.places))
 
     def server_bind(self) -> None:
         """As HTTPServer does, but without asking the network for this computer's name."""
@@ -93,43 +86,12 @@ class _Server(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        with self._changing:
-            if len(self._connections) >= MOST_CONNECTIONS and not self._has_made_room():
-                return False
-            self._connections.add(request)
-            return True
-
-    def _has_made_room(self) -> bool:
-        """Who sends a request byte by byte could hold all connections for ever."""
-        longest = next(iter(self._waiting), None)
-        if longest is None or monotonic() - self._waiting[longest] < PATIENCE:
-            return False
-        del self._waiting[longest]
-        self._connections.discard(longest)
-        with suppress(OSError):  # its other end has gone already
-            longest.shutdown(socket.SHUT_RDWR)
-        return True
-
-    def _waits(self, request: socket.socket) -> None:
-        with self._changing:
-            self._waiting[request] = monotonic()
-
-    def _asks(self, request: socket.socket) -> None:
-        with self._changing:
-            self._waiting.pop(request, None)
+        is_own = is_own_computer(client_address[0], request.getsockname()[0])
+        return self.places.enter(request, OWN_COMPUTER if is_own else client_address[0])
 
     def shutdown_request(self, request: Any) -> None:
-        with self._changing:
-            self._connections.discard(request)
-            self._waiting.pop(request, None)
+        self.places.leave(request)
         super().shutdown_request(request)
-
-    def end_connections(self) -> None:
-        """Whatever they are at: taps end, and what is kept alive between two requests."""
-        with self._changing:
-            for each in self._connections:
-                with suppress(OSError):  # its other end has gone already
-                    each.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Called in an except block. Callers come and go as they like; the rest is our own fault."""

@@ -5,19 +5,25 @@ Knows no connection; who may ask is not its business.
 
 from __future__ import annotations
 
+import gzip
 import json
+import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from http import HTTPStatus
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any, NamedTuple
+from typing import Any
 
 from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.exposition import choose_encoder
 
+from router.edges.clock import wall_ns
+from router.edges.http_callers import COLLECTED_AT
 from router.edges.page_policy import page_policy
 from router.edges.running import Running
-from router.edges.status import Status
+from router.edges.status import MEASURES, Status
 from router.errors import RouterError
 
 PAGE = Path(__file__).with_name("status_page.html")
@@ -27,21 +33,55 @@ STUCK_SECONDS = 2.0
 
 LOOK_SECONDS = 0.05
 
+KEPT_SECONDS = 0.5
+"""For so long an answer that is costly to make is given to whoever asks for the same."""
+
+GZIP_FROM = 1000
+"""Bytes of an answer that are worth compressing."""
+
+OPEN_METRICS = "application/openmetrics-text"
+
 TEXT, JSON, HTML = "text/plain; charset=utf-8", "application/json", "text/html; charset=utf-8"
 _NO_RECORDING = "the table keeps nothing to save; it would with 'record: {last: 60s}'"
 
 Query = Mapping[str, Sequence[str]]
 
 
-class Answer(NamedTuple):
+@dataclass(frozen=True)
+class Answer:
     status: HTTPStatus
     kind: str
     body: bytes
-    headers: Mapping[str, str] = {}
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def zipped(self) -> Answer:
+        """The same, compressed where that is worth it."""
+        if len(self.body) < GZIP_FROM:
+            return self
+        headers = {**self.headers, "Content-Encoding": "gzip"}
+        return replace(self, body=gzip.compress(self.body, compresslevel=1), headers=headers)
 
 
 def text(status: HTTPStatus, line: str) -> Answer:
     return Answer(status, TEXT, f"{line}\n".encode())
+
+
+class _Kept:
+    """What is costly to make, made at most every KEPT_SECONDS for each key, and one at a time."""
+
+    def __init__(self) -> None:
+        self._answers: dict[str, tuple[float, Answer]] = {}  # with when each was made (monotonic, s)
+        self._making = threading.Lock()
+
+    def get(self, key: str, make: Callable[[], Answer]) -> Answer:
+        with self._making:
+            fresh = monotonic() - KEPT_SECONDS
+            self._answers = {name: kept for name, kept in self._answers.items() if kept[0] > fresh}
+            if key not in self._answers:
+                answer = make()
+                self._answers[key] = monotonic(), answer
+            return self._answers[key][1]
 
 
 def _json(status: HTTPStatus, said: Mapping[str, Any]) -> Answer:
@@ -54,6 +94,7 @@ class Answers:
     def __init__(self, running: Running, status: Status, save: Callable[[str], Path] | None) -> None:
         self.running = running
         self._status = status
+        self._kept = _Kept()
         self._save = save
         self._registry = CollectorRegistry()
         self._registry.register(running)
@@ -63,9 +104,8 @@ class Answers:
         self._page = Answer(HTTPStatus.OK, HTML, page, {"Content-Security-Policy": policy})
         self._get: Mapping[str, Callable[[Query], Answer]] = {
             "/": lambda _: self._page,
-            "/status.json": lambda _: _json(HTTPStatus.OK, self._status.numbers()),
+            "/status.json": lambda _: self._kept.get("status", self._numbers),
             "/map.json": self._map,
-            "/healthz": lambda _: self._healthz(),
             "/ready": lambda _: self._ready(),
         }
         self._post = {"/-/reload": self._reload, "/record/save": self._save_recording}
@@ -78,8 +118,17 @@ class Answers:
         return text(HTTPStatus.NOT_FOUND, "there are /, /metrics, /healthz, /ready and /tap")
 
     def metrics(self, accepts: str) -> Answer:
-        encode, kind = choose_encoder(accepts)
-        return Answer(HTTPStatus.OK, kind, encode(self._registry))
+        """In one of two formats: versions and escapings, which callers may make up, would each be encoded anew."""
+        asked = OPEN_METRICS if OPEN_METRICS in accepts else ""
+        return self._kept.get(f"metrics {asked}", partial(self._collected, asked))
+
+    def _collected(self, asked: str) -> Answer:
+        encode, kind = choose_encoder(asked)
+        at = f"{wall_ns() / 1e9:.6f}"
+        return Answer(HTTPStatus.OK, kind, encode(self._registry), {COLLECTED_AT: at})
+
+    def _numbers(self) -> Answer:
+        return _json(HTTPStatus.OK, self._status.numbers())
 
     def post(self, path: str) -> Answer:
         if path in self._post:
@@ -87,12 +136,13 @@ class Answers:
         return text(HTTPStatus.NOT_FOUND, f"there are {' and '.join(self._post)}")
 
     def _map(self, query: Query) -> Answer:
-        try:
-            return _json(HTTPStatus.OK, self._status.map(query.get("width", ["wide"])[0]))
-        except KeyError as error:
-            return text(HTTPStatus.BAD_REQUEST, f"there is no width {error}: narrow, wide")
+        width = query.get("width", ["wide"])[0]
+        if width not in MEASURES:
+            return text(HTTPStatus.BAD_REQUEST, f"there is no width '{width}': narrow, wide")
+        key = f"map {width} {self.running.program.table.sha256}"
+        return self._kept.get(key, lambda: _json(HTTPStatus.OK, self._status.map(width)))
 
-    def _healthz(self) -> Answer:
+    def healthz(self) -> Answer:
         before, until = self.running.progress(), monotonic() + STUCK_SECONDS
         while monotonic() < until:
             if self.running.progress() != before:

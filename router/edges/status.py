@@ -1,12 +1,10 @@
 """What the status page asks for: the map of the running table, its numbers, and the last values, as JSON.
 
-Knows no HTTP. Several who look at once cost as much as one.
+Knows no HTTP.
 """
 
 from __future__ import annotations
 
-import threading
-from time import monotonic
 from typing import Any
 
 from router.compiler.route_map import NARROW, WIDE, Measures, RouteMap, route_map
@@ -15,8 +13,6 @@ from router.edges.last_values import LastValues
 from router.edges.running import Running
 from router.edges.status_numbers import numbers
 from router.errors import shown_path
-
-FRESH_SECONDS = 0.5
 
 MEASURES: dict[str, Measures] = {
     "narrow": NARROW._replace(letters=17, letter=5.5),
@@ -31,26 +27,9 @@ class Status:
     def __init__(self, running: Running) -> None:
         self._running = running
         self._values = LastValues(running)
-        self._made_at = 0.0
-        self._made: dict[str, Any] = {}
-        self._making = threading.Lock()
 
     def numbers(self) -> dict[str, Any]:
         """Everything that changes; `map` says to which map it belongs, which changes with the table."""
-        with self._making:
-            if monotonic() - self._made_at > FRESH_SECONDS:
-                self._made, self._made_at = self._fresh(), monotonic()
-            return self._made
-
-    def map(self, width: str) -> dict[str, Any]:
-        """The drawing, of a width of MEASURES. Raises KeyError for another."""
-        table = self._running.program.table
-        return {"map": table.sha256, **_as_json(route_map(table, MEASURES[width]))}
-
-    def close(self) -> None:
-        self._values.close()
-
-    def _fresh(self) -> dict[str, Any]:
         running = self._running
         program = running.program
         table = program.table
@@ -66,6 +45,14 @@ class Status:
             **found,
             "values": self._values.of(program),
         }
+
+    def map(self, width: str) -> dict[str, Any]:
+        """The drawing, of a width of MEASURES. Raises KeyError for another."""
+        table = self._running.program.table
+        return {"map": table.sha256, **_as_json(route_map(table, MEASURES[width]))}
+
+    def close(self) -> None:
+        self._values.close()
 
 
 def _as_json(drawing: RouteMap) -> dict[str, Any]:

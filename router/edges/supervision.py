@@ -35,13 +35,13 @@ def supervised(progress: Callable[[], int]) -> Iterator[None]:
     for address in inherited().unclaimed():
         logger.warning("nobody listens on a socket that was handed over", address=address, remedy=_REMEDY)
     with ExitStack() as ending:
+        tell("READY=1")
         if (limit := _watchdog_ns()) is not None:
             faulthandler.enable()
             keeper = Timekeeper("watchdog", monotonic_ns, _tell_fault)
             keeper.add(Watchdog(progress, limit // _LOOKS, monotonic_ns()))
             keeper.start()
             ending.callback(keeper.stop)
-        tell("READY=1")
         ending.callback(tell, "STOPPING=1", "WATCHDOG=1")  # from here on the time for stopping counts
         yield
 

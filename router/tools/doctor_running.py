@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from time import time
 
 from router.compiler.books import INTENDED_REASONS
 from router.compiler.program import Program
@@ -105,7 +104,7 @@ def health(program: Program) -> Health | None:
     if table.metrics is None:
         return None
     try:
-        snapshot = parse_metrics(metrics(url_of(table)), time())
+        snapshot = parse_metrics(*metrics(url_of(table)))
     except (TransportError, ValueError, KeyError):  # nobody, or somebody else
         return None
     return Health(table, snapshot, snapshot.at) if snapshot.values else None

@@ -8,11 +8,13 @@ from __future__ import annotations
 import http.client
 import json
 import re
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
+from router.edges.http_callers import COLLECTED_AT
 from router.edges.mirror import Seen
 from router.edges.tap_stream import Lost, StreamReader
 from router.errors import TransportError
@@ -52,14 +54,17 @@ def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
         return Answer(response.status == http.client.OK, said)
 
 
-def metrics(url: str) -> str:
-    """The text of /metrics. Raises TransportError where nobody answers, or something else than a router."""
+def metrics(url: str) -> tuple[str, float]:
+    """The text of /metrics, and when its numbers were read (s, wall clock).
+
+    Raises TransportError where nobody answers, or something else than a router.
+    """
     with closing(_connection(url, PATIENCE)) as connection:
         response = _asked(connection, url, "GET", "/metrics")
         text = _read(response, url)
         if response.status != http.client.OK:
             raise TransportError(f"{url}/metrics: {response.status} {_first_line(text)}")
-        return text.decode(errors="replace")
+        return text.decode(errors="replace"), _collected_at(response)
 
 
 @contextmanager
@@ -116,6 +121,14 @@ def _read(response: http.client.HTTPResponse, url: str) -> bytes:
         return response.read()
     except (OSError, http.client.HTTPException) as error:
         raise TransportError(f"the router at {url} broke off: {error}") from error
+
+
+def _collected_at(response: http.client.HTTPResponse) -> float:
+    """A router may answer with numbers that are half a second old."""
+    try:
+        return float(response.headers[COLLECTED_AT])
+    except (TypeError, ValueError):  # no router, or an older one
+        return time.time()
 
 
 def _first_line(text: bytes) -> str:

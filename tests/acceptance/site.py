@@ -63,13 +63,15 @@ def wait_until(condition: Callable[[], bool], what: str = "it") -> None:
 class RouterProcess:
     """`router run ARGUMENT...` as a child process, whose log goes to a file. `within` is a command that runs it."""
 
+    module = "tests.acceptance.uncached_router"
+
     def __init__(self, folder: Path, *arguments: object, within: Sequence[str] = (), **environment: str) -> None:
         self._log = folder / "router.log"
         folders = (environment.pop("PYTHONPATH", None), str(ROOT), os.environ.get("PYTHONPATH"))
         environment.setdefault("FOXGLOVE", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")  # the rover's has one
         with self._log.open("w") as log:
             self.process = subprocess.Popen(
-                [*within, sys.executable, "-m", "router", "run", *map(str, arguments)],
+                [*within, sys.executable, "-m", self.module, "run", *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 stderr=log,
                 env={**os.environ, **environment, "PYTHONPATH": os.pathsep.join(filter(None, folders))},

@@ -28,7 +28,7 @@ def sim_program() -> Program:
 
 
 class FakeRunning:
-    """`failures` is what consumers of the mirror raised."""
+    """`failures` is what consumers of the mirror raised, `collected` how often the counters were read."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -36,6 +36,7 @@ class FakeRunning:
         self.is_stuck = False
         self.reloads = RELOADED
         self.failures: list[Exception] = []
+        self.collected = 0
         self.mirror = Mirror(MAX_DATAGRAM, lambda: None, self.failures.append)
         self.counts = program.books.fresh_counts()
         self._turns = 0
@@ -48,6 +49,7 @@ class FakeRunning:
         self.mirror.tee(listener, lambda *_: None)(data, peer)
 
     def collect(self) -> Iterator[Family]:
+        self.collected += 1
         asked = {
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")

@@ -64,7 +64,8 @@ class Scraped:
 
 
 @pytest.fixture
-def scraped() -> Iterator[Scraped]:
+def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
+    monkeypatch.setattr("router.edges.http_answers.KEPT_SECONDS", 0)
     books = Books()
     slots = {metric.name: books.slot(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS}
     threads = [books.fresh_counts(), books.fresh_counts()]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from router.compiler.books import METRICS
-from router.edges import last_values, status
+from router.edges import last_values
 from router.edges.http_answers import PAGE
 from router.edges.status import Status
 from router.edges.status_numbers import TAKERS
@@ -31,8 +31,7 @@ def running() -> Iterator[FakeRunning]:
 
 
 @pytest.fixture
-def shown(running: FakeRunning, monkeypatch: pytest.MonkeyPatch) -> Iterator[Status]:
-    monkeypatch.setattr(status, "FRESH_SECONDS", 0)
+def shown(running: FakeRunning) -> Iterator[Status]:
     with closing(Status(running)) as opened:
         yield opened
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from router.edges import http_answers, status
+from router.edges import http_answers
 from router.edges.http import HttpServer
 from router.edges.last_values import LastValues
 from router.errors import SourceSpan
@@ -36,7 +36,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture
 def running(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeRunning]:
     """All endpoints were heard just now, and the page asks ten times as often."""
-    monkeypatch.setattr(status, "FRESH_SECONDS", 0)
+    monkeypatch.setattr(http_answers, "KEPT_SECONDS", 0)
     page = http_answers.PAGE.read_text(encoding="utf-8")
     assert "const PERIOD = 1000;" in page
     hasty = tmp_path / "page.html"

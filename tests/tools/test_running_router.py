@@ -21,6 +21,7 @@ def url() -> Iterator[str]:
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             self.send_response(200 if self.path == "/metrics" else 404)
+            self.send_header("X-Collected-At", "1500000000.25")
             self.end_headers()
             self.wfile.write(b"# nothing yet\n")
 
@@ -37,7 +38,7 @@ def url() -> Iterator[str]:
 
 def test_metrics_are_asked_for_at_the_router_and_no_proxy(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")
-    assert metrics(url) == metrics(url.removeprefix("http://")) == "# nothing yet\n"
+    assert metrics(url) == metrics(url.removeprefix("http://")) == ("# nothing yet\n", 1500000000.25)
 
 
 def test_where_nobody_answers_is_a_network_fault() -> None:

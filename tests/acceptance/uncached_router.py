@@ -1,0 +1,11 @@
+"""`python -m router`, but each scrape collects anew: tests compare counters at shorter distances than KEPT_SECONDS."""
+
+from __future__ import annotations
+
+import runpy
+
+from router.edges import http_answers
+
+if __name__ == "__main__":
+    http_answers.KEPT_SECONDS = 0
+    runpy.run_module("router", run_name="__main__", alter_sys=True)
