@@ -61,7 +61,10 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """A program's functions: `receive` by listener, `take` by topic. `feed` makes what tells deadmen of what clients send."""
+    """A program's functions: `receive` by listener, `take` by topic.
+
+    `feed` makes what tells deadmen of what clients send.
+    """
 
     program: Program
     receive: Mapping[str, Receive]
