@@ -59,11 +59,10 @@ def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
             remedy=f"unset {taken}, or make it what {UDP_ON_LOCALHOST} is and set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
         )
         return {}
-    return {
-        _PROFILES[0]: str(UDP_ON_LOCALHOST),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
-        "ROS_LOCALHOST_ONLY": "0",
-    }
+    chosen = {_PROFILES[0]: str(UDP_ON_LOCALHOST), "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
+    if "ROS_LOCALHOST_ONLY" in variables:  # rcl warns where it is set at all
+        chosen["ROS_LOCALHOST_ONLY"] = "0"
+    return chosen
 
 
 @contextmanager

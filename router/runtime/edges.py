@@ -5,6 +5,7 @@ Knows the order in which things belong, and no table that is not compiled.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from router.edges.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
 from router.edges.intake import Receive
 from router.edges.log import logger
 from router.edges.receiver import ReceiveThread
+from router.edges.ros_environment import check_environment
 from router.engine import MAX_DATAGRAM
 from router.engine.state import State
 from router.runtime.sockets import SocketChange, Sockets
@@ -96,6 +98,8 @@ class Edges:
         clients as soon as they are open.
         """
         with ExitStack() as undo:
+            if self._ros is None and wants_ros(program):
+                check_environment(os.environ)  # before a deadman sends for a start that comes to nothing
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
             self._around.accounts.make_room(program.books)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
-from router.edges.ros_environment import check_environment
 from router.errors import SourceSpan, StartError
 
 if TYPE_CHECKING:
@@ -26,7 +24,6 @@ def open_ros(
     met: Callable[[str], None],
 ) -> RosEdge:
     """A node without any topic. Raises StartError."""
-    check_environment(os.environ)
     try:
         from router.edges.ros import RosEdge
     except ImportError as error:
