@@ -16,7 +16,7 @@ from router.errors import SourceSpan, StartError
 
 Opened = TypeVar("Opened", Publication, Subscription)
 
-_ON_ITS_WAY_S = 0.002
+_ON_ITS_WAY_S = 0.005
 """For how long the middleware may still be handing a message to the second of two subscriptions."""
 
 
@@ -70,6 +70,8 @@ def hand_over(
     """
     left = left_by(then, now)
     anew = {each.plan.topic: then[each.plan.topic] for each in left if each.plan.topic in then}
+    if anew:
+        sleep(_ON_ITS_WAY_S)  # what was taken from the one that is left before the pause has come to the other one then
     for each in anew.values():
         each.raw.take_all()
     if anew:
