@@ -29,6 +29,14 @@ def settings(mode: str = "peer", connect: tuple[str, ...] = (), listen: tuple[st
     return ZenohSettings(Located(KEY, SourceSpan("routes/rover.yaml")), mode, connect, listen)
 
 
+def patient(where: str) -> ZenohSettings:
+    """Settings with which Zenoh drops nothing that is large because the machine is slow."""
+    waits = {"wait_before_drop": 60_000_000, "max_wait_before_drop_fragments": 60_000_000}
+    config = {"transport": {"link": {"tx": {"queue": {"congestion_control": {"drop": waits}}}}}}
+    given = ZenohConfig(SourceSpan("routes/rover.yaml"), json.dumps(config))
+    return replace(settings(listen=(where,)), config=given)
+
+
 def locator() -> str:
     return f"tcp/127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
 
@@ -197,7 +205,7 @@ def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> 
 
     async def story() -> None:
         ears, where = Ears(), locator()
-        transport = ZenohTransport(settings(listen=(where,)), ears)
+        transport = ZenohTransport(patient(where), ears)
         async with serving(transport):
             [client] = ears.clients
             with session("client", connect=where) as far:
@@ -216,7 +224,7 @@ def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> 
 def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None:
     async def story() -> None:
         ears, where = Ears(), locator()
-        transport = ZenohTransport(settings(listen=(where,)), ears)
+        transport = ZenohTransport(patient(where), ears)
         async with serving(transport):
             [client] = ears.clients
             with session("client", connect=where) as far:
