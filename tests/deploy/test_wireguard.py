@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import shutil
 import stat
 import subprocess
+import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -86,6 +88,14 @@ def test_the_rovers_tables_are_ready_for_the_tunnel(tmp_path: Path) -> None:
         assert basestation.listener.value == "radio"
 
 
+@contextmanager
+def _one_at_a_time() -> Iterator[None]:
+    """The control sockets of all tunnels are in /var/run/wireguard, which namespaces and other test runs share."""
+    with Path(tempfile.gettempdir(), "router-tests-wireguard.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Rover]:
     """With the tunnel up: `wg0` on the rover, and as `wg1` on the basestation, for both have one /run."""
@@ -97,7 +107,7 @@ def site(tmp_path: Path) -> Iterator[Rover]:
     (tmp_path / "wg1.conf").write_text((tmp_path / "basestation/wg0.conf").read_text())
     (tmp_path / "wg0.conf").chmod(0o600)
     (tmp_path / "wg1.conf").chmod(0o600)
-    with rover_with_networks(tmp_path) as found, ExitStack() as ending:
+    with _one_at_a_time(), rover_with_networks(tmp_path) as found, ExitStack() as ending:
         for computer, name in ((found.rover, "wg0"), (found.radio, "wg1")):
             said = computer.run("wg-quick", "up", tmp_path / f"{name}.conf", check=False)
             if name not in computer.run("wg", "show", "interfaces"):
