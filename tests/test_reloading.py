@@ -67,6 +67,20 @@ def turns(timeout: str, at_start: str = "silent") -> str:
 """
 
 
+def operator(port: int, timeout: str) -> str:
+    """A gateway that lets a topic in."""
+    return f"""\
+gateways:
+  operator:
+    transport: {{tcp: 127.0.0.1:{port}}}
+    format: json_lines
+    inbound:
+      - topic: word
+        type: std_msgs/msg/Bool
+        deadman: {{timeout: {timeout}, send: {{data: false}}}}
+"""
+
+
 def numbered(number: int) -> bytes:
     """A `ph_info` with a number in it."""
     return bytes.fromhex("0a050d") + struct.pack("<f", number)
@@ -498,16 +512,7 @@ def test_what_waits_for_a_budget_is_counted_when_its_route_goes(site: Site) -> N
 def test_what_a_gateway_let_in_is_stopped_when_a_reload_ends_that(site: Site) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
     port = free_port(kind=socket.SOCK_STREAM)
-    gateway = f"""\
-gateways:
-  operator:
-    transport: {{tcp: 127.0.0.1:{port}}}
-    format: json_lines
-    inbound:
-      - topic: word
-        type: std_msgs/msg/Bool
-        deadman: {{timeout: 1h, send: {{data: false}}}}
-"""
+    gateway = operator(port, "1h")
     with site.router(PH + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
         client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
         wait_until(lambda: router.total("messages_published") == 1)
@@ -521,16 +526,7 @@ def test_a_deadman_brakes_while_the_middleware_blocks_that_of_a_gateway(
 ) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
     port = free_port(kind=socket.SOCK_STREAM)
-    gateway = f"""\
-gateways:
-  operator:
-    transport: {{tcp: 127.0.0.1:{port}}}
-    format: json_lines
-    inbound:
-      - topic: word
-        type: std_msgs/msg/Bool
-        deadman: {{timeout: 10ms, send: {{data: false}}}}
-"""
+    gateway = operator(port, "10ms")
     with site.router(turns("500ms") + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
         is_in, go_on = threading.Event(), threading.Event()
 

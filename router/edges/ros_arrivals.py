@@ -19,11 +19,12 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
 
 from router.edges.clock import wall_ns
+from router.edges.ros_node import RCL
 
 MOST_KEPT = 5000
 """What a subscription without a depth holds: Fast DDS keeps no more samples unless it is told to."""
 
-_set_callback = ctypes.CDLL(rclpy_implementation.__file__).rcl_subscription_set_on_new_message_callback
+_set_callback = RCL.rcl_subscription_set_on_new_message_callback
 _set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 
 # To the middleware it is `void callback(const void *user_data, size_t messages)`, to libc `int eventfd_write(int fd,

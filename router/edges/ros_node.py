@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from pathlib import Path
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
 from router.edges.log import logger
@@ -16,6 +18,9 @@ from router.errors import StartError
 
 RCL_ERRORS = (RuntimeError, NameValidationException)
 """What rclpy raises for bad arguments, names and settings: its own errors derive from RuntimeError."""
+
+RCL = ctypes.CDLL(rclpy_implementation.__file__)
+"""rcl, which rclpy's library has loaded. Calls through it release the interpreter lock; those of rclpy hold it."""
 
 UDP_ON_LOCALHOST = Path(__file__).with_name("fastdds_udp_localhost.xml")
 """A profile of Fast DDS: UDP as its only transport, discovery on this computer only."""

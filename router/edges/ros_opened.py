@@ -14,7 +14,7 @@ from rclpy.node import Node
 
 from router.compiler.program import TopicPlan
 from router.edges.ros_arrivals import RawSubscription
-from router.edges.ros_node import RCL_ERRORS
+from router.edges.ros_node import RCL, RCL_ERRORS
 from router.edges.ros_qos import PeerEvents, publisher_qos, qos_profile, subscription_qos
 from router.errors import SourceSpan, StartError
 
@@ -39,18 +39,17 @@ class _ErrorString(ctypes.Structure):
 
 
 # rclpy publishes with the interpreter lock held, and Fast DDS may wait for seconds in there, for a reader that has gone
-# or a shared-memory port. Through ctypes the lock is released meanwhile. rclpy's library has loaded that of rcl.
-_RCL = ctypes.CDLL(rclpy_implementation.__file__)
+# or a shared-memory port. Through ctypes the lock is released meanwhile.
 _publish_serialized = ctypes.CFUNCTYPE(
     ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_SerializedMessage), ctypes.c_void_p
-)(("rcl_publish_serialized_message", _RCL))
-_error_string = ctypes.CFUNCTYPE(_ErrorString)(("rcutils_get_error_string", _RCL))
+)(("rcl_publish_serialized_message", RCL))
+_error_string = ctypes.CFUNCTYPE(_ErrorString)(("rcutils_get_error_string", RCL))
 
 
 def _rcl_error() -> Exception:
     """What rcl says of the last call of this thread that failed."""
     text = _error_string().text.decode(errors="replace")
-    _RCL.rcutils_reset_error()
+    RCL.rcutils_reset_error()
     error: Exception = rclpy_implementation.RCLError(text)
     return error
 

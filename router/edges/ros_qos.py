@@ -23,6 +23,7 @@ from rclpy.qos import (
 from router.compiler.books import QOS_POLICIES
 from router.compiler.program import QosPlan, TopicPlan
 from router.edges.log import logger
+from router.edges.ros_node import RCL
 
 if TYPE_CHECKING:
     from router.edges.ros_opened import Publication, Subscription
@@ -77,19 +78,18 @@ class _Profile(ctypes.Structure):
     )
 
 
-_rcl = ctypes.CDLL(rclpy_implementation.__file__)
-for _actual_qos in (_rcl.rcl_publisher_get_actual_qos, _rcl.rcl_subscription_get_actual_qos):
+for _actual_qos in (RCL.rcl_publisher_get_actual_qos, RCL.rcl_subscription_get_actual_qos):
     _actual_qos.argtypes, _actual_qos.restype = (ctypes.c_void_p,), ctypes.POINTER(_Profile)
 
 
 def publisher_qos(pointer: int) -> OpenQos:
     """What the middleware made of `system_default` and `best_available`. `pointer` is that of an open handle."""
-    return _open_qos(_rcl.rcl_publisher_get_actual_qos(pointer).contents)
+    return _open_qos(RCL.rcl_publisher_get_actual_qos(pointer).contents)
 
 
 def subscription_qos(pointer: int) -> OpenQos:
     """As `publisher_qos`."""
-    return _open_qos(_rcl.rcl_subscription_get_actual_qos(pointer).contents)
+    return _open_qos(RCL.rcl_subscription_get_actual_qos(pointer).contents)
 
 
 def _open_qos(qos: Any) -> OpenQos:
