@@ -25,7 +25,7 @@ from router.table import load_table
 from router.table.model import RouteTable, Topic
 from router.types.lock import check_lock, locked_size
 from router.types.model import MessageType
-from router.types.protobuf import Envelope, ProtoSchema, find_envelope
+from router.types.protobuf import Envelope, ProtoSchema, find_envelope, without_protos
 
 
 @dataclass(frozen=True)
@@ -72,18 +72,18 @@ def check_table(
         return Checked(path, sorted_findings(findings))
     definitions = definitions or Definitions()
     try:
-        schema = definitions.protos(table.envelope.protos.value, table.envelope.protos.span)
-        envelope = find_envelope(schema, table.envelope)
+        schema, envelope = _wire(table, definitions)
     except TableError as error:
         return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
-    lookup = Lookup(table, schema, envelope, definitions, locked_size(schema) or envelope.max_size)
+    locked = locked_size(schema) if table.envelope else None
+    lookup = Lookup(table, schema, envelope, definitions, locked or envelope.max_size)
     routes = RouteChecker(lookup).check_all()
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
     own_type = lookup.ros_type(own) if own else None
     findings = [
         *findings,
-        *check_lock(schema, envelope),
+        *(check_lock(schema, envelope) if table.envelope else ()),
         *network_findings(table),
         *lookup.findings,
         *clash_findings(table),
@@ -91,3 +91,11 @@ def check_table(
     ]
     own_topics = [(own, own_type)] if own and own_type else []
     return Checked(path, sorted_findings(findings), table, schema, envelope, routes, gateways, own_topics)
+
+
+def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:
+    """Raises TableError."""
+    if table.envelope is None:
+        return without_protos()
+    schema = definitions.protos(table.envelope.protos.value, table.envelope.protos.span)
+    return schema, find_envelope(schema, table.envelope)

@@ -106,7 +106,7 @@ def _surroundings(table: RouteTable) -> Iterator[Named]:
         **flat(table.metrics, "metrics.address"),
         **flat(table.foxglove, "foxglove.address"),
     }
-    yield ("table", ""), Part(SourceSpan(table.routes_span.file), "", settings)
+    yield ("table", ""), Part(SourceSpan(shown_path(table.path)), "", settings)
     if table.record is not None:
         directory = shown_path(Path(os.path.normpath(table.record.directory)))
         yield ("record", ""), Part(table.record.span, directory, flat(table.record))

@@ -29,7 +29,7 @@ class Known:
 
     def payload(self, listener: str, data: bytes) -> tuple[PayloadCase, Message] | None:
         """None for a datagram that this listener's would reject, because there is none in it."""
-        if len(data) > MAX_DATAGRAM:
+        if len(data) > MAX_DATAGRAM or not self.envelope.cases:
             return None
         if listener in self._repairing:
             data = restored(data, MAX_DATAGRAM)

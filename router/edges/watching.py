@@ -101,7 +101,8 @@ def watched_files(table: RouteTable) -> list[Path]:
     """The table, what it extends, files for Zenoh, and everything beside its protos, new files there among them."""
     configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
     paths = [config.path for config in configs if config.path is not None]
-    return [*table.files, *paths, *table.envelope.protos.value.rglob("*")]
+    protos = table.envelope.protos.value.rglob("*") if table.envelope else ()
+    return [*table.files, *paths, *protos]
 
 
 def wait_for_rest(files: Iterable[Path], until: int) -> bool:

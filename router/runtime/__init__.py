@@ -95,6 +95,7 @@ class Router:
             table=str(program.table.path),
             listening={name: listener.bound_to for name, listener in self.listeners.items()},
             routes=sum(not route.ignore for route in program.table.routes),
+            gateways=len(program.gateways),
             destinations=len(program.senders),
             published=len(program.publishers),
             subscribed=len(program.subscriptions),

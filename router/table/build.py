@@ -54,7 +54,7 @@ DEFAULT_KEEP = 4 << 30
 
 
 def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Diagnostic]) -> RouteTable | None:
-    """The table of everything sound; None where the envelope or the routes as a whole are not.
+    """The table of everything sound; None where the envelope or the routes as a whole are not, or are missing.
 
     What only the values themselves can tell, such as a size beyond what the kernel takes, is added to
     `findings`.
@@ -63,7 +63,9 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     envelope = builder.one(root, "envelope", _envelope)
     routes = root.entries.get("routes")
     endpoints = root.entries.get("endpoints")
-    if envelope is None or not _is_group(routes) or not (endpoints is None or _is_group(endpoints)) or routes is None:
+    if not all(entry is None or _is_group(entry) for entry in (routes, endpoints)):
+        return None
+    if (envelope is None or routes is None) and not _has_gateways_only(root):
         return None
     gateways = builder.each(root, "gateways", build_gateway, salvage=sound_part)
     return RouteTable(
@@ -76,7 +78,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         listeners=builder.each(root, "listen", _listener),
         endpoints=builder.each(root, "endpoints", _endpoint),
         routes=named(builder.each(root, "routes", build_case, salvage=sound_part).values()),
-        routes_span=routes.key.span,
+        routes_span=routes.key.span if routes else None,
         gateways={name: each for name, each in gateways.items() if isinstance(each, Gateway)},
         ignored_gateways={name: each for name, each in gateways.items() if isinstance(each, IgnoredGateway)},
         broken=frozenset(builder.broken),
@@ -145,8 +147,13 @@ class _Builder:
         return None
 
 
-def _is_group(entry: Entry | None) -> bool:
-    return entry is not None and isinstance(entry.value, MappingNode)
+def _has_gateways_only(root: MappingNode) -> bool:
+    """The table receives no datagrams, so it needs no envelope."""
+    return "gateways" in root.entries and not root.entries.keys() & {"listen", "routes"}
+
+
+def _is_group(entry: Entry) -> bool:
+    return isinstance(entry.value, MappingNode)
 
 
 def _envelope(entry: Entry) -> EnvelopeSettings:

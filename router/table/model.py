@@ -433,7 +433,8 @@ class IgnoredGateway:
 class RouteTable:
     """One table after `extends` and variables. `files` are all files read, the table itself first.
 
-    `routes_span` is the place of the key `routes`. `sha256` is over the bytes of `files` in order.
+    `routes_span` is the place of the key `routes`. A table of gateways has none, and need not have an envelope.
+    `sha256` is over the bytes of `files` in order.
     `broken` names what the table has but is left out here because of findings of its own, as
     `endpoints/arm_board`, so that nobody reports its absence as well. Of a route in it, `routes/imu_info`,
     there may be the sound part: what is missing there is no finding.
@@ -442,13 +443,13 @@ class RouteTable:
     path: Path
     files: tuple[Path, ...]
     sha256: str
-    envelope: EnvelopeSettings
+    envelope: EnvelopeSettings | None
     node: NodeSettings
     metrics: Located[Address] | None
     listeners: Mapping[str, Listener]
     endpoints: Mapping[str, Endpoint]
     routes: tuple[Route, ...]
-    routes_span: SourceSpan
+    routes_span: SourceSpan | None
     gateways: Mapping[str, Gateway] = field(default_factory=dict)
     ignored_gateways: Mapping[str, IgnoredGateway] = field(default_factory=dict)
     broken: frozenset[str] = frozenset()

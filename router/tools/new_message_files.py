@@ -39,7 +39,7 @@ def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Ch
         texts[tests] = with_test(tests, _read(tests), message, site)
     unrouted = []
     for other in others:
-        if path in other.files or other.envelope.protos.value != site.table.envelope.protos.value:
+        if path in other.files or _protos(other) != _protos(site.table):
             continue
         text = forwarding_table_text(_read(other.path), message, other, shown_path(other.path))
         if text is None:
@@ -47,6 +47,10 @@ def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Ch
         else:
             texts[other.path] = text
     return Changes(texts, tuple(unrouted))
+
+
+def _protos(table: RouteTable) -> Path | None:
+    return table.envelope.protos.value if table.envelope else None
 
 
 class Written:

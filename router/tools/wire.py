@@ -86,7 +86,9 @@ def read_table(path: Path) -> RouteTable:
 
 
 def wire_of_table(table: RouteTable) -> Wire:
-    """The envelope that the table names. Raises TableError."""
+    """The envelope that the table names. Raises TableError, and UsageError where it names none."""
+    if table.envelope is None:
+        raise UsageError(f"{shown_path(table.path)} has no 'envelope': there are no datagrams to build or to read")
     return _wire(table.envelope)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
@@ -135,6 +136,12 @@ def load_protos(root: Path, blame: SourceSpan | None = None) -> ProtoSchema:
     if findings:
         raise TableError(findings)
     return ProtoSchema(root, files, compiled, sources, options)
+
+
+def without_protos() -> tuple[ProtoSchema, Envelope]:
+    """What a table refers to that has no envelope: no declarations, and an envelope without payload cases."""
+    schema = ProtoSchema(Path(), {}, FileDescriptorSet(), ProtoSources((), {}), {})
+    return schema, Envelope("", "", Empty, {}, 0)
 
 
 def _homes(root: Path) -> Mapping[str, str]:

@@ -158,6 +158,7 @@ def test_protos_are_relative_to_the_file_that_says_so(tmp_path: Path) -> None:
     table, findings = load(tmp_path, "extends: base/base.yaml\n")
     assert not findings
     assert table
+    assert table.envelope
     assert table.envelope.protos.value.resolve() == tmp_path / "protos"
 
 
