@@ -81,10 +81,13 @@ def _is_table(file: Path) -> bool:
 
 
 def summary(table: RouteTable) -> str:
-    """`26 payload cases, 31 topics, 8 endpoints, 1 gateway`."""
+    """`26 payload cases, 31 topics, 8 endpoints, 1 gateway`, without what there is none of."""
     topics = sum(len(route.topics) for route in table.routes)
     cases = {route.case.value for route in table.routes}
-    counts = [(len(cases), "payload case"), (topics, "topic"), (len(table.endpoints), "endpoint")]
-    if table.gateways:
-        counts.append((len(table.gateways), "gateway"))
-    return ", ".join(plural(count, noun) for count, noun in counts)
+    counts = {
+        "payload case": len(cases),
+        "topic": topics,
+        "endpoint": len(table.endpoints),
+        "gateway": len(table.gateways),
+    }
+    return ", ".join(plural(count, noun) for noun, count in counts.items() if count)

@@ -70,7 +70,9 @@ def _table(path: Path, variables: Mapping[str, str]) -> Iterator[Finding | Progr
     if warnings:
         count = f"{warnings} warning{'s' if warnings > 1 else ''}"
         yield warning("table", count, f"`router validate {shown_path(path)}` shows them")
-    yield fine("table", f"{shown_path(path)}: {len(table.routes)} routes, {len(table.endpoints)} endpoints")
+    counts = {"route": len(table.routes), "endpoint": len(table.endpoints), "gateway": len(table.gateways)}
+    told = ", ".join(f"{count} {noun}{'s' * (count > 1)}" for noun, count in counts.items() if count)
+    yield fine("table", f"{shown_path(path)}: {told}")
     yield checked.program
 
 

@@ -29,7 +29,9 @@ _UNSYNCHRONISED = 0x40
 
 def receive_buffers(program: Program) -> Iterator[Finding]:
     """Whether a burst has the room that the table wants for it."""
-    wanted = max((listener.receive_buffer for listener in program.listeners), default=0)
+    if not program.listeners:
+        return
+    wanted = max(listener.receive_buffer for listener in program.listeners)
     try:
         allowed = int(RMEM_MAX.read_text())
     except FileNotFoundError:  # in a container with a network of its own

@@ -37,7 +37,7 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
         wanted += [("udp", each.address, each.interface, f"listener '{each.name}'") for each in program.listeners]
     refused = [finding for each in wanted for finding in _port(*each)]
     free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
-    yield from refused or [fine("ports", f"free: {free}")]
+    yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])
 
 
 def interfaces(program: Program) -> Iterator[Finding]:

@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from router.compiler import Checked
 from router.table.model import RouteTable
+from router.tools import UsageError
 from router.types.protobuf import Envelope, ProtoSchema
 
 SCALARS = {
@@ -74,9 +75,11 @@ class Site:
 
 
 def site_of(checked: Checked, messages: Path) -> Site:
-    """`checked` is a table without errors."""
+    """`checked` is a table without errors. Raises UsageError where it has no envelope."""
     if checked.table is None or checked.schema is None or checked.envelope is None:
         raise ValueError(f"{checked.path} has errors")
+    if checked.table.envelope is None:
+        raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
     return Site(checked.table, checked.schema, checked.envelope, messages)
 
 

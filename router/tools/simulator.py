@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from router.compiler.program import DeadmanPlan
 from router.table.model import Address, Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
+from router.tools import UsageError
 from router.tools.board import Change, boards
 from router.tools.inbox import Inbox
 from router.tools.models import moment
@@ -52,7 +53,8 @@ class Statistics:
 
 
 class Simulator:
-    """Plays the endpoints of a table. Binds every address at once; raises UsageError when one cannot be had.
+    """Plays the endpoints of a table. Binds every address at once; raises UsageError when one cannot be had, or for a
+    table without listeners.
 
     `deadmen` are those of the program that the table compiles to: a board knows what they send.
     """
@@ -67,6 +69,8 @@ class Simulator:
         deadmen: Sequence[DeadmanPlan] = (),
         silences: Sequence[Silence] = (),
     ) -> None:
+        if not table.listeners:
+            raise UsageError(f"{table.path} has no listeners: nobody receives what boards would send")
         self.statistics = Statistics()
         played = boards(wire, table, deadmen, self.statistics.changes.append)
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}

@@ -34,6 +34,9 @@ def read_test_file(path: Path, definitions: Definitions) -> TableTestFile:
     checked = check_table(_table_of(root, path), _variables(root), definitions)
     if checked.program is None:
         raise TableError(checked.diagnostics)
+    if checked.program.table.routes_span is None:
+        message, hint = f"{shown_path(checked.path)} has no routes", "only routes are tested, gateways are not"
+        raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message, hint)])
     findings: list[Diagnostic] = []
     reader = _Reader(Names(checked), findings)
     tests = root.get("tests")

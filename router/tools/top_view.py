@@ -74,7 +74,8 @@ def _told(shown: Top) -> list[Text]:
     for row in shown.rows:
         if row.is_tripped:
             about.append(f"deadman of {row.row.route} sends  ", style="bold red")
-    about.append("last heard: ", style="dim")
+    if shown.silence:
+        about.append("last heard: ", style="dim")
     about.append(", ".join(f"{name} {age_text(seconds)}" for name, seconds in shown.silence.items()), style="cyan")
     return [Text(summary_line(shown.view), no_wrap=True, overflow="ellipsis"), about]
 

@@ -1,0 +1,83 @@
+"""What each verb says of a table that has `gateways` only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+
+TABLE = """\
+gateways:
+  headset: {transport: {udp: 127.0.0.9:8502}}
+"""
+NO_ENVELOPE = "only.yaml has no 'envelope': there are no datagrams to build or to read\n"
+
+
+@pytest.fixture(autouse=True)
+def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "only.yaml"
+    path.write_text(TABLE)
+    return path
+
+
+def test_validate_counts_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["validate", "--strict", "only.yaml"]) == OK
+    assert capsys.readouterr().out == "only.yaml: ok (1 gateway)\n"
+
+
+def test_explain_and_graph_show_the_gateway(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["explain", "--table", "only.yaml"]) == OK
+    assert capsys.readouterr().out.startswith("headset: gateway, udp to 127.0.0.9:8502")
+    for name in ("map.svg", "map.mmd", "map.dot"):
+        assert main(["graph", "only.yaml", "-o", name]) == OK
+        assert "headset" in Path(name).read_text()
+
+
+def test_a_dashboard_has_a_row_for_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["dashboard", "only.yaml"]) == OK
+    assert '"title": "gateway headset"' in capsys.readouterr().out
+
+
+def test_the_doctor_says_nothing_of_what_it_does_not_have(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["doctor", "only.yaml"])
+    said = capsys.readouterr().out
+    assert "only.yaml: 1 gateway\n" in said
+    assert "buffers" not in said
+    assert "ports" not in said
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["send", "imu_info", "--to", "127.0.0.1:5000", "--table", "only.yaml"],
+        ["tap", "--table", "only.yaml", "--url", "http://127.0.0.1:9"],
+        ["tap", "5000", "--table", "only.yaml"],
+    ],
+    ids=" ".join,
+)
+def test_what_is_about_datagrams_says_that_there_are_none(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == BAD_USAGE
+    assert capsys.readouterr().err == f"router {arguments[0]}: {NO_ENVELOPE}"
+
+
+def test_the_simulator_has_nobody_to_send_to(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "only.yaml", "--duration", "1"]) == BAD_USAGE
+    assert "only.yaml has no listeners" in capsys.readouterr().err
+
+
+def test_no_message_can_be_added_to_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["new", "SensorBoardDose", "--number", "99", "--board", "sensor", "--table", "only.yaml"]) == BAD_USAGE
+    assert "only.yaml has no 'envelope'" in capsys.readouterr().err
+
+
+def test_there_is_nothing_to_test(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["test", "."]) == BAD_USAGE
+    assert "no tests (*.test.yaml)" in capsys.readouterr().err
+    (tmp_path / "only.test.yaml").write_text("tests: {a: {given: {case: ph_info, from: any}, expect: nothing}}\n")
+    assert main(["test", "."]) == BAD_TABLE
+    assert "only.test.yaml:1:1: error[bad-file]: only.yaml has no routes; only routes are" in capsys.readouterr().err
