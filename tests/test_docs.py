@@ -61,6 +61,16 @@ def test_each_example_of_a_table_is_good_in_place_of_what_the_rover_has(tmp_path
     assert list(map(str, check_table(table).diagnostics)) == []
 
 
+@pytest.mark.parametrize("page", [*TABLE_PAGES, "moving-over.md"])
+def test_examples_with_gateways_only_are_whole_tables(tmp_path: Path, page: str) -> None:
+    table = tmp_path / "table.yaml"
+    whole = [text for text in examples(page, "yaml") if "\ngateways:" in f"\n{text}"]
+    assert whole
+    for example in whole:
+        table.write_text(example)
+        assert list(map(str, check_table(table, {}).diagnostics)) == []
+
+
 # -- links ---------------------------------------------------------------------------------------------------------
 
 TEXTS = [*DOCS.parent.glob("*.md"), *DOCS.glob("*.md")]

@@ -126,6 +126,12 @@ def test_a_page_has_all_of_it() -> None:
     assert lines[4].split()[-2:] == ["3", "stale"]
 
 
+def test_where_there_are_no_endpoints_nobody_was_heard_last() -> None:
+    values = {**snapshot(12, 100, 0).values, "endpoint_last_seen_timestamp_seconds": {}}
+    still = Snapshot(12, values)
+    assert "last heard" not in "".join(printed(page(top(still, still, NOW))))
+
+
 @pytest.mark.parametrize("height", [6, 7, 24])
 def test_a_screen_never_has_more_lines_than_there_are(height: int) -> None:
     lines = printed(screen(seen(), "title", Order.TABLE, height, "no answer"))

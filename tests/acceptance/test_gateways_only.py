@@ -1,0 +1,110 @@
+"""A router whose table has `gateways` only, in a process of its own: the one of docs/moving-over.md, and reloads."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import urllib.request
+from functools import partial
+from pathlib import Path
+
+from router.assets import asset
+from tests.acceptance.payloads import WIRE, sample
+from tests.acceptance.ros_peer import PATIENCE
+from tests.acceptance.ros_speaker import Speaker
+from tests.acceptance.site import ROOT, RouterProcess, key, site, total, udp, wait_until
+from tests.acceptance.test_gateway import Headset, data_of, lines, repeating
+from tests.ports import free_port
+
+ONLY = """\
+metrics: {address: 127.0.0.1:METRICS}
+foxglove: {address: 127.0.0.1:FOXGLOVE}
+record: {directory: recordings, last: 10s}
+node: {diagnostics: true}
+gateways:
+  logger: {transport: {tcp: 127.0.0.5:PORT}, format: json_lines, topics: {include: ["/gw/**"]},
+           publish_period: each, discovery_period: 200ms}
+"""
+ROUTES = f"""\
+envelope: {{protos: {asset("protos")}, message: PBEnvelope, oneof: payload}}
+listen: {{rover: {{address: 127.0.0.5:LISTEN}}}}
+routes:
+  imu_info: {{source: any, topics: [{{topic: gw/imu, type: comms/msg/ImuSensorInformation, fields: auto}}]}}
+"""
+IMU = sample("imu_info", WIRE.envelope.cases["imu_info"].message_class(accel_x=1.5)).datagram
+
+
+def asked(port: int, path: str, data: bytes | None = None) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", data, PATIENCE) as answer:
+        return str(answer.read().decode())
+
+
+def test_the_table_of_who_moves_over_streams_topics(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "moving-over.md").read_text(encoding="utf-8")
+    [text] = re.findall(r"^```yaml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    with site(tmp_path, {}) as place, udp("127.0.0.9") as opened, Speaker() as speaker:
+        text = text.replace("10.0.20.219:8502", f"127.0.0.9:{opened.getsockname()[1]}")
+        text = text.replace("10.0.0.230:8500", f"127.0.0.5:{free_port('127.0.0.5')}").replace(
+            "9108", str(place.metrics)
+        )
+        assert {host.partition(".")[0] for host in re.findall(r"[\d.]+(?=:\d)", text)} == {"127"}
+        table = tmp_path / "gateway.yaml"
+        table.write_text(text)
+        speaker.open("/imu/rate", "geometry_msgs/msg/Vector3", keeps=True)
+        speaker.say("/imu/rate", {"x": 1.5})
+        speaker.open("/elsewhere", "std_msgs/msg/String")
+        with RouterProcess(tmp_path, table) as router:
+            client = Headset(opened)
+            assert client.wait_for(data_of("/imu/rate")) == {"x": [1.5], "y": [0.0], "z": [0.0]}
+            assert client.early == []
+            assert speaker.heard_by("/elsewhere") == 0
+            assert asked(place.metrics, "/ready").strip() == "ready"
+            counts = place.scrape()
+            assert total(counts, "messages_sent", route="vr_headset") > 0
+            assert total(counts, "datagrams_received") == total(counts, "unhandled") == 0
+            assert json.loads(asked(place.metrics, "/status.json"))["routes"].keys() == {"vr_headset"}
+            assert router.stop(signal.SIGTERM) == 0
+            assert len(router.events("router stopped")) == 1
+            assert [line for line in router.log() if line["level"] != "info"] == []
+
+
+def test_a_reload_gives_it_its_first_routes_and_takes_them_away_again(tmp_path: Path) -> None:
+    with site(tmp_path, {}) as place, udp("127.0.0.30") as board, Speaker() as speaker:
+        port = free_port("127.0.0.5", kind=socket.SOCK_STREAM)
+        ports = {"METRICS": place.metrics, "FOXGLOVE": free_port(kind=socket.SOCK_STREAM), "PORT": port}
+        only, routes = ONLY, ROUTES.replace("LISTEN", str(place.listen))
+        for word, number in ports.items():
+            only = only.replace(word, str(number))
+        table = tmp_path / "table.yaml"
+        table.write_text(only)
+        speaker.open("/gw/word", "std_msgs/msg/String", keeps=True)
+        speaker.say("/gw/word", {"data": "before"})
+        with (
+            RouterProcess(tmp_path, table) as router,
+            socket.create_connection(("127.0.0.5", port), PATIENCE) as opened,
+        ):
+            received = (line for line in lines(opened) if line["op"] == "data")
+            assert next(received)["data"] == {"data": "before"}
+
+            table.write_text(only + routes)
+            assert json.loads(asked(place.metrics, "/-/reload", b""))["ok"]
+            with repeating(partial(board.sendto, IMU, ("127.0.0.5", place.listen))):
+                imu = next(line for line in received if line["topic"] == "/gw/imu")
+            assert imu["data"]["accel_x"] == 1.5
+            assert "imu_info" in json.loads(asked(place.metrics, "/status.json"))["routes"]
+
+            table.write_text(only)
+            assert json.loads(asked(place.metrics, "/-/reload", b""))["ok"]
+            assert asked(place.metrics, "/ready").strip() == "ready"
+            with udp("127.0.0.5", place.listen):
+                pass  # nobody has it any more
+            saved = Path(json.loads(asked(place.metrics, "/record/save", b""))["file"])
+            assert saved.stat().st_size > 0
+            speaker.say("/gw/word", {"data": "after"})
+            assert next(line for line in received if line["topic"] == "/gw/word")["data"] == {"data": "after"}
+            accepted = key("messages_received", route="imu_info", source="unknown")
+            wait_until(lambda: place.scrape()[accepted] == total(place.scrape(), "datagrams_received"), "the balance")
+            assert router.stop(signal.SIGTERM) == 0
+            assert {line["level"] for line in router.log()} == {"info"}
