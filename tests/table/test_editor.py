@@ -127,6 +127,15 @@ def test_good_gateways_are_underlined_nowhere(editor: LanguageServer) -> None:
     assert editor.open(new_table(), GATEWAYS) == []
 
 
+def test_gateways_alone_need_nothing_beside_them_and_routes_do(editor: LanguageServer) -> None:
+    lines = GATEWAYS.splitlines(keepends=True)
+    alone = [line for line in lines if not line.startswith(("version", "envelope", "listen", "routes"))]
+    assert len(alone) == len(lines) - 4
+    assert editor.open(new_table(), "".join(alone)) == []
+    found = editor.open(new_table(), "".join(line for line in lines if not line.startswith("envelope")))
+    assert [item["message"] for item in found] == ['Missing property "envelope".']
+
+
 @pytest.mark.parametrize("table", sorted((REPOSITORY / "routes").glob("*.yaml")), ids=lambda path: path.name)
 def test_the_tables_of_the_repository_are_underlined_nowhere_but_for_what_they_inherit(
     editor: LanguageServer, table: Path
