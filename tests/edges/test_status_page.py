@@ -98,6 +98,25 @@ def test_the_map_shows_the_whole_table(page: Page) -> None:
     assert page.evaluate("document.querySelectorAll('.node').length") == page.evaluate("nodes.size")
 
 
+def test_a_table_with_gateways_only_is_shown_as_well(browser: Browser, tmp_path: Path) -> None:
+    table = tmp_path / "only.yaml"
+    table.write_text("gateways: {headset: {transport: {udp: 127.0.0.9:8502}}}\n")
+    program = check_table(table).program
+    assert program is not None
+    opened = FakeRunning(program)
+    opened.count("config_last_reload_successful", to=1)
+    with closing(HttpServer(Address("127.0.0.1", 0), SourceSpan("t.yaml"), opened, None)) as server:
+        page = open_page(browser, f"http://{server.address}/")
+        assert page.evaluate("[...nodes.values()].map((node) => node.name)") == [
+            "ROS topics", "headset", "clients of headset",
+        ]  # fmt: skip
+        assert page.evaluate("document.querySelector('#well').hidden") is False
+        assert page.complaints() == []
+        page.close()
+    opened.mirror.close()
+    assert opened.failures == []
+
+
 def test_a_line_is_as_wide_as_its_rate(running: FakeRunning, page: Page) -> None:
     slow, fast = ("gps_info", "basestation"), ("imu_info", "basestation")
     page.until("answers.length > 1")
