@@ -155,7 +155,7 @@ def test_what_cannot_be_extended_is_one_finding(base: Path, text: str, code: Cod
     [
         ("endpoints: {tool: {address: 127.0.0.8:1}}", "endpoints.tool: kind"),
         ("listen: {second: {framing: exact}}", "listen.second: address"),
-        ("metrics: {}", "metrics: address"),
+        ("foxglove: {}", "foxglove: address"),
         ("routes: {gps_info: {destinations: [basestation]}}", "routes.gps_info: source"),
         ("routes: {imu_info: {deadman: {timeout: 1s, to: [basestation]}}}", "routes.imu_info.deadman: send"),
         ("gateways: {far: {format: json}}", "gateways.far: transport"),
