@@ -302,6 +302,11 @@ def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText
     assert {each for each in series if each[1:] and re.match("it(:|$)", each[1])} == expected
 
 
+def test_a_deadman_of_clients_may_publish_nan(check_text: CheckText) -> None:
+    deadman = "{timeout: 1s, send: {linear.x: nan}}"
+    assert codes(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, deadman: {deadman}}}]}}") == []
+
+
 NO_GOSSIP = "config: {scouting: {gossip: {enabled: false}}}"
 LOCATORS = "listen: [tcp/127.0.0.1:7447]"
 TO_A_ROUTER = "mode: client, connect: [tcp/127.0.0.1:7447]"
