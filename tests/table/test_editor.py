@@ -91,6 +91,7 @@ PART = """\
 # yaml-language-server: $schema=../schemas/route-table.schema.json
 version: 1
 extends: rover.yaml
+networks: [127.0.0.0/8, "${NETWORK:-10.0.0.0/8}"]
 envelope: {message: OtherEnvelope}
 metrics: {}
 record: {keep: 1GiB}
@@ -184,6 +185,7 @@ def test_a_table_that_extends_another_may_leave_out_what_it_inherits(editor: Lan
         ("receive_buffer: 8MiB", "receive_bufer: 8MiB", "receive_bufer", "Property receive_bufer is not allowed."),
         ("127.0.0.30:25008", "127.0.0.30", "127.0.0.30", "must be an IPv4 address and a port"),
         ("publish_period: each", "publish_period: never", "publish_period", "or 'each'"),
+        ("[127.0.0.0/8", "[localhost", "networks", "must be an IPv4 network"),
         (", to: [driving_board]", "", "deadman: {timeout: 200ms", 'Missing property "to"'),
         ("type: std_msgs/msg/Bool, ", "", "topics", 'Missing property "type"'),
         ("timeout: 300ms, ", "", "deadman: {send", 'Missing property "timeout"'),
