@@ -205,7 +205,7 @@ def test_a_table_that_extends_another_is_checked_for_all_else(
 @pytest.mark.parametrize(
     ("part", "missing"),
     [
-        ("envelope: {message: PBEnvelope, oneof: payload}", "protos"),
+        ("envelope: {protos: ../protos, message: PBEnvelope}", "oneof"),
         ("metrics: {}", "address"),
         ("record: {keep: 1GiB}", "directory"),
         ("foxglove: {}", "address"),
