@@ -87,6 +87,7 @@ class Code(enum.Enum):
         "address-clash",
         "Two want one local address or Zenoh key, or two endpoints could not be told apart.",
     )
+    OUTSIDE_NETWORKS = ("outside-networks", "An address, or a way to find others, beyond the table's `networks`.")
     FORWARDING_LOOP = ("forwarding-loop", "A destination is the message's own source, or this router.")
     BAD_TOPIC_NAME = ("bad-topic-name", "Not a ROS topic name.")
     TOPIC_TYPE_CLASH = ("topic-type-clash", "Two routes or gateways give one topic different types.")

@@ -222,6 +222,18 @@ def test_a_table_with_errors_changes_nothing_and_is_told(site: Site) -> None:
         assert settled(router)["router_config_last_reload_successful[]"] == 1
 
 
+def test_an_address_outside_of_the_networks_changes_nothing(site: Site) -> None:
+    with site.router(PH) as router:
+        before = router.program
+        here = "networks: [127.0.0.0/8]\n"
+        site.write(PH, endpoints=f"  camera: {{address: 192.168.0.60:8, kind: tool}}\n{here}")
+        result = router.reload()
+        assert (result.ok, router.program is before) == (False, True)
+        assert "error[outside-networks]" in str(result.findings[0])
+        site.write(PH, endpoints=f"  camera: {{address: 127.0.0.60:8, kind: tool}}\n{here}")
+        assert router.reload().ok
+
+
 def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
     with site.router(PH) as router, udp("127.0.0.1") as taken:
         both = (

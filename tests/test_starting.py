@@ -224,3 +224,23 @@ def test_what_a_domain_may_be_and_which_transports_share_memory(tmp_path: Path) 
     assert not any(uses_shared_memory({transports: each}) for each in ("UDPv4", "UDPv6", "TCPv4", "NONE"))
     assert not uses_shared_memory({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
     assert list(obstacles({}, tmp_path / "none")) == []
+
+
+def test_an_endpoint_that_the_rovers_table_gets_is_an_error_in_that_for_one_machine(tmp_path: Path) -> None:
+    """Its real address was inherited there, and datagrams left the machine."""
+    shutil.copytree(ROOT / "routes", tmp_path / "routes")
+    rover, sim = tmp_path / "routes" / "rover.yaml", tmp_path / "routes" / "sim.yaml"
+    text = rover.read_text(encoding="utf-8").replace("protos: ../protos", f"protos: {ROOT / 'protos'}")
+    rover.write_text(text.replace("\nendpoints:\n", "\nendpoints:\n  camera: {address: 192.168.0.60:8, kind: tool}\n"))
+    line = rover.read_text().splitlines().index("  camera: {address: 192.168.0.60:8, kind: tool}") + 1
+    found = f"{rover}:{line}:21: error[outside-networks]: 'address' of endpoints.camera is 192.168.0.60:8, outside"
+    for verb in (f"validate {sim}", f"run {sim}", f"send ph_info --table {sim} --to camera"):
+        process = start(MODULE, *verb.split())
+        try:
+            told = "".join(process.communicate(timeout=60))
+        finally:
+            process.kill()
+        assert found in told, verb
+        assert process.returncode == 78, verb
+    sim.write_text(sim.read_text().replace("\nendpoints:\n", "\nendpoints:\n  camera: {address: 127.0.0.60:25008}\n"))
+    assert ended("validate", sim)[0] == 0

@@ -133,5 +133,8 @@ _DECLARED = (
 FUNCTIONS: Mapping[str, Function] = {function.name: function for function in _DECLARED}
 """By name, without `has`."""
 
+NOT_FINITE: Mapping[str, float] = {"nan": math.nan, "inf": math.inf}
+"""What no literal gives, by the name that it has in expressions; a field of that name wins."""
+
 HAS = "has"
 """`has(field)` looks at a field rather than at its value, and so is part of the syntax."""

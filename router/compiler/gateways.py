@@ -24,6 +24,10 @@ def check_gateways(lookup: Lookup) -> tuple[CheckedGateway, ...]:
             from router.compiler.zenoh_config import config_findings  # the library takes 50 ms to import
 
             lookup.findings += config_findings(gateway.zenoh.config)
+        if gateway.zenoh is not None and lookup.table.networks is not None:
+            from router.compiler.zenoh_config import scouting_findings
+
+            lookup.findings += scouting_findings(gateway, lookup.table.networks)
         checked.append(CheckedGateway(gateway, check_client_topics(lookup, gateway)))
     return tuple(checked)
 

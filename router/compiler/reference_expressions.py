@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from router.compiler.functions import FUNCTIONS
+from router.compiler.functions import FUNCTIONS, NOT_FINITE
 from router.compiler.kinds import TIME_TYPES
 from router.errors import MappingError
 from router.table.model import Expression
@@ -149,9 +149,10 @@ class _Evaluator:
             "true": True,
             "false": False,
         }
-        if name not in named and isinstance(expected, Enum):
-            return EnumNumber(dict(expected.values)[name])
-        return named[name]
+        values = dict(expected.values) if isinstance(expected, Enum) else {}
+        if name not in named and name in values:
+            return EnumNumber(values[name])
+        return named[name] if name in named else NOT_FINITE[name]
 
     def _attribute(self, node: ast.Attribute) -> object:
         root: ast.expr = node

@@ -8,6 +8,7 @@ saturates into a narrower integer, as the boards' firmware does.
 from __future__ import annotations
 
 import ast
+import math
 
 from router.compiler.expressions import Finding, Typed
 from router.compiler.implementations import FLOAT32_END, clamp
@@ -34,6 +35,7 @@ EXACT_INTEGER_BITS = {32: 24, 64: 53}
 
 def converted(value: Typed, target: Type) -> ast.expr:
     """The expression that fills a scalar field. Raises Finding when it does not fit."""
+    _want_finite(value, target)
     match target:
         case Bool():
             return _to_bool(value, target)
@@ -49,6 +51,14 @@ def converted(value: Typed, target: Type) -> ast.expr:
             return _to_bytes(value, target)
         case List() | MessageType():
             raise AssertionError(f"{target} is no scalar")
+
+
+def _want_finite(value: Typed, target: Type) -> None:
+    """Raises Finding when `nan` or `inf` would fill what is no float."""
+    if isinstance(value.constant, float) and not isinstance(target, Float) and not math.isfinite(value.constant):
+        hint = f"text has quotes of its own: \"'{value.constant}'\"" if isinstance(target, String) else ""
+        message = f"{value.constant} does not fill {target}"
+        raise Finding(value.span, Code.TYPE_MISMATCH, message, hint or "only a float field holds it: write a value")
 
 
 def mismatch(value: Typed, target: Type, hint: str = "") -> Finding:
@@ -107,8 +117,9 @@ def _to_float(value: Typed, target: Float) -> ast.expr:
     limit = 1 << EXACT_INTEGER_BITS[target.bits]
     match value.kind:
         case FloatKind(bits):
-            if isinstance(value.constant, float) and target.bits == 32 and abs(value.constant) >= FLOAT32_END:
-                raise Finding(value.span, Code.OUT_OF_RANGE, f"{value.constant!r} does not fit float32")
+            literal = value.constant if isinstance(value.constant, float) else 0.0
+            if target.bits == 32 and FLOAT32_END <= abs(literal) < math.inf:
+                raise Finding(value.span, Code.OUT_OF_RANGE, f"{literal!r} does not fit float32")
             if bits > target.bits:
                 hint = "float32() says that losing digits is meant"
                 raise Finding(value.span, Code.LOSSY_CONVERSION, f"a double does not fit {target}", hint)

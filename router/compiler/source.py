@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import copy
 import linecache
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +19,9 @@ from router.compiler.syntax import PLACEABLE, place
 from router.errors import SourceSpan
 
 INDENT = "    "
+_NOT_FINITE = {ast.unparse(ast.Constant(value)): str(value) for value in (math.nan, math.inf)}
+"""How Python writes them, and their names in expressions; what it writes for NaN holds infinities."""
+
 _PLACEHOLDER = re.compile(r"_expression_(\d+)_")
 
 
@@ -71,6 +75,8 @@ class Source:
         def replaced(found: re.Match[str]) -> str:
             node = self._expressions[int(found[1])]
             text = ast.unparse(node)
+            for written, name in _NOT_FINITE.items():
+                text = text.replace(written, name)
             return text if alone or isinstance(node, (ast.Constant, ast.Name, ast.Attribute, ast.Call)) else f"({text})"
 
         return _PLACEHOLDER.sub(replaced, line)

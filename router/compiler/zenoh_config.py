@@ -10,11 +10,15 @@ from typing import Any
 import zenoh
 
 from router.errors import Code, Diagnostic, did_you_mean
-from router.table.model import ZenohConfig
+from router.table.model import Gateway, Networks, ZenohConfig
 from router.table.nodes import Path
 
 OWN_KEYS = {"mode": "mode", "connect/endpoints": "connect", "listen/endpoints": "listen"}
 """Keys of the library that the table has beside `config`, and how it calls them."""
+
+
+CLIENT = "client"
+"""The mode that listens nowhere, and connects to nobody but to whom it was told of or found by multicast."""
 
 
 def library_config(config: ZenohConfig | None) -> zenoh.Config:
@@ -41,6 +45,32 @@ def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
             where = f"'{key}' in '{config.path.name}'" if config.path else f"'{key}'"
             message = f"{where} has no place in the 'config' of a gateway"
             yield Diagnostic(span, Code.BAD_VALUE, message, f"write it as '{ours}' beside 'config'")
+
+
+def scouting_findings(gateway: Gateway, networks: Networks) -> Iterator[Diagnostic]:
+    """What a gateway of Zenoh's does without being told an address: listen on all networks, and look for others."""
+    settings = gateway.zenoh
+    try:
+        config = library_config(settings.config) if settings else None
+    except zenoh.ZError:
+        return  # has a finding of its own
+    if settings is None or config is None:
+        return
+    by_itself = {"multicast": not settings.connect and not settings.listen, "gossip": settings.mode != CLIENT}
+    said = {way: json.loads(config.get_json(f"scouting/{way}/enabled")) for way in by_itself}
+    ways = [way for way, value in said.items() if (by_itself[way] if value is None else value)]
+    does, remedies = [], []
+    if settings.mode != CLIENT and not settings.listen:
+        does.append("listens on all networks of this machine")
+        remedies.append("'listen'")
+    if ways:
+        does.append(f"looks for others by {' and '.join(ways)}")
+        off = ", ".join(f"{way}: {{enabled: false}}" for way in ways)
+        remedies.append(f"'config: {{scouting: {{{off}}}}}'")
+    if does:
+        what = f"gateway '{gateway.name}' {' and '.join(does)}, whatever {networks} are"
+        hint = f"say {' and '.join(remedies)}, or 'mode: client' and where to 'connect'"
+        yield Diagnostic(gateway.transport.span, Code.OUTSIDE_NETWORKS, what, hint)
 
 
 def is_default(config: zenoh.Config, key: str) -> bool:

@@ -13,6 +13,7 @@ from router.errors import Diagnostic, TableError
 from router.table.build import build_table
 from router.table.extends import load_chain
 from router.table.model import RouteTable
+from router.table.networks import outside_findings
 from router.table.shape import check_shape
 from router.table.source import Source
 
@@ -28,7 +29,10 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
     table = None
     try:
         root = load_chain(path, os.environ if environ is None else environ, sources, findings)
-        table = build_table(check_shape(root, findings), sources, findings)
+        shaped = check_shape(root, findings)
+        table = build_table(shaped, sources, findings)
+        if table is not None and table.networks is not None:
+            findings.extend(outside_findings(shaped, table.networks, [source.file for source in sources]))
     except TableError as error:
         findings.extend(error.diagnostics)
     return table, in_order(findings)

@@ -8,10 +8,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from ipaddress import IPv4Network
 from pathlib import Path
 from typing import TypeVar, Union
 
-from router.errors import Diagnostic
+from router.errors import Code, Diagnostic
 from router.table.build_addresses import local_address, remote_address
 from router.table.build_gateways import build_gateway
 from router.table.build_routes import build_case, named
@@ -26,12 +27,23 @@ from router.table.model import (
     IgnoredGateway,
     Listener,
     Located,
+    Networks,
     NodeSettings,
     RecordSettings,
     RouteTable,
 )
-from router.table.nodes import Entry, MappingNode, is_sound, marked_broken
-from router.table.reading import UnsoundError, boolean, duration, integer, mapping, optional_text, text, text_or
+from router.table.nodes import Entry, MappingNode, Node, SequenceNode, is_sound, marked_broken
+from router.table.reading import (
+    UnsoundError,
+    boolean,
+    duration,
+    integer,
+    located,
+    mapping,
+    optional_text,
+    text,
+    text_or,
+)
 from router.table.salvage import sound_part
 from router.table.source import Source
 from router.table.units import (
@@ -85,6 +97,7 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         record=builder.one(root, "record", _record),
         foxglove=builder.one(root, "foxglove", _address),
         reload_on_change=builder.one(root, "reload", _reload) or False,
+        networks=builder.one(root, "networks", _networks),
     )
 
 
@@ -189,6 +202,21 @@ def _record(entry: Entry) -> RecordSettings:
         max_age=_parsed(settings, "max_age", parse_duration, DEFAULT_MAX_AGE),
         keep=_parsed(settings, "keep", parse_disk_size, DEFAULT_KEEP),
     )
+
+
+def _networks(entry: Entry) -> Networks:
+    if not isinstance(entry.value, SequenceNode):
+        raise TypeError(f"a sequence, not {entry.value!r}")
+    return Networks(entry.key.span, tuple(map(_network, entry.value.items)))
+
+
+def _network(node: Node) -> IPv4Network:
+    written = located(node)
+    try:
+        return IPv4Network(written.value)
+    except ValueError as error:  # not its form, which the schema has checked
+        what = f"{written.value} is a host of the network {IPv4Network(written.value, strict=False)}"
+        raise UnsoundError(Diagnostic(written.span, Code.BAD_VALUE, what, "write the network")) from error
 
 
 def _reload(entry: Entry) -> bool:

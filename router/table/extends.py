@@ -29,7 +29,7 @@ _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
 def load_chain(
     path: Path, environ: Mapping[str, str], sources: list[Source], findings: list[Diagnostic]
 ) -> MappingNode:
-    """The table at `path` with everything that it extends.
+    """The table at `path` with everything that it extends, without the key `extends`.
 
     Appends every file read to `sources`, the table first, and what is wrong to `findings`. Raises
     TableError for what leaves no tree.
@@ -50,7 +50,7 @@ def load_chain(
     merged = layers.pop()
     while layers:
         merged = merge(merged, layers.pop())
-    return merged
+    return replace(merged, entries={key: entry for key, entry in merged.entries.items() if key != KEY})
 
 
 def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode:

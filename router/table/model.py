@@ -9,6 +9,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from ipaddress import IPv4Network
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
@@ -39,6 +40,18 @@ class Address(NamedTuple):
 def bound_to(address: Address, interface: str | None) -> str:
     """Return what a local socket is bound to as text: `0.0.0.0:5000`, or `0.0.0.0:5000 on wlan0`."""
     return f"{address} on {interface}" if interface else str(address)
+
+
+@dataclass(frozen=True, slots=True)
+class Networks:
+    """In which all addresses of the table lie. `span` is the key `networks`."""
+
+    span: SourceSpan
+    members: tuple[IPv4Network, ...]
+
+    def __str__(self) -> str:
+        """As findings name them, with the place that says so."""
+        return f"the networks of {self.span.file}:{self.span.line} ({', '.join(map(str, self.members))})"
 
 
 class Framing(enum.Enum):
@@ -456,3 +469,4 @@ class RouteTable:
     record: RecordSettings | None = None
     foxglove: Located[Address] | None = None
     reload_on_change: bool = False
+    networks: Networks | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +17,7 @@ from router.compiler.books import (
     QOS_POLICIES,
     TOPIC_STATES,
 )
+from router.edges.gateway_zenoh_config import session_config
 from router.errors import Code
 from tests.compiler.conftest import CheckText
 
@@ -298,3 +300,50 @@ def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText
     }
     series = {(each.metric, *each.labels) for each, _ in program.books.series()}
     assert {each for each in series if each[1:] and re.match("it(:|$)", each[1])} == expected
+
+
+def test_a_deadman_of_clients_may_publish_nan(check_text: CheckText) -> None:
+    deadman = "{timeout: 1s, send: {linear.x: nan}}"
+    assert codes(check_text, f"it: {{{UDP}, inbound: [{{{TWIST}, deadman: {deadman}}}]}}") == []
+
+
+NO_GOSSIP = "config: {scouting: {gossip: {enabled: false}}}"
+LOCATORS = "listen: [tcp/127.0.0.1:7447]"
+TO_A_ROUTER = "mode: client, connect: [tcp/127.0.0.1:7447]"
+
+
+@pytest.mark.parametrize(
+    ("zenoh", "does"),
+    [
+        ("", "listens on all networks of this machine and looks for others by multicast and gossip"),
+        ("mode: router", "listens on all networks of this machine and looks for others by multicast and gossip"),
+        (f"connect: [tcp/127.0.0.1:7447], {NO_GOSSIP}", "listens on all networks of this machine"),
+        (LOCATORS, "looks for others by gossip"),
+        (f"mode: router, {LOCATORS}", "looks for others by gossip"),
+        (f"{LOCATORS}, {NO_GOSSIP}", ""),
+        (
+            f"{LOCATORS}, config: {{scouting: {{multicast: {{enabled: true}}, gossip: {{enabled: false}}}}}}",
+            "multicast",
+        ),
+        ("mode: client", "looks for others by multicast"),
+        (TO_A_ROUTER, ""),
+        (f"{TO_A_ROUTER}, config: {{scouting: {{multicast: {{enabled: true}}}}}}", "looks for others by multicast"),
+        (f"{LOCATORS}, config: zenoh.json5", "looks for others by multicast"),
+    ],
+)
+def test_what_zenoh_does_without_an_address_has_no_place_beside_networks(
+    check_text: CheckText, tmp_path: Path, zenoh: str, does: str
+) -> None:
+    (tmp_path / "zenoh.json5").write_text("{scouting: {multicast: {enabled: true}, gossip: {enabled: false}}}")
+    gateway = f"it: {{transport: {{zenoh: {{{', '.join(filter(None, ('key: rover', zenoh)))}}}}}}}"
+    assert checked(check_text, gateway).diagnostics == []
+    found = checked(check_text, gateway, "networks: [127.0.0.0/8]\nroutes: {}")
+    assert [finding.code for finding in found.diagnostics] == ([Code.OUTSIDE_NETWORKS] if does else [])
+    assert not does or does in found.diagnostics[0].message
+    if not does:
+        assert found.table
+        settings = found.table.gateways["it"].zenoh
+        assert settings
+        config = session_config(settings)
+        assert config.get_json("scouting/multicast/enabled") == "false"
+        assert settings.mode == "client" or config.get_json("scouting/gossip/enabled") == "false"

@@ -87,6 +87,48 @@ gateways:
     transport: {zenoh: {key: rovers/one, mode: client, connect: [tcp/10.0.0.1:7447]}}
     format: json
 """
+PART = """\
+# yaml-language-server: $schema=../schemas/route-table.schema.json
+version: 1
+extends: rover.yaml
+networks: [127.0.0.0/8, "${NETWORK:-10.0.0.0/8}"]
+envelope: {message: OtherEnvelope}
+metrics: {}
+record: {keep: 1GiB}
+endpoints:
+  sensor_board: {address: 127.0.0.30:25008}
+  camera: {kind: tool}
+listen: {rover: {receive_buffer: 8MiB}}
+routes:
+  imu_info: {ttl: 1s}
+  manual_drive: {deadman: {timeout: 300ms}}
+  detected_object: {collect: {timeout: 2s}}
+  ph_info: {ignore: nobody needs it}
+  manual_brake:
+    - {source: ros, topics: [{topic: brake, type: std_msgs/msg/Bool, fields: auto}]}
+    - {source: [sensor_board], deadman: {timeout: 200ms, send: {manual_brake: {}}, to: [driving_board]}}
+gateways:
+  page: {publish_period: each}
+  fast: {max_datagram: 9000B}
+  logger: {transport: {websocket: 127.0.0.1:8600}, compression: {zstd: 1}}
+  far: {transport: {zenoh: {connect: [tcp/127.0.0.1:7447]}}}
+  vr:
+    transport: {udp: 127.0.0.1:8502}
+    inbound:
+      - {topic: /cmd_vel, type: geometry_msgs/msg/Twist, deadman: {timeout: 300ms, send: {}}}
+"""
+COMPLETE_PARTS = {
+    "version": "version: 1\n",
+    "envelope": "envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}\n",
+    "listen": "listen: {rover: {address: 0.0.0.0:5000}}\n",
+    "routes": "routes: {}\n",
+    "metrics": "metrics: {address: 127.0.0.1:9108}\n",
+    "record": "record: {directory: ../recordings}\n",
+    "foxglove": "foxglove: {address: 127.0.0.1:8766}\n",
+    "endpoints": "endpoints: {}\n",
+    "gateways": "gateways: {}\n",
+}
+COMPLETE = "".join(["# yaml-language-server: $schema=../schemas/route-table.schema.json\n", *COMPLETE_PARTS.values()])
 
 
 @pytest.fixture(scope="module")
@@ -137,13 +179,82 @@ def test_gateways_alone_need_nothing_beside_them_and_routes_do(editor: LanguageS
 
 
 @pytest.mark.parametrize("table", sorted((REPOSITORY / "routes").glob("*.yaml")), ids=lambda path: path.name)
-def test_the_tables_of_the_repository_are_underlined_nowhere_but_for_what_they_inherit(
-    editor: LanguageServer, table: Path
+def test_the_tables_of_the_repository_are_underlined_nowhere(editor: LanguageServer, table: Path) -> None:
+    assert editor.open(table, table.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("missing", ["", "version: 1\n"])
+def test_a_table_that_extends_another_may_leave_out_what_it_inherits(editor: LanguageServer, missing: str) -> None:
+    assert editor.open(new_table(), PART.replace(missing, "")) == []
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "blamed", "message"),
+    [
+        ("receive_buffer: 8MiB", "receive_bufer: 8MiB", "receive_bufer", "Property receive_bufer is not allowed."),
+        ("127.0.0.30:25008", "127.0.0.30", "127.0.0.30", "must be an IPv4 address and a port"),
+        ("publish_period: each", "publish_period: never", "publish_period", "or 'each'"),
+        ("[127.0.0.0/8", "[localhost", "networks", "must be an IPv4 network"),
+        (", to: [driving_board]", "", "deadman: {timeout: 200ms", 'Missing property "to"'),
+        ("type: std_msgs/msg/Bool, ", "", "topics", 'Missing property "type"'),
+        ("timeout: 300ms, ", "", "deadman: {send", 'Missing property "timeout"'),
+        ("source: [sensor_board]", "ttl: 1s", "- {ttl", 'Missing property "source"'),
+    ],
+)
+def test_a_table_that_extends_another_is_checked_for_all_else(
+    editor: LanguageServer, right: str, wrong: str, blamed: str, message: str
 ) -> None:
-    text = table.read_text(encoding="utf-8")
-    found = [item["message"] for item in editor.open(table, text)]
-    inherited = [message for message in found if message.startswith("Missing property")]
-    assert found == (inherited if "\nextends:" in text else [])
+    """Lists are not merged, so what stands in one has to be complete."""
+    text = PART.replace(right, wrong)
+    found = editor.open(new_table(), text)
+    assert [item for item in found if message in item["message"]], found
+    assert {item["range"]["start"]["line"] for item in found} == {place(text, blamed)[0]}
+
+
+@pytest.mark.parametrize(
+    ("part", "missing"),
+    [
+        ("envelope: {protos: ../protos, message: PBEnvelope}", "oneof"),
+        ("metrics: {}", "address"),
+        ("record: {keep: 1GiB}", "directory"),
+        ("foxglove: {}", "address"),
+        ("listen: {rover: {framing: exact}}", "address"),
+        ("endpoints: {sensor_board: {address: 127.0.0.1:8}}", "kind"),
+        ("routes: {imu_info: {destinations: [basestation]}}", "source"),
+        ("routes: {imu_info: {source: any, deadman: {timeout: 1s, to: [arm]}}}", "send"),
+        ("routes: {imu_info: {source: any, collect: {by: x, count: y, timeout: 1s}}}", "order"),
+        ("gateways: {far: {format: json}}", "transport"),
+        ("gateways: {far: {transport: {zenoh: {mode: client}}}}", "key"),
+        (
+            "gateways: {vr: {transport: {udp: 10.0.0.1:1}, inbound: [{topic: /a, type: std_msgs/msg/Bool}]}}",
+            "receive",
+        ),
+    ],
+)
+def test_what_is_missing_is_told_unless_the_table_extends_another(
+    editor: LanguageServer, part: str, missing: str
+) -> None:
+    text = COMPLETE.replace(COMPLETE_PARTS[part.partition(":")[0]], "") + part + "\n"
+    found = [item["message"] for item in editor.open(new_table(), text)]
+    assert found == [f'Missing property "{missing}".']
+    assert editor.open(new_table(), "extends: rover.yaml\n" + text) == []
+
+
+@pytest.mark.parametrize("missing", ["envelope", "listen", "routes"])
+def test_a_key_that_every_table_has_is_missed_unless_it_extends_another(editor: LanguageServer, missing: str) -> None:
+    text = COMPLETE.replace(COMPLETE_PARTS[missing], "")
+    assert [item["message"] for item in editor.open(new_table(), text)] == [f'Missing property "{missing}".']
+    assert editor.open(new_table(), "extends: rover.yaml\n" + text) == []
+
+
+def test_completion_and_hovering_work_in_a_table_that_extends_another(editor: LanguageServer) -> None:
+    text = PART.replace("listen:", "  arm_board:\n    kind: board\n    \nlisten:")
+    table = new_table()
+    editor.open(table, text)
+    line, _ = place(text, "listen:")
+    assert editor.completions(table, line - 1, 4) >= {"address", "source_port", "trim_trailing_zeros"}
+    line, character = place(text, "receive_buffer")
+    assert "net.core.rmem" in editor.hover(table, line, character + 1).replace("\\", "")
 
 
 @pytest.mark.parametrize(

@@ -148,3 +148,24 @@ def test_what_cannot_be_extended_is_one_finding(base: Path, text: str, code: Cod
     assert finding.code is code
     assert part in str(finding)
     assert finding.span.line == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "missing"),
+    [
+        ("endpoints: {tool: {address: 127.0.0.8:1}}", "endpoints.tool: kind"),
+        ("listen: {second: {framing: exact}}", "listen.second: address"),
+        ("foxglove: {}", "foxglove: address"),
+        ("routes: {gps_info: {destinations: [basestation]}}", "routes.gps_info: source"),
+        ("routes: {imu_info: {deadman: {timeout: 1s, to: [basestation]}}}", "routes.imu_info.deadman: send"),
+        ("gateways: {far: {format: json}}", "gateways.far: transport"),
+        ("gateways: {far: {transport: {zenoh: {mode: client}}}}", "gateways.far.transport.zenoh: key"),
+    ],
+)
+def test_what_a_table_and_all_that_it_extends_lack_is_missing(base: Path, text: str, missing: str) -> None:
+    _, findings = load(base, f"extends: base.yaml\n{text}\n")
+    path, _, key = missing.partition(": ")
+    owner = path.rpartition(".")[2]
+    assert [(found.code, found.message) for found in findings] == [
+        (Code.MISSING_KEY, f"'{owner}' lacks the key '{key}'")
+    ]

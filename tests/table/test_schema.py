@@ -23,7 +23,7 @@ def keys(schema: object, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]
         for name, member in schema.get("properties", {}).items():
             yield f"{path}/{name}", member
         for name, member in schema.items():
-            if name != "if":  # a condition describes nothing
+            if name != "if" and not name.startswith("complete"):  # conditions describe nothing
                 yield from keys(member, f"{path}/{name}")
 
 

@@ -130,6 +130,22 @@ def test_a_number_outside_its_tolerance_fails(tmp_path: Path, written: str) -> N
     ]
 
 
+@pytest.mark.parametrize(("expected", "differs"), [("nan", False), ("1.5", True), ("inf", True)])
+def test_nan_is_expected_as_what_it_is(tmp_path: Path, expected: str, differs: bool) -> None:
+    routes = """
+imu_info:
+  source: sensor_board
+  topics: [{topic: field, type: sensor_msgs/msg/FluidPressure, fields: {fluid_pressure: accel_x, variance: nan}}]
+"""
+    tests = f"""
+        a:
+          given: {given("{accel_x: nan}")}
+          expect: {{published: {{field: {{fluid_pressure: nan, variance: {expected}}}}}}}
+        """
+    wrong = [f"field: variance is nan, not {expected}"]
+    assert messages(tmp_path, routes, tests) == (wrong if differs else [])
+
+
 def test_float32_is_the_nearest_to_what_is_written(tmp_path: Path) -> None:
     tests = f"""
         a:

@@ -9,8 +9,8 @@ from router.compiler.expressions.literals import constant
 from router.compiler.expressions.parsing import Parsed, dotted
 from router.compiler.expressions.scope import MESSAGE, SOURCE, Scope
 from router.compiler.expressions.typed import Finding, Typed
-from router.compiler.functions import FUNCTIONS, HAS
-from router.compiler.kinds import BoolKind, EnumKind, MessageKind, StringKind, TimeKind
+from router.compiler.functions import FUNCTIONS, HAS, NOT_FINITE
+from router.compiler.kinds import BoolKind, EnumKind, FloatKind, MessageKind, StringKind, TimeKind
 from router.compiler.syntax import attribute, load
 from router.errors import Code, SourceSpan, did_you_mean, nearest
 from router.types.model import Enum, MessageType, String, Type
@@ -29,15 +29,24 @@ def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> T
     values = dict(expected.values) if isinstance(expected, Enum) else {}
     if isinstance(expected, Enum) and text in values:
         return Typed.at(span, EnumKind(expected), ast.Constant(values[text]))
+    if text in NOT_FINITE:
+        return Typed.at(span, FloatKind(32), ast.Constant(NOT_FINITE[text]))
+    raise _unknown(text, span, scope, expected)
+
+
+def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Finding:
     if text in FUNCTIONS or text == HAS:
-        raise Finding(span, Code.WRONG_ARGUMENTS, f"'{text}' is a function", f"call it: {text}(...)")
+        return Finding(span, Code.WRONG_ARGUMENTS, f"'{text}' is a function", f"call it: {text}(...)")
     if scope.holders(text):
-        raise Finding(span, Code.TYPE_MISMATCH, f"'{text}' is an enum, not a value", f"name one: {text}.VALUE")
+        return Finding(span, Code.TYPE_MISMATCH, f"'{text}' is an enum, not a value", f"name one: {text}.VALUE")
+    values = dict(expected.values) if isinstance(expected, Enum) else {}
     known = [*scope.field_names(), *scope.given, *values]
+    if text.lower() in NOT_FINITE:
+        known = [text.lower()]
     hint = _of_an_enum(text, scope) or did_you_mean(text, known) or "only constants can stand here"
     if isinstance(expected, String) and not nearest(text, known):
         hint = f"text has quotes of its own: \"'{text}'\""
-    raise Finding(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
+    return Finding(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
 
 
 def _of_an_enum(text: str, scope: Scope) -> str:

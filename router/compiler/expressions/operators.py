@@ -6,6 +6,7 @@ Operands come here checked. Knows no names and no text.
 from __future__ import annotations
 
 import ast
+import math
 import operator
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -161,6 +162,8 @@ def _comparable_value(held: Typed, written: Typed) -> str:
 def _want_comparable(op: ast.cmpop, left: Typed, right: Typed, span: SourceSpan) -> None:
     if isinstance(op, (ast.Is, ast.IsNot)):
         raise forbidden(op, span)
+    if any(isinstance(operand.constant, float) and math.isnan(operand.constant) for operand in (left, right)):
+        raise Finding(span, Code.TYPE_MISMATCH, "nan equals nothing, not even nan", "x != x is true where x is NaN")
     other: Kind | None = right.kind
     if isinstance(op, (ast.In, ast.NotIn)):
         if not isinstance(right.kind, ListKind):

@@ -33,6 +33,8 @@ class Parsed:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
             may_be_cut = self._expression.place.is_whole_line and "never closed" in reason
             hint = "quote the expression: inside {} a comma ends it" if may_be_cut else ""
+            if text.lower().lstrip("+-") in (".nan", ".inf"):  # YAML's
+                hint = f"write {text.lower().replace('.', '')}"
             raise Finding(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
             raise Finding(self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}") from None

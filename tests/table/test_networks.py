@@ -1,0 +1,133 @@
+"""`networks`: every address of a table lies in one of them."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from router.errors import Code
+from router.table.networks import ADDRESSES
+from router.table.shape import table_schema
+from tests.table.tables import load
+
+LOCAL = """\
+version: 1
+envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
+networks: [127.0.0.0/8]
+metrics: {address: 127.0.0.1:9108}
+foxglove: {address: 127.0.0.1:8766}
+listen: {rover: {address: 127.0.0.1:5000}}
+endpoints: {board: {address: 127.0.0.30:8, kind: board}}
+routes: {}
+gateways:
+  vr: {transport: {udp: 127.0.0.3:8502}, receive: 127.0.0.1:8500}
+  logger: {transport: {tcp: 127.0.0.1:8600}}
+  page: {transport: {websocket: 127.0.0.1:8765}}
+  far: {transport: {zenoh: {key: a, connect: ["tcp/127.0.0.1:7447?prio=1"], listen: [tcp/127.0.0.1:7448]}}}
+"""
+
+
+def outside(folder: Path, text: str) -> list[str]:
+    _, findings = load(folder, text)
+    assert {found.code for found in findings} <= {Code.OUTSIDE_NETWORKS}
+    return [f"{found.message}; {found.hint}" for found in findings]
+
+
+def test_a_table_that_stays_in_its_networks_has_no_finding(tmp_path: Path) -> None:
+    assert outside(tmp_path, LOCAL) == []
+
+
+@pytest.mark.parametrize(
+    ("address", "moved"),
+    [
+        ("127.0.0.1:9108", "10.0.0.1:9108"),
+        ("127.0.0.1:8766", "10.0.0.1:8766"),
+        ("127.0.0.1:5000", "0.0.0.0:5000"),
+        ("127.0.0.30:8", "192.168.0.30:8"),
+        ("127.0.0.3:8502", "10.0.0.3:8502"),
+        ("127.0.0.1:8500", "0.0.0.0:8500"),
+        ("127.0.0.1:8600", "0.0.0.0:8600"),
+        ("127.0.0.1:8765", "128.0.0.1:8765"),
+        ("tcp/127.0.0.1:7447", "tcp/10.0.0.1:7447"),
+        ("tcp/127.0.0.1:7448", "tcp/0.0.0.0:7448"),
+        ("tcp/127.0.0.1:7447", "tcp/localhost:7447"),
+        ("tcp/127.0.0.1:7447", "tcp/[::1]:7447"),
+        ("tcp/127.0.0.1:7447", "unixsock-stream//tmp/zenoh"),
+        ("tcp/127.0.0.1:7448", "udp/224.0.0.1:7448"),
+    ],
+)
+def test_every_address_has_to_lie_in_them(tmp_path: Path, address: str, moved: str) -> None:
+    [found] = outside(tmp_path, LOCAL.replace(address, moved))
+    assert moved.removeprefix("tcp/").removeprefix("udp/") in found
+    assert "the networks of" in found
+    assert "table.yaml:3 (127.0.0.0/8)" in found
+    assert "write one that lies there, such as" in found
+    assert outside(tmp_path, LOCAL.replace(address, moved).replace("networks: [127.0.0.0/8]\n", "")) == []
+
+
+def _keys_of_addresses(schema: Any, definitions: dict[str, Any], here: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    if isinstance(schema, list):
+        for member in schema:
+            yield from _keys_of_addresses(member, definitions, here)
+    elif isinstance(schema, dict):
+        reference = schema.get("$ref", "").rpartition("/")[2]
+        if reference == "address":
+            yield here
+        elif reference and reference not in ("field_value", "nested_fields"):  # which hold themselves
+            yield from _keys_of_addresses(definitions[reference], definitions, here)
+        for key, member in schema.items():
+            if key == "properties":
+                for name, inner in member.items():
+                    yield from _keys_of_addresses(inner, definitions, (*here, name))
+            elif key not in ("definitions", "default", "examples"):
+                below = (*here, "*") if key == "additionalProperties" and isinstance(member, dict) else here
+                yield from _keys_of_addresses(member, definitions, below)
+
+
+def test_no_address_of_the_schema_is_left_out() -> None:
+    schema = table_schema()
+    found = set(_keys_of_addresses(schema, schema["definitions"], ()))
+    assert found == {pattern for pattern in ADDRESSES if "zenoh" not in pattern}
+
+
+def test_what_is_inherited_is_blamed_where_it_is_and_mended_where_the_networks_are(tmp_path: Path) -> None:
+    base = LOCAL.replace("networks: [127.0.0.0/8]\n", "").replace("127.0.0.30:8", "192.168.0.30:8")
+    (tmp_path / "base.yaml").write_text(base)
+    (tmp_path / "near.yaml").write_text("extends: base.yaml\nnetworks: [127.0.0.0/8]\n")
+    _, [found] = load(tmp_path, "extends: near.yaml\n")
+    assert found.span.file.endswith("base.yaml")
+    assert found.span.line == 6
+    assert "near.yaml:2 (127.0.0.0/8)" in found.message
+    assert found.hint.endswith("near.yaml, such as endpoints: {board: {address: 127.168.0.30:8}}")
+    assert outside(tmp_path, "extends: near.yaml\nendpoints: {board: {address: 127.168.0.30:8}}\n") == []
+
+
+def test_the_networks_of_an_extended_table_hold_until_others_replace_them(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(LOCAL)
+    text = "extends: base.yaml\nendpoints: {camera: {address: 192.168.0.60:8, kind: tool}}\n"
+    [found] = outside(tmp_path, text)
+    assert "write one that lies there" in found
+    assert outside(tmp_path, f"{text}networks: [127.0.0.0/8, 192.168.0.0/24]\n") == []
+    assert len(outside(tmp_path, f"{text}networks: [192.168.0.0/24]\n")) == 10
+
+
+def test_an_address_from_a_variable_counts_as_it_is_filled_in(tmp_path: Path) -> None:
+    text = LOCAL.replace("127.0.0.30:8", '"${BOARD:-192.168.0.30:8}"')
+    assert len(outside(tmp_path, text)) == 1
+    _, findings = load(tmp_path, text, {"BOARD": "127.0.0.30:8"})
+    assert findings == []
+
+
+def test_no_name_is_looked_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(*_: object, **__: object) -> None:
+        raise AssertionError("a name was looked up")
+
+    for name in ("getaddrinfo", "gethostbyname", "gethostbyname_ex", "gethostbyaddr", "getnameinfo"):
+        monkeypatch.setattr(socket, name, asked)
+    assert len(outside(tmp_path, LOCAL.replace("tcp/127.0.0.1:7447", "tcp/localhost:7447"))) == 1
+    _, [found] = load(tmp_path, LOCAL.replace("127.0.0.30:8", "localhost:8"))
+    assert found.code is Code.BAD_ADDRESS
