@@ -55,7 +55,7 @@ gateways:
 """
 
 ONE = ("-r", "__ns:=/rover1", "-r", "__node:=one", "-r", "imu_data:=imu", "-r", "/heading:=/rover1/heading")
-TWO = ("-r", "__ns:=/rover2", "-r", "imu_data:=imu")
+TWO = ("-r", "__ns:=/rover2", "-r", "imu_data:=imu", "-p", "use_sim_time:=true")
 
 HEARD = {
     "/rover1/imu": "comms/msg/ImuSensorInformation",
@@ -147,6 +147,11 @@ def test_commands_reach_the_board_of_their_rover_only(rovers: tuple[Rover, Rover
             rover.count("messages_received", route="drive_motor", source="drive") == 1
         )  # the table's name is the label
         assert rover.site.waiting() == {}
+
+
+def test_simulated_time_is_said_to_be_ignored(rovers: tuple[Rover, Rover]) -> None:
+    lines = [[line for line in each.router.log() if "use_sim_time" in line["event"]] for each in rovers]
+    assert [[line["level"] for line in each] for each in lines] == [[], ["warning"]]
 
 
 def test_diagnostics_name_the_node_as_ros_does(rovers: tuple[Rover, Rover]) -> None:

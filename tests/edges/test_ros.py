@@ -248,6 +248,42 @@ def test_a_type_that_is_not_installed_is_refused(type_name: str) -> None:
         open_ros(missing)
 
 
+PARAMETERS = "/**: {ros__parameters: {use_sim_time: true}}\n"
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("-p", "use_sim_time:=true"),
+        ("-p", "router_test:use_sim_time:=true"),
+        ("-r", "__node:=other", "-p", "other:use_sim_time:=true"),
+        ("--params-file", "parameters.yaml"),
+    ],
+    ids=" ".join,
+)
+def test_simulated_time_is_ignored_with_one_warning_and_no_subscription(
+    args: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("parameters.yaml").write_text(PARAMETERS)
+    with capture_logs() as logs, closing(open_ros(string_topic(), args=("--ros-args", *args))) as ros:
+        assert "/clock" not in ros.topics.names()
+    [warning] = [line for line in logs if line["log_level"] == "warning"]
+    assert warning["event"].startswith("use_sim_time is ignored")
+    assert "leave use_sim_time out" in warning["remedy"]
+
+
+@pytest.mark.parametrize("parameter", ["use_sim_time:=false", "someone_else:use_sim_time:=true"])
+def test_real_time_is_no_warning(parameter: str) -> None:
+    with capture_logs() as logs, closing(open_ros(string_topic(), args=("--ros-args", "-p", parameter))):
+        assert [line for line in logs if line["log_level"] == "warning"] == []
+
+
+def test_a_parameter_of_a_wrong_type_is_refused() -> None:
+    with pytest.raises(StartError, match=r"ROS node cannot be created: .*use_sim_time"):
+        open_ros(string_topic(), args=("--ros-args", "-p", "use_sim_time:=1"))
+
+
 def test_bad_ros_arguments_are_refused() -> None:
     with pytest.raises(StartError, match="ROS node cannot be created"):
         open_ros(string_topic(), args=("--ros-args", "-r", "not a rule"))
