@@ -6,7 +6,6 @@ Expects a table without errors: nothing here is checked, and nothing is found.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 
 from router.compiler.books import (
     QOS_POLICIES,
@@ -32,7 +31,7 @@ from router.compiler.program import (
     source_label,
 )
 from router.compiler.topics import qos_of
-from router.table.model import ANY, Located, RouteTable, Topic
+from router.table.model import ANY, RouteTable, Topic
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -88,7 +87,7 @@ def link(
             for one in table.endpoints.values()
             if one.name in destinations
         ),
-        publishers=_topics([*_published(table, served, gateways), *own_topics]),
+        publishers=_topics([*_published(served), *own_topics], _let_in(gateways)),
         subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.feeds),
         inbound=inbound,
         outbound=outbound,
@@ -99,27 +98,31 @@ def link(
     )
 
 
-def _published(
-    table: RouteTable, routes: Iterable[CheckedRoute], gateways: Iterable[CheckedGateway]
-) -> Iterator[tuple[Topic | None, MessageType | None]]:
-    """What routes fill, and under absolute names what clients of gateways publish."""
+def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:
+    """What routes fill."""
     for checked in routes:
         for used in checked.targets:
-            yield used.topic, used.type
+            if used.topic and used.type:
+                yield used.topic, used.type
+
+
+def _let_in(gateways: Iterable[CheckedGateway]) -> Iterator[TopicPlan]:
+    """What clients of gateways publish, under absolute names."""
     for gateway in gateways:
         for entry in gateway.inbound:
-            topic = entry.inbound.topic
-            yield replace(topic, topic=Located(entry.topic, topic.topic.span)), entry.type
+            yield _topic(entry.inbound.topic, entry.type, entry.topic)
 
 
-def _topics(used: Iterable[tuple[Topic | None, MessageType | None]]) -> tuple[TopicPlan, ...]:
+def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan] = ()) -> tuple[TopicPlan, ...]:
     """One for each topic, however many routes name it: the check has seen to it that they agree."""
     plans: dict[str, TopicPlan] = {}
-    for topic, declared in used:
-        if topic and declared:
-            name = topic.topic.value
-            plans.setdefault(name, TopicPlan(name, declared.name, qos_of(topic), layout(declared)))
+    for plan in (*(_topic(topic, declared, topic.topic.value) for topic, declared in used), *more):
+        plans.setdefault(plan.topic, plan)
     return tuple(plans.values())
+
+
+def _topic(topic: Topic, declared: MessageType, label: str) -> TopicPlan:
+    return TopicPlan(label, topic.topic.value, declared.name, qos_of(topic), layout(declared))
 
 
 def _open_books(books: Books, table: RouteTable, envelope: Envelope) -> None:

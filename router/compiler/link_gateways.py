@@ -39,6 +39,7 @@ def _inbound(entry: CheckedInbound, gateway: str, books: Books) -> InboundPlan:
         deadman = _deadman(f"{gateway}:{topic}", inbound.deadman, topic, entry.stop, books)
     return InboundPlan(
         topic=topic,
+        name=inbound.topic.topic.value,
         type=entry.type,
         ttl=inbound.ttl.value if inbound.ttl else None,
         max_rate=inbound.max_rate.value if inbound.max_rate else None,

@@ -32,7 +32,9 @@ LOOKS = 6
 class Diagnostics:
     """A thread that calls `publish` with the CDR bytes of a DiagnosticArray each PERIOD until it is closed."""
 
-    def __init__(self, running: Running, publish: Callable[[bytes], None]) -> None:
+    def __init__(self, running: Running, node: str, publish: Callable[[bytes], None]) -> None:
+        """`node` is how the statuses call the router."""
+        self._node = node
         self._watch = Watch(running)
         self._publish = publish
         self._stopping = threading.Event()
@@ -48,8 +50,8 @@ class Diagnostics:
         is_well = True
         while not self._stopping.wait(PERIOD):
             try:
-                node, told = self._watch.look(monotonic_ns(), wall_ns())
-                self._publish(diagnostic_array(wall_ns(), node, told))
+                told = self._watch.look(monotonic_ns(), wall_ns())
+                self._publish(diagnostic_array(wall_ns(), self._node, told))
             except Exception as error:  # noqa: BLE001 a router that cannot tell how it is routes all the same
                 if is_well:
                     logger.error("diagnostics cannot be published", problem=repr(error))
@@ -67,15 +69,15 @@ class Watch:
         self._looks: deque[tuple[int, Look]] = deque(maxlen=LOOKS)
         self._last_seen: dict[str, tuple[float, int]] = {}  # by endpoint: the stamp, and when that was (monotonic)
 
-    def look(self, now: int, wall: int) -> tuple[str, list[Status]]:
-        """The node's name, and how everything is at `now`, of a monotonic clock, and `wall`, in ns."""
+    def look(self, now: int, wall: int) -> list[Status]:
+        """How everything is at `now`, of a monotonic clock, and `wall`, in ns."""
         program, look = self._running.program, Look(_samples(self._running))
         earlier = self._looks[-1][0] if self._looks else now
         silent = {name: now - self._seen(name, look, earlier, now, wall) for name in program.table.endpoints}
         self._looks.append((now, look))
         since, before = self._looks[0]
         seconds = max(now - since, 1) / 1e9
-        return program.table.node.name, [*statuses(Situation(program, look, before, seconds, silent, self._host))]
+        return [*statuses(Situation(program, look, before, seconds, silent, self._host))]
 
     def _seen(self, endpoint: str, look: Look, earlier: int, now: int, wall: int) -> int:
         """When it was heard of, or was first looked for. Stamps are of the wall clock, which jumps."""

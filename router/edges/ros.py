@@ -30,7 +30,7 @@ class RosEdge:
     `incompatible(topic, policy, peers)` is called by a thread of events, from opening on: peers whose QoS does not go
     with ours, now. It is called once per second for a topic that has such peers, and for some seconds after that.
     `met(topic)` is called there too, when somebody new subscribes to it. Nothing is received before `start`. `topics`
-    are those that the node sees.
+    are those that the node sees, `name` is what ROS made of its namespace and name: `rover1/rover_router`.
 
     What is open can be replaced: `prepare` opens what is new, `apply` has it used, `finish` closes what is not used
     any more. Or `abandon` closes what was opened.
@@ -60,6 +60,7 @@ class RosEdge:
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
             opening.callback(close_node, self._node)
+            self.name = self._node.get_fully_qualified_name().removeprefix("/")
             self.topics = RosTopics(self._node)
             opening.callback(self._close_topics)
             change = self.prepare(publishers, subscriptions, spans)

@@ -9,14 +9,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rclpy.context import Context
-from rclpy.exceptions import NameValidationException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from router.edges.log import logger
 from router.errors import StartError
 
-RCL_ERRORS = (RuntimeError, NameValidationException)
+RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
 """What rclpy raises for bad arguments, names and settings: its own errors derive from RuntimeError."""
 
 RCL = ctypes.CDLL(rclpy_implementation.__file__)
@@ -25,6 +26,7 @@ RCL = ctypes.CDLL(rclpy_implementation.__file__)
 UDP_ON_LOCALHOST = Path(__file__).with_name("fastdds_udp_localhost.xml")
 """A profile of Fast DDS: UDP as its only transport, discovery on this computer only."""
 
+_SIM_TIME = "use_sim_time"
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
@@ -36,10 +38,22 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
             # The router has a log of its own: no log file of ROS, no /rosout. Nor parameter services:
             # parameters fill the table's variables at start, so a service that sets them would pretend.
             context.init(list(ros_args), initialize_logging=False)
-            return Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
+            node = Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
+        _refuse_sim_time(node)
+        return node
     except RCL_ERRORS as error:
         context.try_shutdown()
         raise StartError(f"the ROS node cannot be created: {error}") from error
+
+
+def _refuse_sim_time(node: Node) -> None:
+    """Warns of `use_sim_time`, and drops the subscription to /clock that the node has with it."""
+    if node.get_parameter(_SIM_TIME).value:
+        logger.warning(
+            f"{_SIM_TIME} is ignored: the router runs on real time (stamps, ttl, deadmen)",
+            remedy=f"leave {_SIM_TIME} out for this node, or set it to false; docs/ros.md says what to expect",
+        )
+        node.set_parameters([Parameter(_SIM_TIME, value=False)])
 
 
 def close_node(node: Node) -> None:

@@ -68,7 +68,7 @@ class Publication:
         with _refusing(f"{span}: topic '{plan.topic}' cannot be published"), ExitStack() as opening:
             self._publisher = node.create_publisher(
                 message,
-                plan.topic,
+                plan.name,
                 qos_profile(plan.qos),
                 event_callbacks=peers.of_publisher(plan, self.wanted),
                 callback_group=ReentrantCallbackGroup(),  # the node's own keeps a little of each publisher for ever
@@ -123,7 +123,7 @@ class Subscription:
         """Raises StartError."""
         self.plan = plan
         with _refusing(f"{span}: topic '{plan.topic}' cannot be subscribed to"):
-            self.raw = RawSubscription(node, message, plan.topic, qos_profile(plan.qos), peers.of_subscription(plan))
+            self.raw = RawSubscription(node, message, plan.name, qos_profile(plan.qos), peers.of_subscription(plan))
         self.events: Sequence[EventHandler] = self.raw.events
         self.topic: str = self.raw.handle.get_topic_name()
         self.qos = subscription_qos(self.raw.handle.pointer)

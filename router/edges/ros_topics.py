@@ -60,6 +60,10 @@ class RosTopics:
             for seen in self._ask(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic)
         ]
 
+    def resolved(self, name: str) -> str:
+        """The absolute name that ROS makes of one: by the node's namespace, and then by its remaps."""
+        return str(self._node.resolve_topic_name(name))
+
     def _ask(self, question: Callable[[Any, str, bool], list[dict[str, Any]]], topic: str) -> list[dict[str, Any]]:
         """As rclpy's Node does, which makes an object of each QoS and takes three times as long."""
         with self._handle:
@@ -85,10 +89,15 @@ class RosTopics:
         return message_class
 
     def tap(self, topic: str, message_class: Any, *, is_reliable: bool, keeps: bool, depth: int) -> TopicTap:
-        """Subscribes to `topic`. Raises StartError, also where our node has the topic with another type."""
+        """Subscribes to `topic`. Raises StartError, also where our node has the topic with another type.
+
+        And where a remap of our node leads from it to another one, whose messages would pass for its.
+        """
         type_name = "/".join((*message_class.__module__.split(".")[:2], message_class.__name__))
         try:
             others = self._our_types(topic) - {type_name}
+            if (renamed := self.resolved(topic)) != topic:
+                raise StartError(f"a remap of this router makes '{renamed}' of '{topic}'; remap relative names instead")
             if others:  # DDS has one for a topic in a process; it would say so in other words
                 raise StartError(f"topic '{topic}' is {others.pop()} in this router, and cannot be {type_name} too")
             return TopicTap(

@@ -26,10 +26,14 @@ class Status:
 
     def __init__(self, running: Running) -> None:
         self._running = running
+        self._started = wall_ns() / 1e9
         self._values = LastValues(running)
 
     def numbers(self) -> dict[str, Any]:
-        """Everything that changes; `map` says to which map it belongs, which changes with the table."""
+        """Everything that changes; `map` says to which map it belongs, which changes with the table.
+
+        `started` is different for each run of the router: counters begin again there.
+        """
         running = self._running
         program = running.program
         table = program.table
@@ -39,6 +43,7 @@ class Status:
             found["endpoints"].setdefault(name, {})["stale_after"] = None if patience is None else patience / 1e9
         return {
             "at": wall_ns() / 1e9,
+            "started": self._started,
             "map": table.sha256,
             "table": shown_path(table.path),
             "ready": running.is_ready,

@@ -6,7 +6,7 @@ All of it is for the loop's thread, unless it says otherwise.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,10 @@ class Hub:
         self._feeds: dict[tuple[str, bool], Feed] = {}  # by topic, and whether each message is wanted
         self._types: dict[str, ReadyType | str] = {}  # or why not
         self._loader = ThreadPoolExecutor(1, thread_name_prefix="gateway types")
+
+    def resolved(self, names: Iterable[str]) -> frozenset[str]:
+        """The absolute names that ROS makes of these."""
+        return frozenset(map(self._topics.resolved, names))
 
     async def look(self, let_in: Collection[str], wanted: Callable[[str], bool]) -> dict[str, Choice]:
         """The topics among those `wanted` that somebody publishes on; our own publishers do not count on `let_in`.

@@ -65,7 +65,8 @@ class Topics:
         self._ledger = ledger
         self._tasks = tasks
         self._deliver = deliver
-        self._selector = TopicSelector(plan.settings, plan.inbound)
+        self._let_in = around.hub.resolved(each.name for each in plan.inbound.values())
+        self._selector = TopicSelector(plan.settings, self._let_in)
         self._served: dict[str, Served] = {}
         self._not_installed: set[str] = set()
         self._numbers = count()
@@ -104,7 +105,7 @@ class Topics:
 
     async def _look(self) -> None:
         """Serves what has appeared, forgets what has gone, and follows changes of types and QoS."""
-        seen = await self._hub.look(self._plan.inbound.keys(), self._selector.selects)
+        seen = await self._hub.look(self._let_in, self._selector.selects)
         if not self._outlet.is_heard():
             # What only the router publishes it fills only while somebody listens, and without clients nobody does.
             seen = {topic: choice for topic, choice in seen.items() if not choice.is_ours}

@@ -154,7 +154,7 @@ class Router:
 
     def _open_companions(self, change: Change, opening: ExitStack) -> None:
         diagnostics = change.topics.publications.get(DIAGNOSTICS) if change.topics else None
-        self._companions.open(opening, diagnostics.publish if diagnostics else None)
+        self._companions.open(opening, (self._edges.node_name, diagnostics.publish) if diagnostics else None)
         opening.callback(self.mirror.close)
 
     def _rewire(self) -> None:

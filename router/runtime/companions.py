@@ -30,8 +30,8 @@ class Companions:
         self._saving = DaemonThread("saving")
         self._last_asked: Future[None] | None = None
 
-    def open(self, opening: ExitStack, publish_diagnostics: Callable[[bytes], None] | None) -> None:
-        """`publish_diagnostics` takes CDR bytes; None where the table asks for no diagnostics."""
+    def open(self, opening: ExitStack, diagnostics: tuple[str, Callable[[bytes], None]] | None) -> None:
+        """`diagnostics`: the node's name and what publishes CDR bytes; None where the table asks for none."""
         running, table = self._running, self._running.program.table
         if table.record is not None:
             from router.edges.recorder import Recorder
@@ -43,10 +43,10 @@ class Companions:
             from router.edges.foxglove import FoxgloveServer
 
             opening.callback(FoxgloveServer(table.foxglove, running).close)
-        if publish_diagnostics is not None:
+        if diagnostics is not None:
             from router.edges.diagnostics import Diagnostics
 
-            opening.callback(Diagnostics(running, publish_diagnostics).close)
+            opening.callback(Diagnostics(running, *diagnostics).close)
         if table.metrics is not None:
             from router.edges.http import HttpServer
 

@@ -59,6 +59,11 @@ class Edges:
         """Grows while the receive thread is not stuck, even if nothing comes."""
         return self._receiving.turns
 
+    @property
+    def node_name(self) -> str:
+        """As ROS knows it, with its namespace; empty where no table needed a node."""
+        return self._ros.name if self._ros else ""
+
     # -- from the start to the end -------------------------------------------------------------------------------
 
     def start(self, change: Change, closing: ExitStack) -> None:

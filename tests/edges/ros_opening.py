@@ -31,7 +31,7 @@ HELLO = cdr("hello, rover")
 
 
 def string_topic(qos: QosPlan = RELIABLE, topic: str = "greeting") -> TopicPlan:
-    return TopicPlan(topic, STRING, qos, {STRING: (("data", "string"),)})
+    return TopicPlan(topic, topic, STRING, qos, {STRING: (("data", "string"),)})
 
 
 def open_ros(

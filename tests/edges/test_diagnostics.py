@@ -80,7 +80,7 @@ class Counting:
 
     def after(self, seconds: float) -> dict[str, Status]:
         self.now += int(seconds * SECOND)
-        return {status.name: status for status in self.watch.look(self.now, self.wall)[1]}
+        return {status.name: status for status in self.watch.look(self.now, self.wall)}
 
 
 @pytest.fixture(scope="module")
@@ -268,7 +268,7 @@ def test_levels_are_those_of_the_message() -> None:
 
 def published(router: Counting, monkeypatch: pytest.MonkeyPatch, publish: Callable[[bytes], None]) -> Diagnostics:
     monkeypatch.setattr(diagnostics, "PERIOD", 0.01)
-    return Diagnostics(cast("Running", router), publish)
+    return Diagnostics(cast("Running", router), "rover_router", publish)
 
 
 def test_it_publishes_until_it_is_closed(router: Counting, monkeypatch: pytest.MonkeyPatch) -> None:

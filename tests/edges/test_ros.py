@@ -223,7 +223,7 @@ def test_every_qos_that_a_table_can_name_opens() -> None:
 def test_a_type_that_was_compiled_otherwise_is_refused() -> None:
     stale = (("data", "string"), ("more", "uint8"))
     with pytest.raises(StartError) as refused:
-        open_ros(TopicPlan("greeting", "std_msgs/msg/String", RELIABLE, {"std_msgs/msg/String": stale}))
+        open_ros(TopicPlan("greeting", "greeting", "std_msgs/msg/String", RELIABLE, {"std_msgs/msg/String": stale}))
     assert str(refused.value) == (
         "routes/rover.yaml:40:16: std_msgs/msg/String as installed is not what the table was compiled for; "
         "run 'make setup', or install the ROS package 'std_msgs'\n"
@@ -238,14 +238,50 @@ def test_a_type_with_one_in_it_that_was_compiled_otherwise_is_refused() -> None:
     definitions = {name: definition(found) for name, found in types.items() if found}
     definitions["builtin_interfaces/msg/Time"] = (("sec", "int64"), ("nanosec", "uint32"))
     with pytest.raises(StartError, match="builtin_interfaces/msg/Time as installed is not what"):
-        open_ros(TopicPlan("stamps", "std_msgs/msg/Header", RELIABLE, definitions))
+        open_ros(TopicPlan("stamps", "stamps", "std_msgs/msg/Header", RELIABLE, definitions))
 
 
 @pytest.mark.parametrize("type_name", ["no_such_msgs/msg/String", "std_msgs/msg/NoSuch"])
 def test_a_type_that_is_not_installed_is_refused(type_name: str) -> None:
-    missing = TopicPlan("greeting", type_name, RELIABLE, {type_name: ()})
+    missing = TopicPlan("greeting", "greeting", type_name, RELIABLE, {type_name: ()})
     with pytest.raises(StartError, match=rf"rover.yaml:40:16: {type_name} is not installed .* run 'make setup'"):
         open_ros(missing)
+
+
+PARAMETERS = "/**: {ros__parameters: {use_sim_time: true}}\n"
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("-p", "use_sim_time:=true"),
+        ("-p", "router_test:use_sim_time:=true"),
+        ("-r", "__node:=other", "-p", "other:use_sim_time:=true"),
+        ("--params-file", "parameters.yaml"),
+    ],
+    ids=" ".join,
+)
+def test_simulated_time_is_ignored_with_one_warning_and_no_subscription(
+    args: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("parameters.yaml").write_text(PARAMETERS)
+    with capture_logs() as logs, closing(open_ros(string_topic(), args=("--ros-args", *args))) as ros:
+        assert "/clock" not in ros.topics.names()
+    [warning] = [line for line in logs if line["log_level"] == "warning"]
+    assert warning["event"].startswith("use_sim_time is ignored")
+    assert "leave use_sim_time out" in warning["remedy"]
+
+
+@pytest.mark.parametrize("parameter", ["use_sim_time:=false", "someone_else:use_sim_time:=true"])
+def test_real_time_is_no_warning(parameter: str) -> None:
+    with capture_logs() as logs, closing(open_ros(string_topic(), args=("--ros-args", "-p", parameter))):
+        assert [line for line in logs if line["log_level"] == "warning"] == []
+
+
+def test_a_parameter_of_a_wrong_type_is_refused() -> None:
+    with pytest.raises(StartError, match=r"ROS node cannot be created: .*use_sim_time"):
+        open_ros(string_topic(), args=("--ros-args", "-p", "use_sim_time:=1"))
 
 
 def test_bad_ros_arguments_are_refused() -> None:

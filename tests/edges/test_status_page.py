@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -301,12 +302,62 @@ def test_a_router_that_ended_is_said_and_one_that_comes_back_is_shown(browser: B
     span = SourceSpan("t.yaml")
     server = HttpServer(Address("127.0.0.1", 0), span, running, None)
     page = open_page(browser, f"http://{server.address}/")
+    assert page.text("#well") == "Nothing is wrong."
     server.close()
-    page.until("document.querySelector('#state').textContent.startsWith('no answer for')")
-    assert page.evaluate("document.body.classList.contains('lost')")
+    page.until("!document.querySelector('#silence').hidden")
+    assert_lost(page)
     with closing(HttpServer(server.address, span, running, None)):
         page.until("document.querySelector('#state').textContent === 'running'")
+        assert_well(page)
         page.close()
+
+
+def assert_lost(page: Page) -> None:
+    """Nobody can take what is shown for what is."""
+    assert re.fullmatch(r"No answer from the router since \d\d:\d\d:\d\d \(.* s\)", page.text("#silence"))
+    assert (page.text("#state"), page.evaluate("document.querySelector('#state').className")) == ("no answer", "bad")
+    assert page.evaluate("document.title") == "⚠ No answer from the router"
+    assert "Nothing is wrong." not in page.text("body")
+    for selector in ("#tiles", "#map", "#legend", "#facts"):
+        style = page.evaluate(
+            f"(({{opacity, filter}}) => [opacity, filter])(getComputedStyle(document.querySelector('{selector}')))"
+        )
+        assert style == ["0.45", "grayscale(1)"]
+
+
+def assert_well(page: Page) -> None:
+    assert page.text("#well") == "Nothing is wrong."
+    assert page.evaluate("document.querySelector('#silence').hidden")
+    assert page.evaluate("getComputedStyle(document.querySelector('#tiles')).opacity") == "1"
+
+
+def test_before_the_first_answer_nothing_is_claimed(browser: Browser, running: FakeRunning, url: str) -> None:
+    page = browser.open("about:blank")
+    page.call(
+        "Page.addScriptToEvaluateOnNewDocument", source="window.fetch = () => new Promise(r => { window.give_up = r; })"
+    )
+    page.go(url)
+    shown = "(id => document.querySelector(id).checkVisibility())"
+    assert page.text("#state") == "connecting"
+    assert page.evaluate(f"['#well', '#troubles', '#silence'].map({shown})") == [False] * 3
+    assert page.evaluate("document.querySelector('#state').className") == ""
+    page.evaluate("give_up(Response.error())")
+    page.until("document.querySelector('#silence').checkVisibility()")
+    assert page.text("#silence").startswith("No answer from the router yet (")
+    assert page.evaluate(f"['#well', '#troubles'].map({shown})") == [False] * 2
+    page.close()
+
+
+def test_a_page_that_was_hidden_claims_nothing_before_it_has_asked_again(page: Page) -> None:
+    page.evaluate("Object.defineProperty(document, 'hidden', {value: true, configurable: true})")
+    page.until("next !== 0")
+    page.evaluate("answeredAt -= 60000")
+    page.evaluate("delete document.hidden")
+    at_once = "comeBack(); [document.body.classList.contains('lost'), document.querySelector('#silence').innerText]"
+    lost, said = page.evaluate(at_once)
+    assert lost
+    assert said.endswith("(60 s)")
+    page.until("document.querySelector('#silence').hidden")
 
 
 @pytest.mark.parametrize("size", [PHONE, DESKTOP, (320, 568), (768, 1024)], ids=str)

@@ -251,7 +251,6 @@ def test_what_is_not_sent_is_no_command(rig: Rig, unsent: str) -> None:
 
 def test_each_element_is_a_message_of_its_own(rig: Rig) -> None:
     rig.take("detections", detections(0.9, 0.1, 0.8))
-    rig.take("detections", detections())
 
     assert rig.sent == [
         (
@@ -268,6 +267,14 @@ def test_each_element_is_a_message_of_its_own(rig: Rig) -> None:
     ]  # fmt: skip
     assert rig.count("messages_received", "detected_object_from_ros", "detections") == 3
     assert rig.count("messages_filtered", "detected_object_from_ros", "basestation") == 1
+    rig.assert_books_balance()
+
+
+def test_an_empty_list_sends_nothing_and_is_no_message(rig: Rig) -> None:
+    rig.take("detections", detections())
+
+    assert rig.sent == []
+    assert rig.count("messages_received", "detected_object_from_ros", "detections") == 0
     rig.assert_books_balance()
 
 

@@ -83,6 +83,9 @@ class Graph:
         self.faults: dict[str, Exception] = {}
         self.taps: dict[str, Tap] = {}
 
+    def resolved(self, name: str) -> str:
+        return name
+
     def names(self) -> list[str]:
         if fault := self.faults.pop("names", None):
             raise fault

@@ -417,10 +417,14 @@ def test_the_page_reconnects_and_keeps_what_was_typed(gateway: FakeGateway, page
     received(gateway)
     gateway.go_down()
     page.until("document.querySelector('#state').textContent.startsWith('no connection')")
+    assert re.fullmatch(r"No answer from the gateway since \d\d:\d\d:\d\d \(.* s\)", page.text("#silence"))
+    assert page.evaluate("getComputedStyle(document.querySelector('main')).filter") == "grayscale(1)"
     assert page.evaluate("document.querySelector('[form=form]').disabled") is True
     assert page.evaluate("repeating") == 0
     gateway.reset()
     page.until("document.querySelector('#state').textContent === 'connected'")
+    assert page.evaluate("document.querySelector('#silence').hidden")
+    assert page.evaluate("getComputedStyle(document.querySelector('main')).filter") == "none"
     page.click("[form=form]")
     assert received(gateway)["data"]["linear"]["x"] == 0.75
 
@@ -432,6 +436,17 @@ def test_a_connection_that_is_silent_is_opened_anew(gateway: FakeGateway, page: 
     page.evaluate("heardAt -= 60000; render()")
     page.until("document.querySelector('#state').textContent === 'connected' && !retryAt")
     assert not first & gateway.clients
+
+
+def test_a_connection_without_a_document_for_seconds_is_not_green(page: Page) -> None:
+    """Of a gateway whose computer lost its power, no connection ends."""
+    state, silence = page.evaluate(
+        "answeredAt -= 5000; renderConnection();"
+        "[document.querySelector('#state').className, document.querySelector('#silence').innerText]"
+    )
+    assert state == "bad"
+    assert silence.startswith("No answer from the gateway since ")
+    page.until("document.querySelector('#state').className === 'good' && document.querySelector('#silence').hidden")
 
 
 def test_what_cannot_be_read_is_counted_and_ends_nothing(gateway: FakeGateway, page: Page) -> None:
