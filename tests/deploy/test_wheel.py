@@ -1,0 +1,100 @@
+"""The router from a wheel, in a folder that has nothing: what comes with it, and that nothing is written to it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 60.0
+
+Router = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert built.returncode == 0, built.stderr
+    [path] = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture
+def packages(wheel: Path, tmp_path: Path) -> Path:
+    """Where pip would unpack it."""
+    folder = tmp_path / "venv" / "site-packages"
+    zipfile.ZipFile(wheel).extractall(folder)
+    return folder
+
+
+@pytest.fixture
+def routed(packages: Path, tmp_path: Path) -> Router:
+    """Runs a verb of the wheel's router in an empty folder."""
+    here = tmp_path / "here"
+    here.mkdir()
+
+    def run(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "router", *map(str, arguments)]
+        environment = {**os.environ, "PYTHONPATH": str(packages), "PYTHONDONTWRITEBYTECODE": "1", **variables}
+        return subprocess.run(
+            command, cwd=here, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+
+    return run
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_the_examples_are_copied_and_work_where_they_are(routed: Router, tmp_path: Path) -> None:
+    assert "`router init` writes example tables there" in routed("validate").stdout
+    assert routed("init").returncode == 0
+    copied = tmp_path / "here"
+    assert {path.name for path in copied.iterdir()} == {"protos", "routes", "schemas"}
+    assert (copied / "schemas" / "comms" / "package.xml").is_file()
+    valid = routed("validate")
+    assert [line.split(":")[0] for line in valid.stdout.splitlines()] == [
+        "routes/legacy.yaml",
+        "routes/rover.yaml",
+        "routes/sim.yaml",
+    ]
+    tested = routed("test")
+    assert (tested.returncode, tested.stdout.endswith("in 1 file\n")) == (0, True), tested.stdout
+    before = contents(copied)
+    shutil.rmtree(copied / "schemas")
+    again = routed("init")
+    assert (again.returncode, again.stderr) == (
+        2,
+        "router init: routes is there already; nothing was written\n",
+    )
+    assert before.items() > contents(copied).items()
+
+
+def test_the_lock_of_the_installation_is_not_written(routed: Router, packages: Path, tmp_path: Path) -> None:
+    shipped = packages / "router" / "_assets" / "protos"
+    pump = Path("components/sensor_board/pump.proto")
+    longer = (shipped / pump).read_text().rstrip().removesuffix("}") + "  float more = 100;\n}\n"
+    (shipped / pump).write_text(longer)
+    before = contents(packages)
+    for protos in ((), ("--protos", shipped)):
+        refused = routed("schema", "lock", *protos)
+        assert refused.returncode == 2
+        assert f"the protos in {shipped} belong to the installed router" in refused.stderr
+        assert "copy them with `router init`, and name yours: --protos protos" in refused.stderr
+    assert routed("new", "SensorBoardMore", "--number", "99", "--board", "sensor").returncode == 2
+    assert contents(packages) == before
+    routed("init")
+    locked = routed("schema", "lock", "--protos", "protos")
+    assert "1 new number" in locked.stdout, locked.stderr
+    assert "float more" in (tmp_path / "here" / "protos" / "envelope.lock.json").read_text()
+    assert contents(packages) == before
