@@ -12,8 +12,24 @@ from pathlib import Path
 
 import pytest
 
+import router.assets
+from router.edges.ros_environment import ros_package_remedy, ros_remedy
+
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
+
+OWN_TABLE = """\
+version: 1
+envelope: {message: PBEnvelope, oneof: payload}
+listen: {rover: {address: "127.0.0.1:29999"}}
+endpoints: {sensor_board: {address: "127.0.0.30:8", kind: board}}
+routes:
+  ph_info:
+    source: sensor_board
+    topics:
+      - {topic: a, type: absent_msgs/msg/A, fields: {x: ph_value}}
+      - {topic: b, type: absent_msgs/msg/B, fields: {x: ph_value}}
+"""
 
 Router = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -98,3 +114,40 @@ def test_the_lock_of_the_installation_is_not_written(routed: Router, packages: P
     assert "1 new number" in locked.stdout, locked.stderr
     assert "float more" in (tmp_path / "here" / "protos" / "envelope.lock.json").read_text()
     assert contents(packages) == before
+
+
+def test_the_messages_of_a_sourced_workspace_come_before_those_that_were_shipped(
+    packages: Path, tmp_path: Path
+) -> None:
+    """A team edits and builds its own copy of `comms`."""
+    message = tmp_path / "install" / "share" / "comms" / "msg" / "SensorState.msg"
+    message.parent.mkdir(parents=True)
+    message.write_text("bool ours\n")
+    script = "from router.types.ros import ros_interfaces as r; print(r().get('comms/msg/SensorState').fields[0].name)"
+    environment = {**os.environ, "PYTHONPATH": str(packages), "AMENT_PREFIX_PATH": str(tmp_path / "install")}
+    command = [sys.executable, "-c", script]
+    assert subprocess.check_output(command, env=environment, cwd=tmp_path, text=True, timeout=PATIENCE) == "ours\n"
+
+
+def test_the_doctor_names_a_missing_ros_package_once(routed: Router, tmp_path: Path) -> None:
+    share = tmp_path / "install" / "share" / "absent_msgs" / "msg"
+    share.mkdir(parents=True)
+    for name in "AB":
+        (share / f"{name}.msg").write_text("float32 x\n")
+    (tmp_path / "here" / "table.yaml").write_text(OWN_TABLE)
+    found = routed("doctor", "table.yaml", AMENT_PREFIX_PATH=str(tmp_path / "install")).stdout
+    [problem, remedy] = [line for line in found.splitlines() if "absent_msgs" in line]
+    assert problem.startswith("problem  ROS        absent_msgs/msg/A is not installed")
+    assert problem.endswith("(there is no Python package 'absent_msgs.msg'); and 1 more of its types")
+    assert remedy.strip() == "-> source the workspace that has the ROS package 'absent_msgs', or install it"
+
+
+def test_an_installation_is_told_how_to_get_ros_without_make(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "'make setup'" in ros_remedy()
+    assert "'make setup'" in ros_package_remedy("comms")
+    monkeypatch.setattr(router.assets, "_PACKAGE", ROOT)  # what is in the checkout is installed then
+    assert ros_remedy() == ("run `pip install 'rover-router[ros]'`, or source the setup.sh of an installed ROS 2 Jazzy")
+    assert ros_package_remedy("comms") == (
+        "source the workspace that has the ROS package 'comms'; `router init` writes it to schemas/comms, "
+        "and docs/ros.md says how colcon builds it"
+    )
