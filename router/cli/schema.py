@@ -43,9 +43,10 @@ def run(args: argparse.Namespace) -> int:
     from router.types.protobuf import load_protos
 
     root = args.protos or asset("protos")
-    if is_installed(root):
-        what = f"the protos in {root} belong to the installed router, which an upgrade overwrites"
-        raise UsageError(f"{what}; copy them with `router init`, and name yours: --protos protos")
+    path = root / LOCK_NAME
+    if is_installed(path):
+        what = f"{path} belongs to the installed router, and is lost when that is upgraded"
+        raise UsageError(f"{what}; copy the protos with `router init`, and name yours: --protos protos")
     schema = load_protos(root)
     old = read_lock(root)
     envelope = _envelope(schema, old, args)
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     new = extended_lock(schema, envelope)
     if new != old:
         write_lock(root, new)
-    print(f"{shown_path(root / LOCK_NAME)}: {_summary(old, new)}")
+    print(f"{shown_path(path)}: {_summary(old, new)}")
     return OK
 
 
