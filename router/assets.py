@@ -1,6 +1,6 @@
-"""Where the files that belong to the router lie: beside the package in a wheel, at the root in a checkout.
+"""Where the files that belong to the router lie: within the package in a wheel, at the root in a checkout.
 
-Knows no file's meaning. `schemas/` and `protos/` are such files.
+Knows no file's meaning. `routes/`, `protos/` and `schemas/` are such files.
 """
 
 from __future__ import annotations
@@ -22,6 +22,6 @@ def asset(relative: str) -> Path:
     raise FileNotFoundError(f"this installation of the router has no '{relative}'; install it again")
 
 
-def are_installed() -> bool:
-    """Whether they lie within the package, as a wheel has them: who changes them there loses it with the next one."""
-    return asset("schemas").is_relative_to(_PACKAGE)
+def is_installed(path: Path) -> bool:
+    """Whether `path` is within the installed package: the next version overwrites what is changed there."""
+    return path.resolve().is_relative_to(_PACKAGE.resolve())

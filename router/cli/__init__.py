@@ -27,6 +27,7 @@ BROKEN_PIPE = 141
 DEFAULT_TABLE = Path("routes/rover.yaml")
 
 VERBS = {
+    "init": "copy the example tables, their protos and their ROS messages into a folder",
     "run": "run a route table between UDP and ROS 2",
     "validate": "say what is wrong with route tables",
     "explain": "show what a route does, field by field, with its code, and what a gateway sends",

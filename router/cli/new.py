@@ -40,13 +40,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 @explained
 def run(args: argparse.Namespace) -> int:
-    from router.assets import are_installed
+    from router.assets import asset, is_installed
     from router.tools import UsageError
     from router.tools.new_message import new_message
     from router.tools.new_message_files import Written, changes
 
-    if are_installed():
-        raise UsageError("this router is installed, and our ROS messages with it; use the one of a checkout")
+    if is_installed(asset("schemas")):
+        what = "this router is installed, and its ROS messages with it; use the one of a checkout"
+        raise UsageError(f"{what}, or write by hand what docs/adding-a-message.md lists")
     before = _check(args.table)
     errors = [finding for checked in before for finding in checked.diagnostics if checked.has_errors]
     if errors:

@@ -10,10 +10,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.assets import asset
+from router.assets import asset, is_installed
 from router.cli import BAD_TABLE, OK, VERBS
 from router.cli.findings import plural, print_findings
+from router.cli.tool_options import explained
 from router.errors import Severity, SourceSpan, shown_path
+from router.tools import UsageError
 
 if TYPE_CHECKING:
     from router.types.lock_file import Lock
@@ -33,6 +35,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     lock.add_argument("--oneof", metavar="NAME", help=f"its oneof (default: as the lock says, else {ONEOF})")
 
 
+@explained
 def run(args: argparse.Namespace) -> int:
     """Raises TableError for broken `.proto` files and a broken lock file."""
     from router.types.lock import check_lock, extended_lock
@@ -40,6 +43,10 @@ def run(args: argparse.Namespace) -> int:
     from router.types.protobuf import load_protos
 
     root = args.protos or asset("protos")
+    path = root / LOCK_NAME
+    if is_installed(path):
+        what = f"{path} belongs to the installed router, and is lost when that is upgraded"
+        raise UsageError(f"{what}; copy the protos with `router init`, and name yours: --protos protos")
     schema = load_protos(root)
     old = read_lock(root)
     envelope = _envelope(schema, old, args)
@@ -51,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     new = extended_lock(schema, envelope)
     if new != old:
         write_lock(root, new)
-    print(f"{shown_path(root / LOCK_NAME)}: {_summary(old, new)}")
+    print(f"{shown_path(path)}: {_summary(old, new)}")
     return OK
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import add_url_option, add_wire_options, explained, load_wire, running_url, whole
-from router.edges.ros_environment import check_environment
+from router.edges.ros_environment import check_environment, ros_remedy
 from router.errors import StartError, nearest
 from router.tools import UsageError
 
@@ -160,7 +160,7 @@ def _topic(args: argparse.Namespace) -> Iterator[Iterator[HeardMessage]]:
     except StartError as error:
         raise UsageError(str(error)) from error
     except ImportError as error:
-        raise UsageError(f"a topic needs ROS 2, which is not installed here ({error}); run 'make setup'") from error
+        raise UsageError(f"a topic needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
     from router.tools.tapping import listen_to_topic
 
     if args.type is None:

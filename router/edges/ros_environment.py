@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from router.assets import asset, is_installed
 from router.errors import StartError
 
 LAST_DOMAIN = 232
@@ -52,6 +53,23 @@ def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str
         if needed > _TRACING:
             remedy += "; with FASTDDS_BUILTIN_TRANSPORTS=UDPv4, ROS needs almost nothing there"
         yield f"{shm} has {free >> 10} KiB free, and ROS 2 needs {needed >> 10}", remedy
+
+
+def ros_remedy() -> str:
+    """What to do where ROS 2 cannot be loaded."""
+    install = "`pip install 'rover-router[ros]'`" if is_installed(asset("schemas")) else "'make setup'"
+    return f"run {install}, or source the setup.sh of an installed ROS 2 Jazzy"
+
+
+def ros_package_remedy(package: str) -> str:
+    """What to do where a ROS package is missing, or is not as the table was compiled for."""
+    ours = asset("schemas")
+    if not is_installed(ours):
+        return f"run 'make setup', or install the ROS package '{package}'"
+    source = f"source the workspace that has the ROS package '{package}'"
+    if not (ours / package).is_dir():
+        return f"{source}, or install it"
+    return f"{source}; `router init` writes it to schemas/{package}, and docs/ros.md says how colcon builds it"
 
 
 def shared_memory(environ: Mapping[str, str], folder: Path = SHM) -> tuple[int, int]:

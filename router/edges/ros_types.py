@@ -10,6 +10,7 @@ from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
 
+from router.edges.ros_environment import ros_package_remedy
 from router.errors import SourceSpan, StartError
 
 _NAME = re.compile(r"(?P<package>[A-Za-z]\w*)/(?P<kind>msg|srv|action)/(?P<short>[A-Z]\w*)", re.ASCII)
@@ -76,7 +77,7 @@ def _member(module: ModuleType, name: str) -> Any:
 
 
 def _remedy(name: str) -> str:
-    return f"run 'make setup', or install the ROS package '{name.partition('/')[0]}'"
+    return ros_package_remedy(name.partition("/")[0])
 
 
 def _fields(definition: Definition) -> str:

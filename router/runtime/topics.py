@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
+from router.edges.ros_environment import ros_remedy
 from router.errors import SourceSpan, StartError
 
 if TYPE_CHECKING:
@@ -27,8 +28,8 @@ def open_ros(
     try:
         from router.edges.ros import RosEdge
     except ImportError as error:
-        remedy = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
-        raise StartError(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}; {remedy}") from error
+        what = f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}"
+        raise StartError(f"{what}; {ros_remedy()}") from error
     return RosEdge(program.table.node, (), (), {}, ros_args, incompatible, met)
 
 

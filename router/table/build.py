@@ -12,6 +12,7 @@ from ipaddress import IPv4Network
 from pathlib import Path
 from typing import TypeVar, Union
 
+from router.assets import asset
 from router.errors import Code, Diagnostic
 from router.table.build_addresses import local_address, remote_address
 from router.table.build_gateways import build_gateway
@@ -171,9 +172,10 @@ def _is_group(entry: Entry) -> bool:
 
 def _envelope(entry: Entry) -> EnvelopeSettings:
     settings = mapping(entry.value)
-    protos = text(settings, "protos")
-    folder = Path(protos.span.file).absolute().parent / protos.value
-    return EnvelopeSettings(Located(folder, protos.span), text(settings, "message"), text(settings, "oneof"))
+    protos = Located(asset("protos"), entry.key.span)
+    if written := optional_text(settings, "protos"):
+        protos = Located(Path(written.span.file).absolute().parent / written.value, written.span)
+    return EnvelopeSettings(protos, text(settings, "message"), text(settings, "oneof"))
 
 
 def _node(entry: Entry) -> NodeSettings:

@@ -82,7 +82,7 @@ class Keep(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class EnvelopeSettings:
-    """`protos` is an absolute path; `message` and `oneof` name the envelope in them."""
+    """`protos` is an absolute path, the router's own unless the table has one; the others name the envelope in them."""
 
     protos: Located[Path]
     message: Located[str]

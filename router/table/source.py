@@ -9,6 +9,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from router.assets import asset, is_installed
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 
 MAX_BYTES = 4 << 20
@@ -77,6 +78,8 @@ def _read(path: Path, file: str) -> bytes:
         what = f"the file cannot be read: {(error.strerror or str(error)).lower()}"
         if isinstance(error, FileNotFoundError) and not path.is_absolute():
             hint = f"paths are relative to the working directory, here {Path.cwd()}"
+            if is_installed(asset("routes")):
+                hint += "; `router init` writes example tables there"
     except ValueError as error:  # a path that no file system takes: NUL, half a surrogate pair
         what = f"the file cannot be read: {error}"
     raise TableError([Diagnostic(SourceSpan(file), Code.BAD_FILE, what, hint)])

@@ -7,12 +7,10 @@ import socket
 from collections.abc import Iterator, Mapping
 
 from router.compiler.program import Program
-from router.edges.ros_environment import obstacles
+from router.edges.ros_environment import obstacles, ros_package_remedy, ros_remedy
 from router.edges.udp_kernel import interface_is_up
 from router.errors import StartError
 from router.tools.doctor_report import Finding, fine, problem, warning
-
-_INSTALL = "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
 
 
 def ros(program: Program) -> Iterator[Finding]:
@@ -26,16 +24,19 @@ def ros(program: Program) -> Iterator[Finding]:
     try:
         from router.edges.ros_installation import middleware, usable_class
     except ImportError as error:
-        yield problem("ROS", f"the table has topics, and ROS 2 cannot be loaded: {error}", _INSTALL)
+        yield problem("ROS", f"the table has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
         return
-    wrong = set()
+    wrong: dict[str, dict[str, str]] = {}
     for plan in plans:
         try:
             usable_class(plan.type_name, plan.definitions)
         except StartError as error:
-            if str(error) not in wrong:
-                wrong.add(str(error))
-                yield problem("ROS", str(error), _INSTALL)
+            wrong.setdefault(plan.type_name.partition("/")[0], {})[plan.type_name] = str(error)
+    for package, errors in wrong.items():
+        remedy = ros_package_remedy(package)
+        what = next(iter(errors.values())).removesuffix(f"; {remedy}")
+        more = f"; and {len(errors) - 1} more of its types" if len(errors) > 1 else ""
+        yield problem("ROS", f"{what}{more}", remedy)
     if not wrong:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         types = len({plan.type_name for plan in plans})

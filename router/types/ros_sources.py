@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from router.assets import asset
+from router.assets import asset, is_installed
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 from router.types.model import String
 from router.types.msg_text import PRIMITIVES, MsgDefinition, MsgError, MsgField, NamedType, Shape, parse_msg
@@ -60,9 +60,15 @@ class MsgFiles:
 
 
 def msg_files() -> MsgFiles:
-    """Ours first, then every prefix of the sourced workspaces, then the environment that Python runs in."""
+    """Every prefix of the sourced workspaces, then the environment that Python runs in.
+
+    Ours come first in a checkout, where they are edited and then built, and last in an installation, where a team's own
+    copy of them is what it edits and builds.
+    """
     prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
-    return MsgFiles([asset("schemas"), *(Path(prefix, "share") for prefix in prefixes)])
+    shares = [Path(prefix, "share") for prefix in prefixes]
+    ours = asset("schemas")
+    return MsgFiles([*shares, ours] if is_installed(ours) else [ours, *shares])
 
 
 def _read(path: Path, package: str) -> FoundDefinition:

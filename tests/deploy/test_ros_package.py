@@ -140,6 +140,11 @@ def test_installed_tables_are_in_order(installed: Path) -> None:
     assert re.findall(r"(\w+)\.yaml: ok", said) == ["legacy", "rover", "sim"]
 
 
+def test_its_examples_can_be_copied(installed: Path, tmp_path: Path) -> None:
+    output(start(installed, "init", tmp_path / "copy"))
+    assert (tmp_path / "copy" / "routes" / "rover.yaml").is_file()
+
+
 def test_without_a_verb_it_routes_and_takes_parameters_as_nodes_do(installed: Path, table: Path) -> None:
     port = free_port()
     said = started(start(installed, "--ros-args", "-p", f"routes_path:={table}", "-p", f"listen_port:={port}"))

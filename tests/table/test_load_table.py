@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from router.assets import asset
 from router.errors import Code
 from router.table import load_table
 from router.table.model import Address, EndpointKind, Framing, Keep, Priority, Route, RouteTable
@@ -150,6 +151,16 @@ def test_a_list_of_expressions_keeps_its_items(table: RouteTable) -> None:
     expression = fields.entries[-1].value
     assert expression.items
     assert [item.text for item in expression.items] == ["-1", "0", "accel_y"]
+
+
+def test_protos_are_the_routers_own_unless_the_table_has_some(tmp_path: Path) -> None:
+    path = tmp_path / "table.yaml"
+    path.write_text(
+        "version: 1\nenvelope: {message: PBEnvelope, oneof: payload}\nlisten: {all: {address: 127.0.0.1:5000}}\n"
+        "routes: {imu_info: {ignore: not here}}\n"
+    )
+    table, findings = load_table(path)
+    assert (table and table.envelope.protos.value, findings) == (asset("protos"), [])
 
 
 def test_protos_are_relative_to_the_file_that_says_so(tmp_path: Path) -> None:

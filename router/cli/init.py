@@ -1,0 +1,44 @@
+"""`router init [DIR]`: the files that come with the router, as files of one's own.
+
+They are then where a checkout has them, so that everything which is written about a checkout holds there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+from router.assets import asset
+from router.cli import OK, VERBS
+from router.cli.tool_options import explained
+from router.errors import shown_path
+from router.tools import UsageError
+
+_PARTS = {
+    "routes": "the example tables and their test: `router validate`, `router test`",
+    "protos": "what boards and basestation send: after a change, `router schema lock --protos protos`",
+    "schemas": "for editors, and `comms`, the ROS messages of the tables; colcon builds them (docs/ros.md)",
+}
+_DESCRIPTION = """Copy what comes with the router into a folder, to run it and to change it there. Where there is
+one of them already, nothing is written."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser("init", help=VERBS["init"], description=_DESCRIPTION)
+    parser.add_argument("folder", metavar="DIR", nargs="?", type=Path, default=Path(), help="default: where you are")
+
+
+@explained
+def run(args: argparse.Namespace) -> int:
+    targets = {part: args.folder / part for part in _PARTS}
+    try:
+        for target in targets.values():
+            if target.exists():
+                raise UsageError(f"{shown_path(target)} is there already; nothing was written")
+        for part, target in targets.items():
+            shutil.copytree(asset(part), target, copy_function=shutil.copyfile)  # theirs may be read-only
+            print(f"{shown_path(target)}: {_PARTS[part]}")
+    except OSError as error:
+        raise UsageError(str(error)) from error
+    return OK

@@ -1,0 +1,166 @@
+"""The router from a wheel, in a folder that has nothing: what comes with it, and that nothing is written to it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import router.assets
+from router.edges.ros_environment import ros_package_remedy, ros_remedy
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 60.0
+
+PROTO = """\
+syntax = "proto3";
+message Motor {
+  float rpm = 1;
+}
+message PBEnvelope {
+  oneof payload {
+    Motor motor = 1;
+  }
+}
+"""
+TABLE = """\
+version: 1
+envelope: {message: PBEnvelope, oneof: payload}
+listen: {rover: {address: "127.0.0.1:29999"}}
+endpoints: {driving_board: {address: "127.0.0.30:8", kind: board}}
+routes:
+  motor:
+    source: driving_board
+    topics:
+      - {topic: a, type: absent_msgs/msg/A, fields: {x: rpm}}
+      - {topic: b, type: absent_msgs/msg/B, fields: {x: rpm}}
+"""
+
+Router = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert built.returncode == 0, built.stderr
+    [path] = folder.glob("*.whl")
+    return path
+
+
+@pytest.fixture
+def packages(wheel: Path, tmp_path: Path) -> Path:
+    """Where pip would unpack it."""
+    folder = tmp_path / "venv" / "site-packages"
+    zipfile.ZipFile(wheel).extractall(folder)
+    return folder
+
+
+@pytest.fixture
+def routed(packages: Path, tmp_path: Path) -> Router:
+    """Runs a verb of the wheel's router in an empty folder."""
+    here = tmp_path / "here"
+    here.mkdir()
+
+    def run(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "router", *map(str, arguments)]
+        environment = {**os.environ, "PYTHONPATH": str(packages), "PYTHONDONTWRITEBYTECODE": "1", **variables}
+        return subprocess.run(
+            command, cwd=here, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+
+    return run
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def ship(packages: Path, proto: str) -> Path:
+    """Puts protos of the test's own into the wheel, in place of those that a team edits, and without a lock."""
+    shipped = packages / "router" / "_assets" / "protos"
+    shutil.rmtree(shipped)
+    shipped.mkdir()
+    (shipped / "envelope.proto").write_text(proto)
+    return shipped
+
+
+def test_the_examples_are_copied_and_work_where_they_are(routed: Router, packages: Path, tmp_path: Path) -> None:
+    assert "`router init` writes example tables there" in routed("validate").stdout
+    assert routed("init").returncode == 0
+    copied = tmp_path / "here"
+    assert contents(copied) == contents(packages / "router" / "_assets")
+    for name in ("routes/sim.yaml", "protos/envelope.lock.json", "schemas/comms/package.xml"):
+        assert (copied / name).is_file()
+    valid = routed("validate")
+    assert valid.returncode == 0, valid.stdout
+    shutil.rmtree(copied / "schemas")
+    before = contents(copied)
+    again = routed("init")
+    assert (again.returncode, again.stderr) == (2, "router init: routes is there already; nothing was written\n")
+    assert contents(copied) == before
+
+
+def test_the_lock_of_the_installation_is_not_written(routed: Router, packages: Path, tmp_path: Path) -> None:
+    shipped = ship(packages, PROTO)
+    before = contents(packages)
+    for protos in ((), ("--protos", shipped)):
+        refused = routed("schema", "lock", *protos)
+        assert refused.returncode == 2
+        assert refused.stderr == (
+            f"router schema: {shipped}/envelope.lock.json belongs to the installed router, and is lost when that is "
+            "upgraded; copy the protos with `router init`, and name yours: --protos protos\n"
+        )
+    assert routed("new", "SensorBoardMore", "--number", "99", "--board", "sensor").returncode == 2
+    assert contents(packages) == before
+    routed("init")
+    locked = routed("schema", "lock", "--protos", "protos")
+    assert "2 new numbers" in locked.stdout, locked.stderr
+    assert (tmp_path / "here" / "protos" / "envelope.lock.json").is_file()
+    assert contents(packages) == before
+
+
+def test_the_messages_of_a_sourced_workspace_come_before_those_that_were_shipped(
+    packages: Path, tmp_path: Path
+) -> None:
+    """A team edits and builds its own copy of `comms`."""
+    message = tmp_path / "install" / "share" / "comms" / "msg" / "SensorState.msg"
+    message.parent.mkdir(parents=True)
+    message.write_text("bool ours\n")
+    script = "from router.types.ros import ros_interfaces as r; print(r().get('comms/msg/SensorState').fields[0].name)"
+    environment = {**os.environ, "PYTHONPATH": str(packages), "AMENT_PREFIX_PATH": str(tmp_path / "install")}
+    command = [sys.executable, "-c", script]
+    assert subprocess.check_output(command, env=environment, cwd=tmp_path, text=True, timeout=PATIENCE) == "ours\n"
+
+
+def test_the_doctor_names_a_missing_ros_package_once(routed: Router, packages: Path, tmp_path: Path) -> None:
+    """Of a table that names no protos, so that it has those of the wheel."""
+    ship(packages, PROTO)
+    share = tmp_path / "install" / "share" / "absent_msgs" / "msg"
+    share.mkdir(parents=True)
+    for name in "AB":
+        (share / f"{name}.msg").write_text("float32 x\n")
+    (tmp_path / "here" / "table.yaml").write_text(TABLE)
+    found = routed("doctor", "table.yaml", AMENT_PREFIX_PATH=str(tmp_path / "install")).stdout
+    [problem, remedy] = [line for line in found.splitlines() if "absent_msgs" in line]
+    assert problem.startswith("problem  ROS        absent_msgs/msg/A is not installed")
+    assert problem.endswith("(there is no Python package 'absent_msgs.msg'); and 1 more of its types")
+    assert remedy.strip() == "-> source the workspace that has the ROS package 'absent_msgs', or install it"
+
+
+def test_an_installation_is_told_how_to_get_ros_without_make(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "'make setup'" in ros_remedy()
+    assert "'make setup'" in ros_package_remedy("comms")
+    monkeypatch.setattr(router.assets, "_PACKAGE", ROOT)  # what is in the checkout is installed then
+    assert ros_remedy() == ("run `pip install 'rover-router[ros]'`, or source the setup.sh of an installed ROS 2 Jazzy")
+    assert ros_package_remedy("comms") == (
+        "source the workspace that has the ROS package 'comms'; `router init` writes it to schemas/comms, "
+        "and docs/ros.md says how colcon builds it"
+    )
