@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.table.language_server import LanguageServer
+from tests.tables import ROUTES
 
 SERVER = "yaml-language-server"
 VERSION = "1.19.2"
@@ -127,7 +128,7 @@ def test_good_gateways_are_underlined_nowhere(editor: LanguageServer) -> None:
     assert editor.open(new_table(), GATEWAYS) == []
 
 
-@pytest.mark.parametrize("table", sorted((REPOSITORY / "routes").glob("*.yaml")), ids=lambda path: path.name)
+@pytest.mark.parametrize("table", sorted(ROUTES.glob("*.yaml")), ids=lambda path: path.name)
 def test_the_tables_of_the_repository_are_underlined_nowhere_but_for_what_they_inherit(
     editor: LanguageServer, table: Path
 ) -> None:
