@@ -22,7 +22,7 @@ setup:  ## build .venv with the router, ROS 2 Jazzy and the comms interfaces; wh
 install-service:  ## install the router as a systemd service and start it, with sudo; TABLE=... for another table
 	@deploy/install-service.sh $(TABLE)
 
-test: setup  ## run the tests; TESTS=tests/wire for some of them
+test: setup  ## run the tests of the router; TESTS=tests/wire for some of them. Your tables: make validate
 	@$(ENV) .venv/bin/python -m pytest $(TESTS)
 
 demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost link halts the rover

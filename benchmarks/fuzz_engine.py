@@ -24,6 +24,7 @@ from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM, Engine, Report
 from tests.engine.ledger import Ledger
 from tests.engine.plain import plain_outlets
+from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = 500_000
@@ -115,9 +116,9 @@ class Outcome:
 
 
 def fuzz(count: int, seed: int) -> Outcome:
-    program = check_table(ROOT / "routes" / "rover.yaml", {}).program
+    program = check_table(ROUTES / "rover.yaml", {}).program
     if program is None:
-        raise SystemExit("routes/rover.yaml has errors; see `router validate`")
+        raise SystemExit(f"{ROUTES}/rover.yaml has errors; see `router validate`")
     counts = program.books.fresh_counts()
     noise = random.Random(seed)
     receive = _receiver(program, counts, noise)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from router.compiler.topics import resolved
-from router.table.model import Address, EndpointKind, GatewayFormat, Route, RouteTable
-
-SILENT = "basestation"
-"""The endpoint whose link is lost for a while."""
+from router.table.model import Address, EndpointKind, GatewayFormat, Route, RouteTable, Transport
 
 LOST, FOUND = 5.0, 8.0
-"""Seconds after the simulator's start at which that link is lost and found again."""
+"""Seconds after the simulator's start at which the link to all basestations is lost and found again."""
 
 
 def active_routes(table: RouteTable) -> list[Route]:
@@ -45,7 +42,8 @@ def _topics(routes: list[Route]) -> dict[str, str]:
 def page_of(table: RouteTable) -> Address | None:
     """Where the table has a page for browsers."""
     for gateway in table.gateways.values():
-        if gateway.format is GatewayFormat.JSON and gateway.address is not None:
+        is_for_browsers = gateway.transport.value is Transport.WEBSOCKET and gateway.format is GatewayFormat.JSON
+        if is_for_browsers and gateway.address is not None:
             return gateway.address.value
     return None
 
@@ -64,11 +62,19 @@ def expected_arrivals(table: RouteTable) -> set[tuple[str, str]]:
     }
 
 
+def basestations(table: RouteTable) -> list[str]:
+    """The endpoints whose link is lost for a while: those that send something."""
+    senders = {source.value for route in active_routes(table) for source in route.sources}
+    kinds = {name: endpoint.kind for name, endpoint in table.endpoints.items()}
+    return [name for name, kind in kinds.items() if kind is EndpointKind.BASESTATION and name in senders]
+
+
 def halted_boards(table: RouteTable) -> set[str]:
     """To whom deadmen speak while the link is lost."""
+    silent = basestations(table)
     return {
         to.value
         for route in active_routes(table)
-        if route.deadman is not None and any(source.value == SILENT for source in route.sources)
+        if route.deadman is not None and any(source.value in silent for source in route.sources)
         for to in route.deadman.to
     }

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from demo.children import Child
-from demo.expected import FOUND, LOST, SILENT, page_of, shown_topics
+from demo.expected import FOUND, LOST, basestations, page_of, shown_topics
 from demo.page import Shown, look
 from demo.places import free_ros_domain
 from demo.recorded import first_of, recordings
@@ -72,8 +72,8 @@ class Demo:
         listener = self._start("listener", "demo.ros_listener", str(TABLE))
         self._start("router", "router", "run", str(TABLE))
         self._wait_until_up(listener)
-        cut_off = f"{SILENT}:{LOST}-{FOUND}"
-        simulator = self._start("simulator", "router", "sim", str(TABLE), "--json", "--silent", cut_off)
+        cut_off = [word for name in basestations(self._table) for word in ("--silent", f"{name}:{LOST}-{FOUND}")]
+        simulator = self._start("simulator", "router", "sim", str(TABLE), "--json", *cut_off)
         self._wait_until(lambda: bool(simulator.latest), "the simulator did not start")
         talker = self._start("talker", "demo.ros_talker", str(TABLE))
         window = Window()

@@ -11,7 +11,7 @@ from typing import Any
 from demo.expected import (
     FOUND,
     LOST,
-    SILENT,
+    basestations,
     expected_arrivals,
     halted_boards,
     inbound_topics,
@@ -108,15 +108,16 @@ def _deadman(table: RouteTable, simulated: Said) -> Finding:
     """Whether each board was told to halt while the link was lost, and obeyed again when it was found."""
     boards = sorted(halted_boards(table))
     if not boards:
-        return Finding(False, f"no deadman guards what {SILENT} commands")
+        return Finding(False, "no deadman guards what a basestation commands")
     halted = {board: _change(simulated, board, "halted", LOST, FOUND) for board in boards}
     released = {board: _change(simulated, board, "obeying", FOUND, math.inf) for board in boards}
     missing = [f"{board} was not halted" for board, at in halted.items() if at is None]
     missing += [f"{board} did not obey again" for board, at in released.items() if at is None]
+    cut = f"the link to {' and '.join(basestations(table))} was cut"
     if missing:
-        return Finding(False, f"{SILENT} was cut off from {LOST:.0f} to {FOUND:.0f} s, and {', '.join(missing)}")
+        return Finding(False, f"{cut} from {LOST:.0f} to {FOUND:.0f} s, and {', '.join(missing)}")
     told = ", ".join(f"{board} after {at - LOST:.2f} s" for board, at in halted.items() if at is not None)
-    return Finding(True, f"{SILENT} was cut off for {FOUND - LOST:.0f} s: halted {told}; obeyed again when it was back")
+    return Finding(True, f"{cut} for {FOUND - LOST:.0f} s: halted {told}; obeyed again when it was back")
 
 
 def _change(simulated: Said, board: str, state: str, start: float, end: float) -> float | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import tempfile
 from pathlib import Path
 
@@ -25,6 +26,21 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # No deadline: how long an example takes says more about the machine than about the code.
 settings.register_profile("router", deadline=None)
 settings.load_profile("router")
+
+
+_ROOT = Path(__file__).parents[1]
+TEAMS = (f"{_ROOT}/routes/", f"{_ROOT}/protos/", f"{_ROOT}/deploy/grafana/rover.json")
+"""What a team edits. A test that reads it would fail with the next basestation: tests/tables.py has other tables."""
+
+
+def _leave_to_the_team(event: str, arguments: tuple[object, ...]) -> None:
+    if event != "open" or not isinstance(path := arguments[0], str):
+        return
+    if os.path.abspath(path).startswith(TEAMS):  # noqa: PTH100 - `resolve` would look at the disk each time
+        raise AssertionError(f"a test opens {path}, which is the team's; use tests/tables.py")
+
+
+sys.addaudithook(_leave_to_the_team)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -29,9 +29,10 @@ from router.table.shape import table_schema
 from router.types.ros import ros_interfaces
 from tests.gateway.fake_gateway import FakeGateway
 from tests.ports import free_port
+from tests.tables import ROUTES
 
 DOCS = Path(__file__).parent.parent / "docs"
-ROVER = DOCS.parent / "routes" / "rover.yaml"
+ROVER = ROUTES / "rover.yaml"
 PAGES = runpy.run_path(str(DOCS / "generate.py"))["PAGES"]
 PATIENCE = 30.0
 TABLE_PAGES = ("table.md", "gateway.md", "../README.md")

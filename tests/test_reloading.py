@@ -29,8 +29,8 @@ from router.runtime.accounts import Accounts
 from router.runtime.edges import Edges
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
+from tests.tables import PROTOS
 
-ROOT = Path(__file__).parent.parent
 TABLE = """\
 version: 1
 envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
@@ -125,9 +125,7 @@ class Site:
         listeners = listen or f'  rover: {{address: "127.0.0.1:{self.listen}"}}'
         destination = self.basestation.getsockname()[1]
         path.write_text(
-            TABLE.format(
-                protos=ROOT / "protos", listen=listeners, basestation=destination, more=f"{endpoints}routes:\n{routes}"
-            )
+            TABLE.format(protos=PROTOS, listen=listeners, basestation=destination, more=f"{endpoints}routes:\n{routes}")
         )
         let_rest(path)
         return path

@@ -1,11 +1,10 @@
-"""The tables in `routes/`: who gets what, and whether the standard messages are in SI units."""
+"""The tables that other tests rely on: who gets what, and whether the standard messages are in SI units."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import pytest
 from geometry_msgs.msg import TwistStamped
@@ -17,8 +16,8 @@ from router.compiler.program import Program
 from router.engine import Engine
 from router.table.model import Route, RouteTable, Transport
 from tests.engine.plain import plain_outlets
+from tests.tables import ROUTES
 
-ROUTES = Path(__file__).parent.parent / "routes"
 Publish = Callable[..., dict[str, bytes]]
 EPHEMERAL = 32_768
 """From this port on, Linux hands them out by itself."""

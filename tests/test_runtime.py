@@ -29,6 +29,7 @@ from router.errors import StartError
 from router.runtime import Router
 from tests.acceptance.site import wait_until
 from tests.edges.recorder_rig import read
+from tests.tables import PROTOS
 
 ROOT = Path(__file__).parent.parent
 BOARD = "127.0.0.30"
@@ -75,7 +76,7 @@ class Site:
     def program(self, more: str = "") -> Program:
         path = self.folder / "table.yaml"
         ports = {"listen": self.listen, "destination": self.basestation.getsockname()[1]}
-        path.write_text(TABLE.format(protos=ROOT / "protos", **ports) + more)
+        path.write_text(TABLE.format(protos=PROTOS, **ports) + more)
         checked = check_table(path)
         assert checked.program, "\n".join(map(str, checked.diagnostics))
         return checked.program

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.ports import free_port
+from tests.tables import PROTOS
 
 ROOT = Path(__file__).parent.parent
 
@@ -32,7 +33,7 @@ routes:
 @pytest.fixture
 def table(tmp_path: Path) -> Path:
     path = tmp_path / "table.yaml"
-    path.write_text(TABLE.format(protos=ROOT / "protos", destination=free_port()))
+    path.write_text(TABLE.format(protos=PROTOS, destination=free_port()))
     return path
 
 

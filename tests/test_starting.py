@@ -16,6 +16,7 @@ import pytest
 
 from router.edges.ros_environment import SHM, obstacles, uses_shared_memory
 from tests.ports import free_port
+from tests.tables import PROTOS
 
 ROOT = Path(__file__).parent.parent
 TABLE = """\
@@ -58,7 +59,7 @@ SCRIPT = ["-c", "import sys; from router import main; sys.exit(main())"]
 def table(tmp_path: Path) -> Path:
     path = tmp_path / "table.yaml"
     ports = {"listen": free_port(), "destination": free_port()}
-    path.write_text(TABLE.format(protos=ROOT / "protos", folder=tmp_path / "recordings", **ports))
+    path.write_text(TABLE.format(protos=PROTOS, folder=tmp_path / "recordings", **ports))
     return path
 
 

@@ -19,7 +19,7 @@ done
 generated=$out/generated
 rm -rf "$generated"
 mkdir -p "$generated"
-cd "$here/../../protos"
+cd "$here/../../tests/rover/protos"
 find . -name '*.proto' -printf '%P\n' | xargs /usr/bin/protoc -I . --cpp_out="$generated"
 # In one piece, so that protobuf's headers are read once; each file has statics of these names.
 cd "$generated"

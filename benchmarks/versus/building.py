@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.tables import PROTOS
+
 ROOT = Path(__file__).parents[2]
 PEER = ROOT / "benchmarks" / "peer"
 PROGRAMS = ROOT / "build" / "bench"
@@ -30,7 +32,7 @@ def missing_packages() -> list[str]:
 
 def _checksum() -> str:
     """Of everything that the programs are made from."""
-    folders = (PEER, ROOT / "protos", ROOT / "schemas" / "comms")
+    folders = (PEER, PROTOS, ROOT / "schemas" / "comms")
     made_from = hashlib.sha256(sys.prefix.encode())
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
         made_from.update(path.read_bytes())

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from benchmarks.versus.building import PROGRAMS, ROOT
+from benchmarks.versus.building import PROGRAMS
 from benchmarks.versus.contenders import PAYLOADS, datagrams
 from benchmarks.versus.helpers import ALL_TOPICS
 from router.engine.framing import LEN
 from tests.engine.wire import tag
+from tests.tables import PROTOS
 
 SMALL, LARGE = 26, 260
 FIRST_COPY = 101
@@ -56,7 +57,7 @@ def folder(count: int) -> Path:
 def write(count: int, target: Path) -> None:
     """Makes table.yaml, payloads.txt with a datagram of each case, and protos/ in a folder."""
     shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(ROOT / "protos", target / "protos", ignore=shutil.ignore_patterns("*.lock.json"))
+    shutil.copytree(PROTOS, target / "protos", ignore=shutil.ignore_patterns("*.lock.json"))
     all_cases = list(_cases(count))
     (target / "protos" / ENVELOPE).write_text(_envelope(all_cases), encoding="utf-8")
     (target / "payloads.txt").write_text("\n".join(_payloads(all_cases)), encoding="utf-8")
@@ -72,8 +73,8 @@ def _cases(count: int) -> Iterator[Case]:
 
 def _envelope(cases: Sequence[Case]) -> str:
     """The rover's envelope with other cases, and the messages that are copies."""
-    original = (ROOT / "protos" / ENVELOPE).read_text(encoding="utf-8")
-    texts = (path.read_text(encoding="utf-8") for path in (ROOT / "protos").rglob("*.proto"))
+    original = (PROTOS / ENVELOPE).read_text(encoding="utf-8")
+    texts = (path.read_text(encoding="utf-8") for path in (PROTOS).rglob("*.proto"))
     messages = dict(re.findall(r"^message (\w+) (\{\n.*?^\})", "".join(texts), re.DOTALL | re.MULTILINE))
     lines = [original.partition("message PBEnvelope")[0], 'import "components/sensor_board/sensor.proto";']
     lines += [f"message {case.message} {messages[case.like_message]}" for case in cases if case not in REAL]

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
-from router.assets import asset
 from router.tools.wire import wire_of_protos
+from tests.tables import PROTOS
 
-WIRE = wire_of_protos(asset("protos"))
+WIRE = wire_of_protos(PROTOS)
 FRAME = 320
 """Bytes of a fixed-size frame: the longest envelope has 305."""
 

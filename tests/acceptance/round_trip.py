@@ -16,7 +16,8 @@ from router.types.protobuf import PayloadCase
 from tests.acceptance.expected import from_board_units, in_board_units
 from tests.acceptance.payloads import WIRE, Sample, generated, sample
 from tests.acceptance.rover_map import ROUTER
-from tests.acceptance.site import ROOT, RouterProcess, Site, site, wait_until
+from tests.acceptance.site import RouterProcess, Site, site, wait_until
+from tests.tables import PROTOS
 from tests.wire.test_comms import OTHER_FIELDS, OTHER_NAMES
 
 AT_ONCE = 50
@@ -32,7 +33,7 @@ def table(place: Site, publishes: str, listens: str) -> dict[str, Any]:
     host, port = place.endpoints[NEAR].getsockname()
     return {
         "version": 1,
-        "envelope": {"protos": str(ROOT / "protos"), "message": "PBEnvelope", "oneof": "payload"},
+        "envelope": {"protos": str(PROTOS), "message": "PBEnvelope", "oneof": "payload"},
         "metrics": {"address": f"127.0.0.1:{place.metrics}"},
         "listen": {"all": {"address": f"{ROUTER}:{place.listen}", "receive_buffer": "4MiB"}},
         "endpoints": {NEAR: {"address": f"{host}:{port}", "kind": "tool"}},

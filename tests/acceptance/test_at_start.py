@@ -20,7 +20,7 @@ from tests.ports import free_port
 
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics: {{address: 127.0.0.1:{metrics}}}
 listen: {{rover: {{address: 127.0.0.5:{listen}}}}}
 endpoints:

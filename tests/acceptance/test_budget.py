@@ -11,7 +11,7 @@ from tests.engine.wire import LEN, tag, varint
 
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics: {{address: 127.0.0.1:{metrics}}}
 listen: {{rover: {{address: 127.0.0.5:{listen}}}}}
 endpoints:

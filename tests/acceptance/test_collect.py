@@ -19,7 +19,7 @@ from tests.acceptance.site import RouterProcess, Site, balance, key, site, total
 
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics: {{address: 127.0.0.1:{metrics}}}
 listen:
   rover: {{address: 127.0.0.5:{listen}, receive_buffer: 4MiB}}

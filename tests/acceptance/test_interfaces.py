@@ -30,7 +30,7 @@ from tests.namespaces import Computer, cable
 
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics: {{address: 127.0.0.1:9108}}
 listen:
   lan: {{address: 0.0.0.0:5000, interface: lan0}}

@@ -7,9 +7,10 @@ from pathlib import Path
 from tests.acceptance.expected import in_board_units
 from tests.acceptance.payloads import WIRE, generated, sample
 from tests.acceptance.ros_peer import RosPeer
-from tests.acceptance.site import ROOT, RouterProcess, Site, site, wait_until
+from tests.acceptance.site import RouterProcess, Site, site, wait_until
+from tests.tables import ROUTES
 
-LEGACY = ROOT / "routes" / "legacy.yaml"
+LEGACY = ROUTES / "legacy.yaml"
 DESTINATIONS = ("dst_a", "dst_b")
 TOPICS = {
     "imu_data": "comms/msg/ImuSensorInformation",

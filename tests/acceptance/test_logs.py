@@ -14,6 +14,7 @@ from tests.acceptance.conftest import Rover
 from tests.acceptance.payloads import WIRE, generated, sample
 from tests.acceptance.rover_map import topics_of
 from tests.acceptance.site import ROOT, RouterProcess, balance, key, site, total
+from tests.tables import ROUTES
 
 FLOOD = 10_000
 HANDFUL = 10
@@ -51,7 +52,7 @@ def test_a_value_that_a_mapping_cannot_take_is_told_with_the_line_of_the_table(w
 
     [line] = router.events("message dropped")
     assert (line["route"], line["target"], line["reason"]) == ("gps_info", "gps/vel", "mapping_error")
-    rover_yaml = ROOT / "routes" / "rover.yaml"
+    rover_yaml = ROUTES / "rover.yaml"
     number = next(n for n, text in enumerate(rover_yaml.read_text().splitlines(), 1) if "speed * sin(" in text)
     frames = [text.strip() for text in line["exception"].splitlines() if text.strip().startswith("File ")]
     assert any("rover.yaml" in frame and f"line {number}," in frame for frame in frames), line["exception"]

@@ -19,7 +19,7 @@ from tests.edges.recorder_rig import imu
 
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics: {{address: 127.0.0.1:{metrics}}}
 record: {{directory: recordings, last: 60s}}
 listen:

@@ -140,7 +140,7 @@ def test_what_is_repaired_and_then_rejected_is_counted_as_both(
 
 NARROW = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics:
   address: 127.0.0.1:{metrics}
 listen:

@@ -34,7 +34,7 @@ HOSTS = ("127.0.0.5", "127.0.0.6")
 
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 listen: {{{listeners}}}
 endpoints:
   driving_board: {{address: "127.0.0.222:{board}", kind: board}}

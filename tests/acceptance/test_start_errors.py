@@ -83,7 +83,7 @@ def test_comms_interfaces_that_are_not_those_of_the_table(place: Site) -> None:
     (package / "__init__.py").write_text(OTHER_COMMS)
     topic = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 listen:
   rover:
     address: 127.0.0.5:{listen}

@@ -23,6 +23,7 @@ from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.site import RouterProcess, key, wait_until
 from tests.acceptance.test_gateway import ZENOH, Scene, repeating, scene, twist
 from tests.ports import free_port
+from tests.tables import PROTOS
 from tests.test_docs import examples
 
 KEY = "rovers/rover_1"
@@ -155,7 +156,7 @@ def connecting(port: int, config: str = "") -> str:
     """A table with nothing but a gateway that connects to another one with the same key."""
     return f"""\
 version: 1
-envelope: {{protos: {Path(__file__).parents[2] / "protos"}, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
 node: {{name: second}}
 listen: {{here: {{address: 127.0.0.1:{free_port()}}}}}
 routes: {{}}

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+from tests.tables import ROUTES
 
 BASE = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
 TABLE = """\
@@ -61,7 +61,7 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
 def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_element(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    rover = asset("routes/rover.yaml")
+    rover = ROUTES / "rover.yaml"
     told = explained(capsys, rover, "detected_object", "--no-code")
     places = re.findall(r"^detected_object_from_ros\w*: .*:(\d+):7\)$", told, re.MULTILINE)
     written = rover.read_text(encoding="utf-8").splitlines()

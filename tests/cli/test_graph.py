@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
+from tests.tables import ROUTES
 
-ROVER = asset("routes") / "rover.yaml"
+ROVER = ROUTES / "rover.yaml"
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pytest
 
 from router.cli import BAD_TABLE, BAD_USAGE, BROKEN_PIPE, INTERRUPTED, VERBS, main, validate
 from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError
+from tests.tables import ROUTES
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -94,13 +95,13 @@ def test_a_reader_that_leaves_early_is_no_reason_to_complain() -> None:
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
 def test_a_caller_may_close_the_standard_streams(closed: str) -> None:
-    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-m", "router", "validate", "routes"]
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-m", "router", "validate", str(ROUTES)]
     subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=True)
 
 
 def test_validate_imports_neither_ros_nor_what_a_person_looks_at() -> None:
     script = "import sys; from router.cli import main; main(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
-    command = [sys.executable, "-c", script, "validate", "routes"]
+    command = [sys.executable, "-c", script, "validate", str(ROUTES)]
     result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
     unwanted = {"rclpy", "rich", "structlog", "prometheus_client", "router.runtime", "router.cli.run"}
     assert unwanted.isdisjoint(result.stderr.split())

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.cli import main
+from tests.tables import PROTOS
 
 PROTO = """\
 syntax = "proto3";
@@ -89,7 +89,7 @@ def test_unknown_envelope_is_refused(proto: Path, capsys: pytest.CaptureFixture[
 
 
 def test_rovers_lock_is_as_the_command_writes_it(tmp_path: Path) -> None:
-    protos = shutil.copytree(asset("protos"), tmp_path / "protos")
+    protos = shutil.copytree(PROTOS, tmp_path / "protos")
     lock_file = protos / "envelope.lock.json"
     committed = lock_file.read_text()
     lock_file.unlink()

@@ -18,9 +18,10 @@ from router.table import shape
 from router.tools.table_tests import prove
 from router.tools.table_tests_reading import read_test_file
 from router.tools.table_tests_shape import SCHEMA
+from tests.tables import PROTOS, RIG, ROUTES
 
 REPOSITORY = Path(__file__).parents[2]
-TESTS = REPOSITORY / "routes" / "rover.test.yaml"
+TESTS = ROUTES / "rover.test.yaml"
 DEFINITIONS = Definitions()
 
 
@@ -30,8 +31,8 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "routes"
     folder.mkdir()
     for name in ("rover.yaml", "rover.test.yaml"):
-        shutil.copy(REPOSITORY / "routes" / name, folder)
-    (tmp_path / "protos").symlink_to(asset("protos"))
+        shutil.copy(ROUTES / name, folder)
+    (tmp_path / "protos").symlink_to(PROTOS)
     monkeypatch.chdir(tmp_path)
     findings._lines.cache_clear()  # which knows other files under these relative names
     return folder / "rover.yaml"
@@ -46,7 +47,7 @@ def change(table: Path, old: str, new: str) -> None:
 def test_the_tests_of_the_rover_pass_and_cover_its_table_completely(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(REPOSITORY)
+    monkeypatch.chdir(RIG)
     assert main(["test", "routes", "--coverage"]) == OK
     out = capsys.readouterr().out
     covered = re.search(r"rover\.yaml: covered (\d+) of (\d+) routes, (\d+) of (\d+) targets, (\d+) of (\d+) exp", out)
@@ -202,7 +203,7 @@ def test_examples_of_the_documentation_pass(tmp_path: Path, rover: Path) -> None
     text = (REPOSITORY / "docs" / "testing-tables.md").read_text(encoding="utf-8")
     examples = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     listed = tmp_path / "listed.yaml"
-    listed.write_text(LISTED.replace("PROTOS", str(asset("protos"))))
+    listed.write_text(LISTED.replace("PROTOS", str(PROTOS)))
     for number, example in enumerate(examples):
         table = listed if "max_rate" in example or "incomplete" in example else rover
         path = tmp_path / f"example-{number}.test.yaml"

@@ -35,14 +35,6 @@ def test_gateways_are_counted_where_there_are_some(routes: Path, capsys: pytest.
     assert capsys.readouterr().out.endswith("2 endpoints, 1 gateway)\n")
 
 
-def test_the_tables_of_the_repository_have_no_errors(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(REPOSITORY)
-    assert main(["validate", "routes"]) == OK
-    assert "routes/rover.yaml: ok (" in capsys.readouterr().out
-
-
 def test_a_folder_stands_for_its_tables(routes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("second.yml", "x.test.yaml", ".hidden.yaml", "notes.txt", "below/third.yaml"):
         (routes / name).parent.mkdir(exist_ok=True)

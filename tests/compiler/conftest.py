@@ -12,8 +12,8 @@ import pytest
 from router.compiler import Checked, check_table
 from router.compiler.definitions import Definitions
 from router.compiler.program import Program
+from tests.tables import PROTOS, ROUTES
 
-ROUTES = Path(__file__).parents[2] / "routes"
 HEAD = """\
 version: 1
 envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
@@ -52,7 +52,7 @@ def check_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, definitions: Def
     linecache.clearcache()
 
     def check(routes: str, node: str = "{name: router}", listen: str = LISTEN, endpoints: str = ENDPOINTS) -> Checked:
-        head = HEAD.format(protos=ROUTES.parent / "protos", node=node, listen=listen, endpoints=endpoints)
+        head = HEAD.format(protos=PROTOS, node=node, listen=listen, endpoints=endpoints)
         text = head + textwrap.dedent(routes)
         (tmp_path / "table.yaml").write_text(text, encoding="utf-8")
         return check_table(Path("table.yaml"), {}, definitions)

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from router.assets import asset
 from router.compiler.cdr import CdrReads
 from router.compiler.expressions import ParsedReads, Reads, Scope
 from router.compiler.mapping import build
@@ -21,6 +20,7 @@ from router.table.model import EnvelopeSettings, FieldMap, Located
 from router.types.model import Field, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of
+from tests.tables import PROTOS
 
 Wire = tuple[ProtoSchema, Envelope]
 MakeEnvelope = Callable[[Any], bytes]
@@ -35,7 +35,7 @@ def made_wire() -> Wire:
 
 @cache
 def rover_wire() -> Wire:
-    return _wire(asset("protos"), "PBEnvelope")
+    return _wire(PROTOS, "PBEnvelope")
 
 
 def _wire(root: Path, name: str) -> Wire:

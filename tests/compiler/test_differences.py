@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.cli import BAD_TABLE, OK, main
 from router.compiler import Checked, check_table
 from router.compiler.differences import differences
+from tests.tables import ROUTES
 
-ROVER = asset("routes") / "rover.yaml"
-SIM = asset("routes") / "sim.yaml"
+ROVER = ROUTES / "rover.yaml"
+SIM = ROUTES / "sim.yaml"
 OLD = f"""\
 version: 1
 extends: {ROVER}
@@ -161,7 +161,7 @@ def test_a_record_that_is_new_is_told_with_its_folder_as_a_person_writes_it(
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "routes"
     folder.mkdir()
-    plain = f"version: 1\nextends: {asset('routes') / 'legacy.yaml'}\n"
+    plain = f"version: 1\nextends: {ROUTES / 'legacy.yaml'}\n"
     (folder / "old.yaml").write_text(plain)
     (folder / "new.yaml").write_text(plain + "record: {directory: ../recordings}\n")
     (found,) = differences(checked(folder / "old.yaml"), checked(folder / "new.yaml"))

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.assets import asset
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.compiler.route_map import NARROW, WIDE, Measures, route_map, shortened, spread
 from router.compiler.route_map_parts import PartKind, map_parts
 from router.table.model import ANY, RouteTable
+from tests.tables import PROTOS, ROUTES
 
 TABLES = ("rover.yaml", "legacy.yaml", "sim.yaml")
 
@@ -26,7 +26,7 @@ def table_of(path: Path) -> RouteTable:
 
 
 def program_of(name: str) -> Program:
-    program = check_table(asset("routes") / name).program
+    program = check_table(ROUTES / name).program
     assert program is not None
     return program
 
@@ -35,7 +35,7 @@ def hostile(tmp_path: Path) -> RouteTable:
     path = tmp_path / "hostile.yaml"
     path.write_text(f"""\
 version: 1
-envelope: {{protos: {asset("protos")}, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
 listen: {{all: {{address: "127.0.0.1:5000"}}}}
 endpoints: {{a: {{address: "127.0.0.1:6000", kind: tool}}}}
 routes:
@@ -50,7 +50,7 @@ routes:
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("measures", [WIDE, NARROW], ids=["wide", "narrow"])
 def test_no_box_overlaps_another_and_all_are_in_the_picture(name: str, measures: Measures) -> None:
-    drawing = route_map(table_of(asset("routes") / name), measures)
+    drawing = route_map(table_of(ROUTES / name), measures)
     for node in drawing.nodes:
         assert 0 <= node.x < node.x + node.width <= drawing.width
         assert 0 <= node.y < node.y + node.height <= drawing.height
@@ -61,7 +61,7 @@ def test_no_box_overlaps_another_and_all_are_in_the_picture(name: str, measures:
 
 @pytest.mark.parametrize("name", TABLES)
 def test_links_run_from_the_right_of_a_box_to_the_left_of_another(name: str) -> None:
-    drawing = route_map(table_of(asset("routes") / name))
+    drawing = route_map(table_of(ROUTES / name))
     nodes = {node.part.key: node for node in drawing.nodes}
     assert len(nodes) == len(drawing.nodes)
     for link in drawing.links:

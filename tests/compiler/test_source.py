@@ -15,7 +15,8 @@ from router.compiler.handlers import HandlerSource
 from router.compiler.source import Source
 from router.errors import SourceSpan
 from tests.compiler.compiling import Published
-from tests.compiler.conftest import ROUTES, CheckText
+from tests.compiler.conftest import CheckText
+from tests.tables import ROUTES
 
 SPAN = SourceSpan("table.yaml", 3, 5, 9)
 

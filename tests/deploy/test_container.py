@@ -14,6 +14,7 @@ import yaml
 
 from router.compiler import check_table
 from tests.deploy.prometheus_server import SCRAPED
+from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent.parent
 FOLDER = ROOT / "deploy/container"
@@ -51,7 +52,7 @@ def test_the_entry_point_is_a_program_that_bash_can_read() -> None:
 
 
 def test_health_is_asked_where_the_rovers_table_serves_it() -> None:
-    table = check_table(ROOT / "routes/rover.yaml").table
+    table = check_table(ROUTES / "rover.yaml").table
     assert table is not None
     assert table.metrics is not None
     host, _, port = SCRAPED.rpartition(":")

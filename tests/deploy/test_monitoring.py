@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,16 +15,19 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.sync.client import connect
 
+from router.compiler import check_table
+from router.tools.dashboard import dashboard
 from tests.acceptance.payloads import generated
 from tests.acceptance.rover_map import FLOWS
-from tests.acceptance.site import ROOT, ROVER, RouterProcess, Site, site, wait_until
+from tests.acceptance.site import ROVER, RouterProcess, Site, site, wait_until
 from tests.deploy.prometheus_server import PROGRAM, PrometheusServer
 from tests.deploy.promql import selectors
 from tests.deploy.test_prometheus import ALERTS, RECORDED
 from tests.ports import free_port
+from tests.tables import ROUTES
 
 MONITORED = (
-    ROVER.replace("tests/acceptance/patient.yaml", "routes/rover.yaml")
+    ROVER.replace("acceptance/patient.yaml", "rover/routes/rover.yaml")
     + """
 gateways:
   dashboard: {{transport: {{websocket: 127.0.0.1:@gateway}}}}
@@ -108,8 +110,9 @@ def prometheus(monitored: Monitored, tmp_path_factory: pytest.TempPathFactory) -
 
 def queries() -> list[str]:
     """All of the dashboard's."""
-    dashboard = json.loads((ROOT / "deploy/grafana/rover.json").read_text())
-    panels = [inner for panel in dashboard["panels"] for inner in (panel, *panel.get("panels", ()))]
+    program = check_table(ROUTES / "rover.yaml").program
+    assert program is not None
+    panels = [inner for panel in dashboard(program)["panels"] for inner in (panel, *panel.get("panels", ()))]
     return [target["expr"] for panel in panels for target in panel.get("targets", ())]
 
 

@@ -13,13 +13,14 @@ import pytest
 
 from router.compiler import check_table
 from tests.deploy.machine import Machine, hidden_by, machine
+from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent.parent
 UNITS = ROOT / "deploy" / "systemd"
 NAMES = ("rover-router.service", "rover-router.socket", "rover-router-hold.service")
 MOST_EXPOSED = 2.0
 ROUTER = f"{ROOT}/.venv/bin/router"
-SIM = f"{ROOT}/routes/sim.yaml"
+SIM = f"{ROUTES}/sim.yaml"
 METRICS = "curl -s 127.0.0.1:29108/metrics"
 SEND = f"{ROUTER} send ph_info ph_value=7 --table {SIM} --to rover --from sensor_board"
 BAD_TABLE = 78
@@ -46,7 +47,7 @@ def test_the_units_are_as_systemd_wants_them() -> None:
 
 
 def test_the_socket_has_the_addresses_of_the_rovers_table() -> None:
-    program = check_table(ROOT / "routes" / "rover.yaml", {}).program
+    program = check_table(ROUTES / "rover.yaml", {}).program
     assert program is not None
     text = (UNITS / "rover-router.socket").read_text()
     assert re.findall("^ListenDatagram=(.*)$", text, re.MULTILINE) == [str(each.address) for each in program.listeners]

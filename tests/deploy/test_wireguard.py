@@ -18,12 +18,13 @@ import pytest
 from router.compiler import check_table
 from tests.acceptance.site import ROOT, wait_until
 from tests.acceptance.two_networks import DRIVE, LAN, RADIO, Rover, attacker, rover_with_networks, udp
+from tests.tables import PROTOS, ROUTES
 
 KEYS = ROOT / "deploy" / "wireguard" / "keys.sh"
 STATION, ROVER = ("10.77.0.10", 9000), ("10.77.0.1", 5000)
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics: {{address: 127.0.0.1:9108}}
 listen:
   rover: {{address: 0.0.0.0:5000, interface: lan0}}
@@ -73,7 +74,7 @@ def test_keys_are_not_for_git() -> None:
 def test_the_rovers_tables_are_ready_for_the_tunnel(tmp_path: Path) -> None:
     """Each line that begins with `#name:` is taken in place of the one of that name."""
     for name in ("rover.yaml", "sim.yaml"):
-        lines = (ROOT / "routes" / name).read_text().replace("../protos", str(ROOT / "protos")).splitlines()
+        lines = (ROUTES / name).read_text().replace("../protos", str(PROTOS)).splitlines()
         prepared = {found[2] for line in lines if (found := re.match(r"( +)#([a-z]+): +{", line))}
         assert prepared >= {"rover", "radio"}
         kept = [line for line in lines if not any(re.match(f" +{name}: +{{", line) for name in prepared)]

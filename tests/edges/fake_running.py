@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 from prometheus_client.metrics_core import Metric as Family
 
@@ -14,15 +13,15 @@ from router.edges.metrics import BooksCollector
 from router.edges.mirror import Mirror
 from router.edges.running import ReloadResult
 from router.engine import MAX_DATAGRAM
+from tests.tables import ROUTES
 
-ROOT = Path(__file__).parents[2]
 RELOADED = ReloadResult(True, (), "nothing has changed")
 
 
 @cache
 def sim_program() -> Program:
     """Of routes/sim.yaml."""
-    program = check_table(ROOT / "routes" / "sim.yaml").program
+    program = check_table(ROUTES / "sim.yaml").program
     assert program is not None
     return program
 

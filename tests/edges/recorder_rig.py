@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-from router.assets import asset
 from router.edges.mirror import Seen
 from router.edges.recorder_channels import Channels
 from router.edges.recorder_chunk import Chunk
@@ -22,6 +21,7 @@ from router.errors import SourceSpan
 from router.table.model import Address, Endpoint, EndpointKind, Framing, Located, RecordSettings, RouteTable
 from router.tools.recording import Recorded, Recording
 from router.tools.wire import Wire, wire_of_protos
+from tests.tables import PROTOS
 
 SPAN = SourceSpan("table.yaml", 3)
 START = 1_790_000_000_000_000_000
@@ -32,7 +32,7 @@ MILLISECOND = 1_000_000
 
 @cache
 def wire() -> Wire:
-    return wire_of_protos(asset("protos"))
+    return wire_of_protos(PROTOS)
 
 
 def imu(accel_x: float = 1.5) -> bytes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import cast
 
 import pytest
@@ -22,17 +21,17 @@ from router.edges.diagnostics_findings import Level, Status
 from router.edges.metrics import BooksCollector
 from router.edges.ros_types import installed_class
 from router.edges.running import Running
+from tests.tables import ROUTES
 
 DiagnosticArray = installed_class("diagnostic_msgs/msg/DiagnosticArray")
 DiagnosticStatus = installed_class("diagnostic_msgs/msg/DiagnosticStatus")
 
-ROOT = Path(__file__).parents[2]
 SECOND = 10**9
 WALL = 1_800_000_000 * SECOND
 
 TABLE = """\
 version: 1
-extends: {root}/routes/rover.yaml
+extends: {routes}/rover.yaml
 endpoints:
   sensor_board: {{stale_after: 3s}}
   arm_board: {{stale_after: never}}
@@ -86,7 +85,7 @@ class Counting:
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Program:
     table = tmp_path_factory.mktemp("diagnostics") / "table.yaml"
-    table.write_text(TABLE.format(root=ROOT))
+    table.write_text(TABLE.format(routes=ROUTES))
     checked = check_table(table)
     assert checked.program is not None, [*map(str, checked.diagnostics)]
     return checked.program

@@ -24,8 +24,8 @@ from router.edges.running import Running
 from router.errors import SourceSpan, StartError
 from router.table.model import Address, Located
 from tests.edges.foxglove_client import PATIENCE, FoxgloveClient
+from tests.tables import PROTOS, ROUTES
 
-ROOT = Path(__file__).parents[2]
 SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
 LOOPBACK = Located(Address("127.0.0.1", 0), SPAN)
 PEER = ("192.168.0.30", 8)
@@ -70,7 +70,7 @@ def compiled(table: Path) -> Program:
 
 @pytest.fixture(scope="module")
 def program() -> Program:
-    return compiled(ROOT / "routes" / "rover.yaml")
+    return compiled(ROUTES / "rover.yaml")
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_trimmed_and_padded_datagrams_are_shown_and_what_is_no_payload_is_not(
 
 def test_listener_that_repairs_nothing_shows_nothing_that_it_rejects(tmp_path: Path) -> None:
     table = tmp_path / "table.yaml"
-    table.write_text(f"version: 1\nextends: {ROOT}/routes/rover.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
+    table.write_text(f"version: 1\nextends: {ROUTES}/rover.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
     router = Showing(compiled(table))
     brake = envelope(router.program, "manual_brake", brake=True)
     with (
@@ -176,7 +176,7 @@ def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
 ) -> None:
     """The same protos elsewhere, in which one message has a field more."""
     protos = tmp_path / "protos"
-    shutil.copytree(ROOT / "protos", protos)
+    shutil.copytree(PROTOS, protos)
     [file] = [path for path in protos.rglob("*.proto") if "message BasestationManualBrake" in path.read_text()]
     file.write_text(
         file.read_text().replace(
@@ -184,7 +184,7 @@ def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
         )
     )
     table = tmp_path / "table.yaml"
-    table.write_text(f"version: 1\nextends: {ROOT}/routes/rover.yaml\nenvelope: {{protos: {protos}}}\n")
+    table.write_text(f"version: 1\nextends: {ROUTES}/rover.yaml\nenvelope: {{protos: {protos}}}\n")
     before = dict(client.channels)
     client.subscribe("imu_info")
     router.wait_for(1)
@@ -238,7 +238,7 @@ def test_router_that_is_started_again_gets_its_port_back(router: Showing) -> Non
 
 
 def test_port_that_somebody_has_is_said_with_its_holder() -> None:
-    router = Showing(compiled(ROOT / "routes" / "rover.yaml"))
+    router = Showing(compiled(ROUTES / "rover.yaml"))
     with socket.create_server(("127.0.0.1", 0)) as holder:
         address = Located(Address("127.0.0.1", holder.getsockname()[1]), SPAN)
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: .*{address.value}: .*\(pid \d+\) has the port"):

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.compiler import check_table
 from tests.edges.recorder_rig import START, imu, recorded, seen
+from tests.tables import ROUTES
 
 PAGE = Path(__file__).parents[2] / "docs" / "recording.md"
 
@@ -33,7 +33,7 @@ def test_the_keys_of_the_table_have_the_defaults_that_are_shown(tmp_path: Path) 
     found = []
     for text in (example("yaml"), "record: {directory: ../recordings, continuous: true, last: 60s}\n"):
         path = tmp_path / "table.yaml"
-        path.write_text(f"extends: {asset('routes') / 'rover.yaml'}\n{text}")
+        path.write_text(f"extends: {ROUTES / 'rover.yaml'}\n{text}")
         checked = check_table(path)
         assert checked.table is not None
         assert checked.table.record is not None

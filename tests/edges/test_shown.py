@@ -10,7 +10,8 @@ from router.compiler import check_table
 from router.edges.shown import Known, first_field
 from router.engine import MAX_DATAGRAM
 from router.types.protobuf import PayloadCase
-from tests.edges.fake_running import ROOT, sim_program
+from tests.edges.fake_running import sim_program
+from tests.tables import ROUTES
 
 PROGRAM = sim_program()
 KNOWN = Known(PROGRAM.envelope, PROGRAM.table)
@@ -43,7 +44,7 @@ def test_what_is_longer_than_the_router_takes_has_no_payload() -> None:
 
 def test_zeros_are_repaired_where_the_listener_does_that(tmp_path: Path) -> None:
     table = tmp_path / "table.yaml"
-    table.write_text(f"version: 1\nextends: {ROOT}/routes/sim.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
+    table.write_text(f"version: 1\nextends: {ROUTES}/sim.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
     program = check_table(table).program
     assert program is not None
     exact = Known(program.envelope, program.table)
@@ -60,7 +61,7 @@ def test_senders_are_called_what_the_table_calls_them() -> None:
 def test_a_sender_is_called_what_the_listener_takes_it_for(tmp_path: Path) -> None:
     table = tmp_path / "table.yaml"
     table.write_text(
-        f"version: 1\nextends: {ROOT}/routes/sim.yaml\n"
+        f"version: 1\nextends: {ROUTES}/sim.yaml\n"
         "listen: {radio: {address: 127.0.0.6:25000, interface: lo}}\n"
         "endpoints: {basestation: {listener: radio}}\n"
     )

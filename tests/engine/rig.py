@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-from router.assets import asset
 from router.compiler import check_table
 from router.compiler.definitions import Definitions
 from router.compiler.program import Program
@@ -17,6 +16,7 @@ from router.engine.deadman import Deadman, feeder
 from router.engine.machine import Machine
 from router.engine.pacing import Pacer
 from tests.engine.ledger import Ledger
+from tests.tables import PROTOS
 
 HEAD = """version: 1
 envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
@@ -62,7 +62,7 @@ def _definitions() -> Definitions:
 def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = None) -> Program:
     """The compiled table. What is wrong with it fails the test; a case that is not covered is fine."""
     path = folder / "table.yaml"
-    path.write_text(head.replace("PROTOS", str(protos or asset("protos"))) + routes)
+    path.write_text(head.replace("PROTOS", str(protos or PROTOS)) + routes)
     checked = check_table(path, {}, _definitions())
     assert checked.program is not None, "\n".join(map(str, checked.diagnostics))
     return checked.program

@@ -9,10 +9,10 @@ from typing import cast
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from hypothesis import strategies as st
 
-from router.assets import asset
 from router.errors import SourceSpan
 from router.table.model import EnvelopeSettings, Located
 from router.types.protobuf import Envelope, find_envelope, load_protos
+from tests.tables import PROTOS
 
 VARINT, I64, LEN, I32 = 0, 1, 2, 5
 
@@ -23,7 +23,7 @@ UNKNOWN_NUMBER = 30
 @cache
 def rover_envelope() -> Envelope:
     here = SourceSpan(__file__)
-    schema = load_protos(asset("protos"))
+    schema = load_protos(PROTOS)
     names = Located("PBEnvelope", here), Located("payload", here)
     return find_envelope(schema, EnvelopeSettings(Located(schema.root, here), *names))
 

@@ -28,6 +28,7 @@ from router.gateway.surroundings import Surroundings
 from router.table.model import Address
 from router.types.model import MessageType
 from router.types.ros import ros_interfaces
+from tests.tables import PROTOS
 
 INTERFACES = ros_interfaces()
 TABLE = """\
@@ -44,7 +45,7 @@ gateways: {{{gateways}}}
 def program(folder: Path, gateways: str) -> Program:
     """Of a table with these gateways, a YAML flow mapping without its braces."""
     path = folder / "table.yaml"
-    text = TABLE.format(protos=Path(__file__).parents[2] / "protos", gateways=gateways)
+    text = TABLE.format(protos=PROTOS, gateways=gateways)
     path.write_text(text, encoding="utf-8")
     made = check_table(path, {}).program
     assert made is not None

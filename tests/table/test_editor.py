@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.table.language_server import LanguageServer
+from tests.tables import ROUTES
 
 SERVER = "yaml-language-server"
 VERSION = "1.19.2"
@@ -178,7 +179,7 @@ def test_gateways_alone_need_nothing_beside_them_and_routes_do(editor: LanguageS
     assert [item["message"] for item in found] == ['Missing property "envelope".']
 
 
-@pytest.mark.parametrize("table", sorted((REPOSITORY / "routes").glob("*.yaml")), ids=lambda path: path.name)
+@pytest.mark.parametrize("table", sorted(ROUTES.glob("*.yaml")), ids=lambda path: path.name)
 def test_the_tables_of_the_repository_are_underlined_nowhere(editor: LanguageServer, table: Path) -> None:
     assert editor.open(table, table.read_text(encoding="utf-8")) == []
 

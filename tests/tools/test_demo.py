@@ -19,8 +19,10 @@ from demo.children import Child
 from demo.expected import (
     FOUND,
     LOST,
+    basestations,
     command_topics,
     expected_arrivals,
+    halted_boards,
     inbound_topics,
     outbound_topics,
     page_of,
@@ -35,8 +37,17 @@ from router.tools.live import RouteRow, TargetRow, View
 from router.tools.places import open_udp
 from router.tools.wire import read_table
 from tests.ports import free_port
+from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent.parent
+MORE = """\
+extends: {routes}/sim.yaml
+endpoints:
+  pit: {{address: "127.0.0.12:29000", kind: basestation}}
+  stands: {{address: "127.0.0.13:29000", kind: basestation}}
+routes: {{manual_arm: {{source: [pit]}}}}
+gateways: {{laptop: {{transport: {{tcp: "127.0.0.1:28766"}}}}}}
+"""
 LASTING = "import time\nprint('{\"ready\": true}', flush=True)\ntime.sleep(60)\n"
 
 
@@ -71,7 +82,7 @@ def all_shown(table: RouteTable) -> Shown:
 
 @pytest.fixture(scope="module")
 def sim_table() -> RouteTable:
-    return read_table(ROOT / "routes" / "sim.yaml")
+    return read_table(ROUTES / "sim.yaml")
 
 
 def complaints(
@@ -137,7 +148,7 @@ def test_a_deadman_that_does_not_trip_or_release_fails(
     arrived = all_arrived(sim_table)
     arrived["changes"].remove({"at": at, "board": "driving_board", "state": state, "text": state})
     assert complaints(sim_table, all_heard(sim_table), arrived, seen()) == [
-        f"basestation was cut off from {LOST:.0f} to {FOUND:.0f} s, and {complaint}"
+        f"the link to basestation was cut from {LOST:.0f} to {FOUND:.0f} s, and {complaint}"
     ]
 
 
@@ -166,6 +177,16 @@ def test_what_a_page_did_not_show_fails(sim_table: RouteTable) -> None:
 
 def test_a_page_that_nobody_serves_shows_nothing() -> None:
     assert look(Address("127.0.0.1", free_port(kind=socket.SOCK_STREAM)), {"/imu/mag"}) == Shown()
+
+
+def test_a_table_with_more_basestations_and_gateways_is_judged_as_well(tmp_path: Path) -> None:
+    """All who command are cut off, for one of them alone would keep the deadmen from tripping; `stands` only looks."""
+    (tmp_path / "table.yaml").write_text(MORE.format(routes=ROUTES))
+    table = read_table(tmp_path / "table.yaml")
+    assert basestations(table) == ["basestation", "pit"]
+    assert halted_boards(table) == {"driving_board", "arm_board"}
+    others_first = replace(table, gateways=dict(reversed([*table.gateways.items()])))
+    assert page_of(others_first) == page_of(table) == Address("127.0.0.1", 28765)
 
 
 def test_silence_of_the_witnesses_fails(sim_table: RouteTable) -> None:

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parent.parent.parent
 
 TABLE = """\
 version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
 metrics: {{address: 127.0.0.1:{metrics}}}
 listen: {{rover: {{address: "127.0.0.1:{listen}", receive_buffer: {buffer}}}}}
 endpoints:

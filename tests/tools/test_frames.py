@@ -2,9 +2,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from router.assets import asset
 from router.tools.frames import TIMEOUT, Frames, is_part
 from router.tools.wire import wire_of_protos
+from tests.tables import PROTOS
 
 
 def part(frame_id: int, total_count: int, index: int) -> SimpleNamespace:
@@ -39,5 +39,5 @@ def test_a_part_of_no_possible_frame_is_astray() -> None:
 
 
 def test_parts_are_known_by_their_fields() -> None:
-    cases = wire_of_protos(asset("protos")).envelope.cases
+    cases = wire_of_protos(PROTOS).envelope.cases
     assert [name for name, case in cases.items() if is_part(case.type)] == ["detected_object"]

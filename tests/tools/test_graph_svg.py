@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.compiler import check_table
 from router.compiler.route_map import route_map
 from router.table.model import RouteTable
 from router.tools.graph_svg import svg
+from tests.tables import PROTOS, ROUTES
 
 SVG = "{http://www.w3.org/2000/svg}"
 HOSTILE = """\
@@ -29,10 +29,10 @@ routes:
 
 @pytest.fixture(params=["rover.yaml", "hostile"])
 def table(request: pytest.FixtureRequest, tmp_path: Path) -> RouteTable:
-    path = asset("routes") / request.param
+    path = ROUTES / request.param
     if request.param == "hostile":
         path = tmp_path / "hostile.yaml"
-        path.write_text(HOSTILE.format(protos=asset("protos")))
+        path.write_text(HOSTILE.format(protos=PROTOS))
     table = check_table(path).table
     assert table is not None
     return table

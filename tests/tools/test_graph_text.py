@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.compiler import check_table
 from router.compiler.route_map_parts import map_parts
 from router.table.model import RouteTable
 from router.tools.graph_text import dot, mermaid
+from tests.tables import PROTOS, ROUTES
 
 DOT = shutil.which("dot")
 HOSTILE = """\
@@ -30,10 +30,10 @@ routes:
 
 @pytest.fixture(params=["rover.yaml", "legacy.yaml", "sim.yaml", "hostile"])
 def table(request: pytest.FixtureRequest, tmp_path: Path) -> RouteTable:
-    path = asset("routes") / request.param
+    path = ROUTES / request.param
     if request.param == "hostile":
         path = tmp_path / "hostile.yaml"
-        path.write_text(HOSTILE.format(protos=asset("protos")))
+        path.write_text(HOSTILE.format(protos=PROTOS))
     table = check_table(path).table
     assert table is not None
     return table
@@ -62,7 +62,7 @@ def test_mermaid_has_a_line_for_every_part_and_tie(table: RouteTable) -> None:
 @pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")
 def test_a_condition_is_shown_as_it_is_written_on_one_line(tmp_path: Path) -> None:
     path = tmp_path / "hostile.yaml"
-    path.write_text(HOSTILE.format(protos=asset("protos")))
+    path.write_text(HOSTILE.format(protos=PROTOS))
     table = check_table(path).table
     assert table is not None
     drawn = subprocess.run([str(DOT), "-Tsvg"], input=dot(table, ""), capture_output=True, text=True, check=True)

@@ -1,23 +1,22 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from router.assets import asset
 from router.tools.models import moment
 from router.tools.payload_model import PayloadModel
 from router.tools.wire import Wire, wire_of_protos
 from router.types.protobuf import PayloadCase
+from tests.tables import PROTOS
 
 EPOCH = 1_700_000_000.0
 
 
 @pytest.fixture(scope="module")
 def rover() -> Wire:
-    return wire_of_protos(Path(asset("protos")))
+    return wire_of_protos(PROTOS)
 
 
 def sequence(case: PayloadCase, seed: int, times: tuple[float, ...] = (0.0, 0.5, 1.0)) -> list[Any]:

@@ -15,6 +15,7 @@ from router.tools import recording_tap as module
 from router.tools.recording_tap import TapRecording
 from tests.edges.recorder_rig import again, imu, read, seen, table, wire
 from tests.ports import free_port
+from tests.tables import RIG
 
 TABLE = table()
 BATCH = seen(imu(1), b"bad", imu(2))
@@ -54,7 +55,10 @@ def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [[], ["--last"]])
-def test_a_router_that_does_not_run_is_told(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_router_that_does_not_run_is_told(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(RIG)
     url = f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
     assert main(["record", *words, "--url", url]) == 1
     assert f"router record: no router answers at {url}" in capsys.readouterr().err

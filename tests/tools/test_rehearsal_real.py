@@ -8,9 +8,6 @@ from collections import Counter
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-import pytest
-
-from router.assets import asset
 from router.compiler import check_table
 from router.compiler.definitions import Definitions
 from router.runtime import Router
@@ -22,6 +19,7 @@ from router.tools.table_tests_running import Runner
 from router.tools.table_tests_words import Happened
 from router.tools.wire import Wire, payload
 from tests.ports import free_port
+from tests.tables import PROTOS, ROUTES
 
 BOARD = ("127.0.0.30", 0)
 TABLE = """
@@ -69,7 +67,7 @@ def test_rehearsal_sends_and_counts_what_the_router_does(tmp_path: Path) -> None
         listen = free_port()
         path = tmp_path / "table.yaml"
         ports = {"basestation": basestation.getsockname()[1], "recorder": recorder.getsockname()[1]}
-        path.write_text(TABLE.format(protos=asset("protos"), listen=listen, **ports))
+        path.write_text(TABLE.format(protos=PROTOS, listen=listen, **ports))
         program = check_table(path).program
         assert program is not None
         given = datagrams(Wire(program.envelope), 200)
@@ -91,9 +89,8 @@ def test_rehearsal_sends_and_counts_what_the_router_does(tmp_path: Path) -> None
         assert len(kinds) >= 5
 
 
-@pytest.mark.parametrize("tests", ["routes/rover.test.yaml"])
-def test_code_with_probes_does_what_it_does_without(tests: str) -> None:
-    file = read_test_file(asset(tests), Definitions())
+def test_code_with_probes_does_what_it_does_without() -> None:
+    file = read_test_file(ROUTES / "rover.test.yaml", Definitions())
     assert file.checked.program is not None
     seen: list[list[Happened]] = []
     for program in (file.checked.program, Coverage.of(file).program):

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.cli import main
 from router.tools import UsageError
 from router.tools.recording import Recorded, Recording
 from router.tools.replaying import on_time, parse_rate
 from tests.edges.recorder_rig import MILLISECOND, START, imu, recorded, seen
 from tests.ports import free_port
+from tests.tables import PROTOS
 
 BOARD, STRANGER = ("127.0.6.30", 40001), ("127.0.6.99", 40002)
 ELSEWHERE = ("198.51.100.7", 5000)
@@ -55,7 +55,7 @@ def received(receiver: socket.socket, count: int) -> list[tuple[bytes, str]]:
 
 def table(folder: Path, port: int, listener: str = "rover") -> str:
     path = folder / "table.yaml"
-    path.write_text(TABLE.format(protos=asset("protos"), port=port, listener=listener))
+    path.write_text(TABLE.format(protos=PROTOS, port=port, listener=listener))
     return str(path)
 
 

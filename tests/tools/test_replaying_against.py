@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from router.assets import asset
 from router.cli import main
 from router.edges.mirror import Seen
 from router.tools.recording import Recording
 from router.tools.replaying_against import Against
 from tests.edges.recorder_rig import MILLISECOND, START, imu, recorded, seen, wire
 from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, program
+from tests.tables import PROTOS
 
 FORWARD = "  imu_info: {source: sensor_board, destinations: [basestation]}\n"
 TOPIC = """\
@@ -59,7 +59,7 @@ class Compared:
     ) -> None:
         recorded(folder / "it.mcap", *batches())
         for name, text in (("old", old_head + old), ("new", new_head + new)):
-            (folder / f"{name}.yaml").write_text(text.replace("PROTOS", str(asset("protos"))))
+            (folder / f"{name}.yaml").write_text(text.replace("PROTOS", str(PROTOS)))
         words = [str(folder / "it.mcap"), "--table", str(folder / "old.yaml"), "--against", str(folder / "new.yaml")]
         self.code = main(["replay", *words])
         captured = capsys.readouterr()

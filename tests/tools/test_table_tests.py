@@ -7,7 +7,6 @@ from textwrap import dedent, indent
 
 import pytest
 
-from router.assets import asset
 from router.compiler.definitions import Definitions
 from router.errors import Code, Diagnostic, TableError
 from router.tools.table_tests import find_test_files, prove
@@ -17,6 +16,7 @@ from router.tools.table_tests_model import TableTestFile
 from router.tools.table_tests_reading import read_test_file
 from router.tools.table_tests_shown import offset
 from tests.engine.rig import HEAD, HEAD_OF_LISTENERS
+from tests.tables import PROTOS
 
 DEFINITIONS = Definitions()
 IMU = """
@@ -50,7 +50,7 @@ detected_object:
 
 def written(folder: Path, routes: str, tests: str, head: str = HEAD) -> TableTestFile:
     """`tests` are those of a test file, beside a table with these routes."""
-    table = head.replace("PROTOS", str(asset("protos"))) + indent(dedent(routes), "  ")
+    table = head.replace("PROTOS", str(PROTOS)) + indent(dedent(routes), "  ")
     (folder / "table.yaml").write_text(table)
     path = folder / "table.test.yaml"
     path.write_text("tests:\n" + indent(dedent(tests), "  "))

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.errors import Diagnostic, SourceSpan, TableError
 from router.table.model import EnvelopeSettings, Located
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
+from tests.tables import PROTOS
 
 Write = Callable[[Mapping[str, str]], Path]
 
@@ -64,7 +64,7 @@ def settings(root: Path, message: str = "Envelope", oneof: str = "payload") -> E
 
 @pytest.fixture(scope="session")
 def rover_schema() -> ProtoSchema:
-    return load_protos(asset("protos"))
+    return load_protos(PROTOS)
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.types.protobuf import Envelope, ProtoSchema, load_protos
 from router.types.sizes import largest_encoding
+from tests.tables import PROTOS
 
 Write = Callable[[Mapping[str, str]], Path]
 
@@ -50,7 +50,7 @@ def our_sizes(schema: ProtoSchema) -> dict[str, int]:
 def test_the_rovers_messages_are_as_large_as_nanopb_says(
     rover_schema: ProtoSchema, rover_envelope: Envelope, tmp_path: Path
 ) -> None:
-    expected = nanopb_sizes(asset("protos"), tmp_path)
+    expected = nanopb_sizes(PROTOS, tmp_path)
     assert our_sizes(rover_schema) == expected
     assert rover_envelope.max_size == expected["PBEnvelope"]
 

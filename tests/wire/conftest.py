@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from router.assets import asset
 from router.errors import SourceSpan
 from router.table.model import EnvelopeSettings, Located
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
+from tests.tables import PROTOS
 
 _HERE = SourceSpan(__file__)
 
 
 @pytest.fixture(scope="session")
 def schema() -> ProtoSchema:
-    return load_protos(asset("protos"))
+    return load_protos(PROTOS)
 
 
 @pytest.fixture(scope="session")
