@@ -160,7 +160,8 @@ def test_protos_are_the_routers_own_unless_the_table_has_some(tmp_path: Path) ->
         "routes: {imu_info: {ignore: not here}}\n"
     )
     table, findings = load_table(path)
-    assert table is not None and table.envelope is not None
+    assert table is not None
+    assert table.envelope is not None
     assert (table.envelope.protos.value, findings) == (asset("protos"), [])
 
 
