@@ -72,7 +72,7 @@ def check_table(
         return Checked(path, sorted_findings(findings))
     definitions = definitions or Definitions()
     try:
-        schema = definitions.protos(table.envelope.protos.value, table.envelope.protos.span)
+        schema = definitions.protos(table.envelope)
         envelope = find_envelope(schema, table.envelope)
     except TableError as error:
         return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
@@ -83,7 +83,8 @@ def check_table(
     own_type = lookup.ros_type(own) if own else None
     findings = [
         *findings,
-        *check_lock(schema, envelope),
+        *schema.warnings,
+        *check_lock(schema, envelope, table.envelope.lock),
         *network_findings(table),
         *lookup.findings,
         *clash_findings(table),

@@ -151,9 +151,18 @@ def _is_group(entry: Entry | None) -> bool:
 
 def _envelope(entry: Entry) -> EnvelopeSettings:
     settings = mapping(entry.value)
-    protos = text(settings, "protos")
-    folder = Path(protos.span.file).absolute().parent / protos.value
-    return EnvelopeSettings(Located(folder, protos.span), text(settings, "message"), text(settings, "oneof"))
+    lock = optional_text(settings, "lock")
+    return EnvelopeSettings(
+        _beside(text(settings, "protos")),
+        text(settings, "message"),
+        text(settings, "oneof"),
+        _beside(lock) if lock else None,
+    )
+
+
+def _beside(path: Located[str]) -> Located[Path]:
+    """A path relative to the file that names it."""
+    return Located(Path(path.span.file).absolute().parent / path.value, path.span)
 
 
 def _node(entry: Entry) -> NodeSettings:

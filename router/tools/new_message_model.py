@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from router.compiler import Checked
 from router.table.model import RouteTable
-from router.types.protobuf import Envelope, ProtoSchema
+from router.types.protobuf import Envelope, ProtoSchema, load_protos
 
 SCALARS = {
     "bool": "bool", "float": "float32", "double": "float64", "int32": "int32", "int64": "int64", "uint32": "uint32",
@@ -75,9 +75,10 @@ class Site:
 
 def site_of(checked: Checked, messages: Path) -> Site:
     """`checked` is a table without errors."""
-    if checked.table is None or checked.schema is None or checked.envelope is None:
+    if checked.table is None or checked.envelope is None:
         raise ValueError(f"{checked.path} has errors")
-    return Site(checked.table, checked.schema, checked.envelope, messages)
+    schema = load_protos(checked.table.envelope, with_others=True)  # a field's type may be in a file of its own
+    return Site(checked.table, schema, checked.envelope, messages)
 
 
 def prefix_of(board: str) -> str:

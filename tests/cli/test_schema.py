@@ -70,7 +70,7 @@ def test_conflict_is_refused_and_nothing_written(proto: Path, capsys: pytest.Cap
     assert lock() == 78
     assert capsys.readouterr().out == (
         "motor.proto:3:15: error[wire-number-conflict]: Motor.rpm has number 3 instead of 1; "
-        "the lock says `float rpm = 1`\n"
+        "the lock says `float rpm = 1`; if it is intended, `router schema lock --protos . --accept Motor.rpm`\n"
         "    3 |   float rpm = 3;\n"
         "      |               ^\n"
     )

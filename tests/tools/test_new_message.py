@@ -76,7 +76,7 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
     assert main(["new", *RADIATION, *FIELDS]) == OK
     new = added(before, contents(site))
     lock = new.pop("protos/envelope.lock.json")
-    assert '        "27": "SensorBoardRadiationInfo radiation_info"' in lock
+    assert '        "27": "oneof payload: SensorBoardRadiationInfo radiation_info"' in lock
     assert new.pop("protos/components/sensor_board/radiation.proto") == [
         "// Radiation info from the sensor board.",
         'syntax = "proto3";',
@@ -338,7 +338,7 @@ def test_what_is_interrupted_while_it_is_checked_is_taken_back(site: Path, monke
 def test_a_number_that_was_given_out_once_stays_taken(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lock = site / "protos/envelope.lock.json"
     text = lock.read_text(encoding="utf-8")
-    was = '"26": "BasestationManualBrake manual_brake"'
+    was = '"26": "oneof payload: BasestationManualBrake manual_brake"'
     lock.write_text(text.replace(was, f'{was},\n        "27": "Gone gone_info"'), encoding="utf-8")
     envelope = site / "protos/components/common/envelope.proto"
     declared = envelope.read_text(encoding="utf-8")

@@ -49,7 +49,7 @@ def test_hash_changes_with_content_and_name_of_protos_and_options(load: Load) ->
 
 def test_message_class_has_a_pool_of_its_own(write: Write) -> None:
     root = write({"a.proto": ENVELOPE})
-    first, second = load_protos(root), load_protos(root)
+    first, second = load_protos(settings(root)), load_protos(settings(root))
     message = first.message_class("Imu")(x=1.5)
     assert second.message_class("Imu").FromString(message.SerializeToString()) != message
     assert second.message_class("Imu") is not first.message_class("Imu")
@@ -87,10 +87,10 @@ def test_envelope_size_counts_what_stands_beside_the_oneof(load: Load) -> None:
     assert find_envelope(load({"a.proto": text}), settings(Path())).max_size == 7 + 2 + 5
 
 
-def test_envelope_in_a_package_is_found_by_short_name(load: Load) -> None:
-    schema = load({"a.proto": ENVELOPE.replace("message Imu", "package rover;\nmessage Imu")})
-    assert find_envelope(schema, settings(Path())).name == "rover.Envelope"
-    assert find_envelope(schema, settings(Path(), "rover.Envelope")).name == "rover.Envelope"
+def test_envelope_in_a_package_is_found_by_short_name(write: Write) -> None:
+    root = write({"a.proto": ENVELOPE.replace("message Imu", "package rover;\nmessage Imu")})
+    assert load_protos(settings(root)).envelope == "rover.Envelope"
+    assert load_protos(settings(root, "rover.Envelope")).envelope == "rover.Envelope"
 
 
 @pytest.mark.parametrize(
@@ -107,10 +107,10 @@ def test_envelope_in_a_package_is_found_by_short_name(load: Load) -> None:
         ("Imu", "payload", "table.yaml:4:10: error[bad-value]: Imu has no oneof 'payload'"),
     ],
 )  # fmt: skip
-def test_wrong_name_in_the_table_is_a_finding_there(load: Load, message: str, oneof: str, finding: str) -> None:
-    schema = load({"a.proto": ENVELOPE})
+def test_wrong_name_in_the_table_is_a_finding_there(write: Write, message: str, oneof: str, finding: str) -> None:
+    named = settings(write({"a.proto": ENVELOPE}), message, oneof)
     with pytest.raises(TableError) as caught:
-        find_envelope(schema, settings(Path(), message, oneof))
+        find_envelope(load_protos(named), named)
     assert [str(found) for found in caught.value.diagnostics] == [finding]
 
 

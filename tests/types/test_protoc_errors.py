@@ -58,7 +58,7 @@ def proto(body: str) -> str:
         ),
         pytest.param(
             "message A {\n  Motr motor = 1;\n}",
-            'a.proto:3:3: error[bad-proto]: "Motr" is not defined',
+            "a.proto:3:3: error[bad-proto]: \"Motr\" is not defined; did you mean 'Motor'?",
             id="unknown type",
         ),
         pytest.param(
