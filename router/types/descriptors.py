@@ -37,7 +37,7 @@ def declared_type(field: FieldDescriptor) -> str:
         if field.type == FieldDescriptor.TYPE_GROUP:
             name = f"delimited {name}"
     elif field.enum_type is not None:
-        name = field.enum_type.full_name
+        name = f"enum {field.enum_type.full_name}"
     else:
         name = FieldDescriptorProto.Type.Name(FieldDescriptorProto.Type.ValueType(field.type))
         name = name.removeprefix("TYPE_").lower()

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from router.errors import Code, Diagnostic, TableError, did_you_mean, shown_path
 from router.table.model import EnvelopeSettings
 from router.types.proto_folder import Folder
 from router.types.proto_scan import declaring, reached, scan
+from router.types.protoc_errors import Homes
 
 _FURTHER_UP = 4
 _OF_PROTOBUF = "google/protobuf/"
 
 
-def envelope_file(folder: Folder, settings: EnvelopeSettings, homes: Mapping[str, str]) -> tuple[str, str]:
+def envelope_file(folder: Folder, settings: EnvelopeSettings, homes: Homes) -> tuple[str, str]:
     """The file that declares the envelope, and its full name there. `homes` are the files that the lock knows.
 
     Raises TableError when there is none or more than one, and when `protos` is the wrong folder.
@@ -26,12 +27,13 @@ def envelope_file(folder: Folder, settings: EnvelopeSettings, homes: Mapping[str
         raise TableError(_missing(folder, settings))
     rules: Sequence[Callable[[str, str], bool]] = (
         lambda _, name: "." in wanted and name == wanted,
-        lambda file, name: homes.get(name) == file,
+        lambda file, name: homes().get(name) == file,
         lambda _, name: name == wanted,
         lambda file, name: scan(folder.files[file]).is_top_level(name),
     )
     for rule in rules:
-        found = [each for each in found if rule(*each)] or found
+        if len(found) > 1:
+            found = [each for each in found if rule(*each)] or found
     if len(found) > 1:
         files = " and ".join(file for file, _ in found)
         message = f"several files declare a message '{wanted}': {files}"

@@ -153,7 +153,8 @@ def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
         names.setdefault(lock.message, current.message)
     messages = _renamed(lock.messages, names)
     for name in sorted(messages.keys() & current.messages):
-        oneofs = _renamed_oneofs(messages[name], current.messages[name])
+        if not (oneofs := _renamed_oneofs(messages[name], current.messages[name])):
+            continue
         entries = {replace(entry, oneof=oneofs.get(entry.oneof, entry.oneof)) for entry in messages[name].entries}
         messages[name] = replace(messages[name], entries=frozenset(entries))
         moved |= {f"{name}.{old}": f"{name}.{new}" for old, new in oneofs.items()}
@@ -180,6 +181,8 @@ def _without_package(name: str, messages: Container[str]) -> str:
 
 
 def _renamed(declared: Mapping[str, Declaration], names: Mapping[str, str]) -> dict[str, Declaration]:
+    if not names:
+        return dict(declared)
     renamed: dict[str, Declaration] = {}
     for name, declaration in declared.items():
         entries = set()
@@ -195,6 +198,8 @@ def _renamed(declared: Mapping[str, Declaration], names: Mapping[str, str]) -> d
 def _renamed_oneofs(locked: Declaration, current: Declaration) -> dict[str, str]:
     """From the name of a oneof that is gone to that of a new one with a member of it."""
     was = {entry.oneof for entry in locked.entries}
+    if was == {entry.oneof for entry in current.entries}:
+        return {}
     now = {entry.number: entry.oneof for entry in current.entries}
     renamed: dict[str, str] = {}
     for entry in by_number(locked):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
@@ -27,7 +28,7 @@ from router.types.proto_model import build_types
 from router.types.proto_scan import reached
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos
-from router.types.protoc_errors import findings_of
+from router.types.protoc_errors import Homes, findings_of
 from router.types.sizes import framed_size, largest_beside, largest_encoding
 
 MessageClass = type[Message]
@@ -131,7 +132,7 @@ def load_protos(settings: EnvelopeSettings, *, with_others: bool = False) -> Pro
     root = settings.protos.value.resolve()
     folder = read_folder(root, settings.protos.span)
     lock = lock_path(settings)
-    homes = _homes(lock)
+    homes = cache(partial(_homes, lock))  # read where there is something to blame
     file, envelope = envelope_file(folder, settings, homes)
     used = reached(file, folder.files) if folder.faults else {file}
     if faults := [finding for name in sorted(used) for finding in _faults(folder, name)]:
@@ -188,7 +189,7 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
     if not sound:
         return warnings, []
     complaints = check_protos(folder, compiled, sound)
-    warnings += map(_unused, findings_of(complaints, folder, {}))
+    warnings += map(_unused, findings_of(complaints, folder, dict))
     broken = {complaint.file for complaint in complaints}
     return warnings, [name for name in sound if name not in broken]
 
@@ -205,7 +206,7 @@ def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
     return ProtoSources(compiled.file, paths)
 
 
-def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Mapping[str, str]) -> list[Diagnostic]:
+def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Homes) -> list[Diagnostic]:
     """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
     names: dict[str, list[str]] = {}
     for file in compiled.file:
@@ -219,7 +220,7 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Mapp
         return findings
     sources = _sources(folder, compiled)
     for short, same in names.items():
-        first, *others = sorted(same, key=lambda name: name not in homes)
+        first, *others = sorted(same, key=lambda name: name not in homes())
         place = sources.span(first)
         hint = f"the other is at {place.file}:{place.line}; names must differ even in different packages"
         text = f"there are two messages '{short}'"
