@@ -189,7 +189,8 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
     if not sound:
         return warnings, []
     complaints = check_protos(folder, compiled, sound)
-    warnings += map(_unused, findings_of(complaints, folder, dict))
+    news = [complaint for complaint in complaints if complaint.file not in folder.faults]
+    warnings += map(_unused, findings_of(news, folder, dict))
     broken = {complaint.file for complaint in complaints}
     return warnings, [name for name in sound if name not in broken]
 
