@@ -235,7 +235,7 @@ class _Comparison:
             self._refuse(envelope.name, "", span, message, "name that one in the table")
         if names:
             old = min(names)
-            more = f" ({len(names)} names are others)" if len(names) > 1 else ""
+            more = f", and so for {len(names) - 1} more" if len(names) > 1 else ""
             self._add(span, f"the lock has {old} for what is {names[old]} now{more}", "the wire is the same; ")
         if lock.max_size != envelope.max_size and not self.conflicts:
             message = f"{envelope.name} takes up to {envelope.max_size} bytes, the lock says {lock.max_size}"

@@ -182,22 +182,26 @@ def _faults(folder: Folder, proto: str) -> list[Diagnostic]:
 
 
 def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnostic], list[str]]:
-    """Warnings of the files that were not compiled, and the `.proto` files among them that could be."""
+    """A warning for each file that was not compiled and has faults, and the `.proto` files among them without any."""
     unused = [faults for name, faults in folder.faults.items() if _proto_of(name) not in compiled]
-    warnings = [_unused(finding) for faults in unused for finding in faults]
+    warnings = [_unused(faults[0], len(faults)) for faults in unused]
     sound = [name for name in folder.protos if name not in compiled and name not in folder.faults]
     if not sound:
         return warnings, []
     complaints = check_protos(folder, compiled, sound)
     news = [complaint for complaint in complaints if complaint.file not in folder.faults]
-    warnings += map(_unused, findings_of(news, folder, dict))
+    files: dict[str, list[Diagnostic]] = {}
+    for finding in findings_of(news, folder, dict):
+        files.setdefault(finding.span.file, []).append(finding)
+    warnings += [_unused(findings[0], len(findings)) for findings in files.values()]
     broken = {complaint.file for complaint in complaints}
     return warnings, [name for name in sound if name not in broken]
 
 
-def _unused(finding: Diagnostic) -> Diagnostic:
-    """A fault of a file that is not compiled."""
-    message = f"the envelope does not import this file, and it is left out: {finding.message}"
+def _unused(finding: Diagnostic, count: int = 1) -> Diagnostic:
+    """The first fault of a file that is not compiled."""
+    more = f" (and {count - 1} more)" if count > 1 else ""
+    message = f"the envelope does not import this file, and it is left out: {finding.message}{more}"
     return replace(finding, code=Code.UNUSED_PROTO, message=message)
 
 

@@ -78,6 +78,8 @@ def _without_consequences(complaints: Sequence[Complaint], names: Container[str]
             continue
         if (member := _MEMBER_TAKEN.match(complaint.message)) and member["holder"] in twice:
             continue  # its message is a finding, and so would be all its fields
+        if (taken := _TYPE_TAKEN.match(complaint.message)) and taken["name"].rpartition(".")[0] in twice:
+            continue  # so too where the other message is in another file
         if (used := _NOT_IMPORTED.match(complaint.message)) and used["name"] in twice:
             continue  # it means the other message of that name
         if complaint.file in lacking and complaint.message.endswith(" is not defined."):

@@ -246,6 +246,25 @@ def test_a_type_that_several_messages_have_is_to_be_said_whose(site: Path, capsy
     assert main(["new", *RADIATION, "--fields", "side:Left.Side"]) == OK
 
 
+def test_the_type_of_a_field_may_be_in_a_file_that_nothing_imports_yet(site: Path) -> None:
+    proto = site / "protos/components/sensor_board/radiation_level.proto"
+    proto.write_text('syntax = "proto3";\nenum RadiationLevel { RADIATION_UNKNOWN = 0; }\n', encoding="utf-8")
+    assert main(["validate", "--strict", "routes/rover.yaml"]) == OK
+    assert main(["new", *RADIATION, "--fields", "level:RadiationLevel"]) == OK
+    text = (site / "protos/components/sensor_board/radiation.proto").read_text(encoding="utf-8")
+    assert 'import "components/sensor_board/radiation_level.proto";' in text
+    assert '"RADIATION_UNKNOWN"' in (site / "protos/envelope.lock.json").read_text(encoding="utf-8")
+
+
+def test_a_type_in_a_file_with_a_fault_is_missed_with_the_fault(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    proto = site / "protos/radiation_level.proto"
+    proto.write_text('syntax = "proto3";\nenum RadiationLevel { SENSOR_IDLE = 0; }\n', encoding="utf-8")
+    assert main(["new", *RADIATION, "--fields", "level:RadiationLevel"]) == BAD_USAGE
+    said = capsys.readouterr().err
+    assert "there is no type 'RadiationLevel' for 'level'" in said
+    assert "radiation_level.proto:2:23: warning[unused-proto]" in said
+
+
 @pytest.mark.parametrize(
     "stanza",
     [

@@ -223,7 +223,7 @@ def said(findings: Sequence[Diagnostic]) -> list[str]:
 
 def test_package_alone_keeps_the_wire(changed: Callable[..., list[Diagnostic]]) -> None:
     assert said(changed(*PACKAGE)) == [
-        "warning the lock has Envelope for what is rover.Envelope now (3 names are others)"
+        "warning the lock has Envelope for what is rover.Envelope now, and so for 2 more"
     ]
 
 
