@@ -62,7 +62,7 @@ def read_lock(path: Path) -> Lock | None:
     except json.JSONDecodeError as error:
         span = SourceSpan(shown_path(path), error.lineno, error.colno, error.colno + 1)
         if re.match("<{7}|={7}|>{7}", error.doc.split("\n")[error.lineno - 1]):
-            hint = "take one side, then run `router schema lock`, which adds what the other one had"
+            hint = "take one side; `router validate` then says how to record what the other one had"
             raise TableError([Diagnostic(span, Code.BAD_FILE, "an unresolved merge", hint)]) from None
         problem = error.msg
     except (OSError, ValueError, RecursionError) as error:

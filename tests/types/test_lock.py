@@ -392,7 +392,7 @@ def test_unresolved_merge_of_the_lock_says_so(write: Write, envelope: Find) -> N
     (finding,) = check_lock(schema, envelope(schema))
     assert str(finding) == (
         "envelope.lock.json:18:1: error[bad-file]: an unresolved merge; "
-        "take one side, then run `router schema lock`, which adds what the other one had"
+        "take one side; `router validate` then says how to record what the other one had"
     )
 
 
