@@ -3,8 +3,9 @@
 A number that changes its meaning is an error, since boards in the field keep the old one. What is merely
 new is a warning until `router schema lock` records it.
 
-The wire has no names of messages and packages. So a locked declaration that is gone is taken for the one of the same
-name in another package, and their members are compared.
+The wire has no names of packages and oneofs. So a locked declaration that is gone is taken for the one of the same
+name in another package, and their members are compared. A message or enum of another name is another one, whatever is
+in it: that it was only renamed cannot be told.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ def check_lock(schema: ProtoSchema, envelope: Envelope, named: Located[Path] | N
         message = "no lock file records the field numbers"
         return [Diagnostic(schema.span(envelope.name), Code.NOT_LOCKED, message, hint)]
     comparison = _Comparison(schema, envelope, lock)
-    conflicts = [conflict.finding for conflict in comparison.conflicts]
-    return sorted([*conflicts, *comparison.additions], key=lambda finding: finding.span)
+    errors = [conflict.finding for conflict in comparison.conflicts]
+    return sorted([*errors, *comparison.additions], key=lambda finding: finding.span)
 
 
 def conflicts(schema: ProtoSchema, envelope: Envelope) -> Sequence[Conflict]:
@@ -321,5 +322,5 @@ def _place(entry: Entry) -> str:
 
 
 def _shown(entry: Entry) -> str:
-    """As a `.proto` file writes it: `float ph_value = 1`."""
+    """As in a `.proto` file: `float ph_value = 1`, but with `enum` before the type of an enum."""
     return f"`{entry.type} {entry.name} = {entry.number}`".replace("` ", "`")
