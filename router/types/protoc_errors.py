@@ -80,9 +80,10 @@ def _without_consequences(complaints: Sequence[Complaint], names: Container[str]
             continue  # its message is a finding, and so would be all its fields
         if (taken := _TYPE_TAKEN.match(complaint.message)) and taken["name"].rpartition(".")[0] in twice:
             continue  # so too where the other message is in another file
-        if (used := _NOT_IMPORTED.match(complaint.message)) and used["name"] in twice:
+        used = _NOT_IMPORTED.match(complaint.message)
+        if used and used["name"] in twice:
             continue  # it means the other message of that name
-        if complaint.file in lacking and complaint.message.endswith(" is not defined."):
+        if complaint.file in lacking and (_NOT_DEFINED.match(complaint.message) or used):
             continue  # it would be, by the import
         if (imported := _IMPORT_FAILED.fullmatch(complaint.message)) and imported["name"] in names:
             continue  # that file's own errors are findings already
