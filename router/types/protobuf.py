@@ -160,7 +160,8 @@ def load_protos(settings: EnvelopeSettings, *, with_others: bool = False) -> Pro
 
 def lock_path(settings: EnvelopeSettings) -> Path:
     """The lock file of these protos: beside them unless the table says where."""
-    return settings.lock.value if settings.lock is not None else settings.protos.value.resolve() / LOCK_NAME
+    path = settings.lock.value if settings.lock is not None else settings.protos.value / LOCK_NAME
+    return path.resolve()
 
 
 def _homes(lock: Path) -> Mapping[str, str]:

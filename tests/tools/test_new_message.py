@@ -410,3 +410,14 @@ def test_where_there_is_no_table_nothing_is_written(
     assert main(["new", *RADIATION]) == BAD_TABLE
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_lock_may_be_elsewhere(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lock = (site / "protos/envelope.lock.json").rename(site / "wire.lock.json")
+    for table in (site / "routes/rover.yaml", site / "routes/legacy.yaml"):
+        text = table.read_text(encoding="utf-8")
+        table.write_text(text.replace("oneof: payload", "oneof: payload, lock: ../wire.lock.json"), encoding="utf-8")
+    assert main(["new", *RADIATION]) == OK
+    assert "changed  wire.lock.json" in capsys.readouterr().out
+    assert '"27": "oneof payload: SensorBoardRadiationInfo radiation_info"' in lock.read_text(encoding="utf-8")
+    assert not (site / "protos/envelope.lock.json").exists()
