@@ -71,9 +71,10 @@ class Code(enum.Enum):
     UNKNOWN_QOS_VALUE = ("unknown-qos-value", "A word that is no setting of ROS QoS.")
     # the wire definitions
     BAD_PROTO = ("bad-proto", "A `.proto` file does not compile, or declares what cannot be routed.")
+    UNUSED_PROTO = ("unused-proto", "A `.proto` file that the envelope does not import is broken, or clashes.")
     WIRE_NUMBER_CONFLICT = (
         "wire-number-conflict",
-        "A field number on the wire was reused, renumbered, retyped or renamed.",
+        "A field number was reused, renumbered, retyped or renamed, or the envelope is another message.",
     )
     DUPLICATE_MESSAGE = ("duplicate-message", "Two protobuf messages have one name.")
     NOT_LOCKED = ("not-locked", "`envelope.lock.json` does not record this yet: run `router schema lock`.")
@@ -121,7 +122,9 @@ class Code(enum.Enum):
         return Severity.WARNING if self in _WARNINGS else Severity.ERROR
 
 
-_WARNINGS = frozenset({Code.UNCOVERED_PAYLOAD_CASE, Code.UNUSED_LISTENER, Code.NOT_LOCKED, Code.NO_DEADMAN})
+_WARNINGS = frozenset(
+    {Code.UNUSED_PROTO, Code.UNCOVERED_PAYLOAD_CASE, Code.UNUSED_LISTENER, Code.NOT_LOCKED, Code.NO_DEADMAN}
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,8 @@ import functools
 import gc
 import os
 import random
+import re
+import shutil
 import socket
 import struct
 import threading
@@ -663,3 +665,32 @@ def test_a_gateway_in_a_zenoh_network_goes_on_unless_its_config_changes(site: Si
         wait_until(lambda: client_count(router) == 1, "its turn")
         conflicts = [value for name, _, value in router.samples() if name == "router_gateway_key_conflicts_total"]
         assert set(conflicts) == {0}
+
+
+def test_a_reload_agrees_with_validate_about_stray_protos_and_a_lock_elsewhere(site: Site) -> None:
+    protos, lock = site.folder / "protos", site.folder / "wire.lock.json"
+    shutil.copytree(PROTOS, protos)
+    (protos / "envelope.lock.json").rename(lock)
+    own = f"envelope: {{protos: protos, message: PBEnvelope, oneof: payload, lock: {lock.name}}}"
+
+    def write(routes: str) -> None:
+        path = site.write(routes)
+        path.write_text(re.sub("envelope:.*", own, path.read_text()))
+        let_rest(path)
+
+    with site.router(PH) as router:
+        write(PH)
+        assert router.reload().ok
+        assert lock in watched_files(router.program.table)
+        (protos / "stray.proto").write_text("<<<<<<< HEAD\n")
+        assert router.reload().ok
+        text = lock.read_text()
+        lock.write_text(text.replace("float ph_value", "double ph_value"))
+        assert router.reload().text == "the table has 1 error"
+        lock.write_text(text)
+        assert router.reload().ok
+        (protos / "stray.proto").unlink()
+        lock.unlink()
+        assert router.reload().text == "the table has 1 error"
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)

@@ -16,7 +16,7 @@ import pytest
 
 from router.edges.ros_environment import SHM, obstacles, uses_shared_memory
 from tests.ports import free_port
-from tests.tables import PROTOS
+from tests.tables import PROTOS, ROUTES
 
 ROOT = Path(__file__).parent.parent
 TABLE = """\
@@ -229,9 +229,9 @@ def test_what_a_domain_may_be_and_which_transports_share_memory(tmp_path: Path) 
 
 def test_an_endpoint_that_the_rovers_table_gets_is_an_error_in_that_for_one_machine(tmp_path: Path) -> None:
     """Its real address was inherited there, and datagrams left the machine."""
-    shutil.copytree(ROOT / "routes", tmp_path / "routes")
+    shutil.copytree(ROUTES, tmp_path / "routes")
     rover, sim = tmp_path / "routes" / "rover.yaml", tmp_path / "routes" / "sim.yaml"
-    text = rover.read_text(encoding="utf-8").replace("protos: ../protos", f"protos: {ROOT / 'protos'}")
+    text = rover.read_text(encoding="utf-8").replace("protos: ../protos", f"protos: {PROTOS}")
     rover.write_text(text.replace("\nendpoints:\n", "\nendpoints:\n  camera: {address: 192.168.0.60:8, kind: tool}\n"))
     line = rover.read_text().splitlines().index("  camera: {address: 192.168.0.60:8, kind: tool}") + 1
     found = f"{rover}:{line}:21: error[outside-networks]: 'address' of endpoints.camera is 192.168.0.60:8, outside"

@@ -1,12 +1,14 @@
 """`router schema lock`: record the field numbers of the `.proto` files, so that none is ever reused.
 
-Adds what is new and refuses everything else; comparing without writing is part of `router validate`.
+Adds what is new and refuses everything else that is not accepted by name; comparing without writing is part of
+`router validate`.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,16 +16,18 @@ from router.assets import asset, is_installed
 from router.cli import BAD_TABLE, OK, VERBS
 from router.cli.findings import plural, print_findings
 from router.cli.tool_options import explained
-from router.errors import Severity, SourceSpan, shown_path
+from router.errors import SourceSpan, did_you_mean, shown_path
+from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, Located
 from router.tools import UsageError
 
 if TYPE_CHECKING:
+    from router.types.lock import Conflict
     from router.types.lock_file import Lock
-    from router.types.protobuf import Envelope, ProtoSchema
 
-ENVELOPE, ONEOF = "PBEnvelope", "payload"
 _DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there.
-A number that is reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written."""
+A number that is reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written.
+`--accept` takes such a change when all boards get new firmware; `router validate` prints the command."""
+_ACCEPT = "a change that is meant, called as the finding calls it: Message.field, Enum.VALUE, or a whole Message"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -31,47 +35,64 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     lock = actions.add_parser("lock", help="record new field numbers in the lock file", description=_DESCRIPTION)
     lock.add_argument("--protos", type=Path, metavar="DIR", help="folder of .proto files (default: the rover's)")
+    lock.add_argument("--lock", type=Path, metavar="FILE", help="the lock file (default: envelope.lock.json in DIR)")
     lock.add_argument("--message", metavar="NAME", help=f"the envelope (default: as the lock says, else {ENVELOPE})")
     lock.add_argument("--oneof", metavar="NAME", help=f"its oneof (default: as the lock says, else {ONEOF})")
+    lock.add_argument("--accept", action="append", default=[], metavar="NAME", help=_ACCEPT)
 
 
 @explained
 def run(args: argparse.Namespace) -> int:
     """Raises TableError for broken `.proto` files and a broken lock file."""
-    from router.types.lock import check_lock, extended_lock
-    from router.types.lock_file import LOCK_NAME, read_lock, write_lock
-    from router.types.protobuf import load_protos
+    from router.types.lock import conflicts, extended_lock
+    from router.types.lock_file import read_lock, write_lock
+    from router.types.protobuf import find_envelope, load_protos, lock_path
 
-    root = args.protos or asset("protos")
-    path = root / LOCK_NAME
+    settings = _settings(args)
+    path = lock_path(settings)
     if is_installed(path):
         what = f"{path} belongs to the installed router, and is lost when that is upgraded"
         raise UsageError(f"{what}; copy the protos with `router init`, and name yours: --protos protos")
-    schema = load_protos(root)
-    old = read_lock(root)
-    envelope = _envelope(schema, old, args)
-    findings = check_lock(schema, envelope)
-    errors = [finding for finding in findings if finding.severity is Severity.ERROR]
-    if errors:
-        print_findings(errors, sys.stdout)
+    old = read_lock(path)
+    if old is not None:
+        settings = _settings(args, old.message, old.oneof)
+    schema = load_protos(settings)
+    envelope = find_envelope(schema, settings)
+    found = conflicts(schema, envelope)
+    if problem := _unknown(args.accept, found):
+        raise UsageError(f"{problem}; nothing was written")
+    accepted = [each for each in found if each.name in args.accept or each.owner in args.accept]
+    if refused := [each for each in found if each not in accepted]:
+        print_findings(sorted((each.finding for each in refused), key=lambda finding: finding.span), sys.stdout)
         return BAD_TABLE
-    new = extended_lock(schema, envelope)
+    new = extended_lock(schema, envelope, accepted)
     if new != old:
-        write_lock(root, new)
+        write_lock(path, new)
+    for conflict in accepted:
+        print(f"accepted: {conflict.finding.message}")
     print(f"{shown_path(path)}: {_summary(old, new)}")
     return OK
 
 
-def _envelope(schema: ProtoSchema, old: Lock | None, args: argparse.Namespace) -> Envelope:
-    from router.table.model import EnvelopeSettings, Located
-    from router.types.protobuf import find_envelope
-
-    message = args.message or (old.message if old is not None else ENVELOPE)
-    oneof = args.oneof or (old.oneof if old is not None else ONEOF)
-    span = SourceSpan(shown_path(schema.root))
-    return find_envelope(
-        schema, EnvelopeSettings(Located(schema.root, span), Located(message, span), Located(oneof, span))
+def _settings(args: argparse.Namespace, message: str = ENVELOPE, oneof: str = ONEOF) -> EnvelopeSettings:
+    root = args.protos or asset("protos")
+    span = SourceSpan(shown_path(root))
+    return EnvelopeSettings(
+        Located(root.absolute(), span),
+        Located(args.message or message, span),
+        Located(args.oneof or oneof, span),
+        Located(args.lock.absolute(), span) if args.lock is not None else None,
     )
+
+
+def _unknown(names: Sequence[str], found: Sequence[Conflict]) -> str:
+    """What is wrong with the names to accept; empty when each is that of a conflict."""
+    known = {name for each in found for name in (each.name, each.owner)}
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known) or "nothing conflicts with the lock"
+            return f"'{name}' has nothing to accept; {hint}"
+    return ""
 
 
 def _summary(old: Lock | None, new: Lock) -> str:

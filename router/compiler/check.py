@@ -83,7 +83,8 @@ def check_table(
     own_type = lookup.ros_type(own) if own else None
     findings = [
         *findings,
-        *(check_lock(schema, envelope) if table.envelope else ()),
+        *schema.warnings,
+        *(check_lock(schema, envelope, table.envelope.lock) if table.envelope else ()),
         *network_findings(table),
         *lookup.findings,
         *clash_findings(table),
@@ -97,5 +98,5 @@ def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Env
     """Raises TableError."""
     if table.envelope is None:
         return without_protos()
-    schema = definitions.protos(table.envelope.protos.value, table.envelope.protos.span)
+    schema = definitions.protos(table.envelope)
     return schema, find_envelope(schema, table.envelope)

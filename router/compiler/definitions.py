@@ -5,30 +5,33 @@ from __future__ import annotations
 from functools import cached_property
 from pathlib import Path
 
-from router.errors import SourceSpan
-from router.types.proto_folder import folder_sha256
-from router.types.protobuf import ProtoSchema, load_protos
+from router.table.model import EnvelopeSettings
+from router.types.proto_folder import read_folder
+from router.types.protobuf import ProtoSchema, load_protos, lock_path
 from router.types.ros import RosInterfaces, ros_interfaces
 
 
 class Definitions:
-    """`known` is a folder that was read before. It is what it was as long as its files are."""
+    """`known` are protos that were read before. They are what they were as long as the folder's files are."""
 
     def __init__(self, known: ProtoSchema | None = None) -> None:
-        self._protos: dict[Path, ProtoSchema] = {}
+        self._protos: dict[tuple[Path, str, Path], ProtoSchema] = {}
         self._known = known
 
-    def protos(self, root: Path, blame: SourceSpan) -> ProtoSchema:
+    def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
         """Raises TableError; a folder that is broken is read again, and reported, by every table."""
-        if root not in self._protos:
-            self._protos[root] = self._unchanged(root, blame) or load_protos(root, blame)
-        return self._protos[root]
+        key = settings.protos.value, settings.message.value, lock_path(settings)
+        if key not in self._protos:
+            self._protos[key] = self._unchanged(settings) or load_protos(settings)
+        return self._protos[key]
 
-    def _unchanged(self, root: Path, blame: SourceSpan) -> ProtoSchema | None:
+    def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
         known = self._known
-        if known is None or known.root != root.resolve() or known.sha256 != folder_sha256(root, blame):
+        if known is None or (known.root, known.lock) != (settings.protos.value.resolve(), lock_path(settings)):
             return None
-        return known
+        if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
+            return None
+        return known if known.sha256 == read_folder(known.root, settings.protos.span).sha256 else None
 
     @cached_property
     def interfaces(self) -> RosInterfaces:

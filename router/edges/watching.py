@@ -98,10 +98,14 @@ class InterfaceWatcher:
 
 
 def watched_files(table: RouteTable) -> list[Path]:
-    """The table, what it extends, files for Zenoh, and everything beside its protos, new files there among them."""
+    """The table, what it extends, files for Zenoh, the lock, and everything beside its protos, new files among them."""
     configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
     paths = [config.path for config in configs if config.path is not None]
-    protos = table.envelope.protos.value.rglob("*") if table.envelope else ()
+    protos: Iterable[Path] = ()
+    if table.envelope is not None:
+        protos = table.envelope.protos.value.rglob("*")
+        if table.envelope.lock is not None:
+            paths.append(table.envelope.lock.value)
     return [*table.files, *paths, *protos]
 
 

@@ -172,10 +172,18 @@ def _is_group(entry: Entry) -> bool:
 
 def _envelope(entry: Entry) -> EnvelopeSettings:
     settings = mapping(entry.value)
-    protos = Located(asset("protos"), entry.key.span)
-    if written := optional_text(settings, "protos"):
-        protos = Located(Path(written.span.file).absolute().parent / written.value, written.span)
-    return EnvelopeSettings(protos, text(settings, "message"), text(settings, "oneof"))
+    protos, lock = optional_text(settings, "protos"), optional_text(settings, "lock")
+    return EnvelopeSettings(
+        _beside(protos) if protos else Located(asset("protos"), entry.key.span),
+        text(settings, "message"),
+        text(settings, "oneof"),
+        _beside(lock) if lock else None,
+    )
+
+
+def _beside(path: Located[str]) -> Located[Path]:
+    """A path relative to the file that names it."""
+    return Located(Path(path.span.file).absolute().parent / path.value, path.span)
 
 
 def _node(entry: Entry) -> NodeSettings:

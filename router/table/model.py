@@ -80,13 +80,21 @@ class Keep(enum.Enum):
     LATEST = "latest"
 
 
+ENVELOPE, ONEOF = "PBEnvelope", "payload"
+"""The envelope's names where there is no table to say them."""
+
+
 @dataclass(frozen=True, slots=True)
 class EnvelopeSettings:
-    """`protos` is an absolute path, the router's own unless the table has one; the others name the envelope in them."""
+    """`protos` is an absolute path, the router's own unless the table has one; `message` and `oneof` name the envelope.
+
+    `lock` is the absolute path of the lock file, None where it is beside the protos.
+    """
 
     protos: Located[Path]
     message: Located[str]
     oneof: Located[str]
+    lock: Located[Path] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,6 +95,8 @@ def _field(text: str, comment: str, site: Site) -> NewField:
         close = nearest(type_, sorted((*SCALARS, *named)))
         there = f"there are {', '.join(SCALARS)}, and the enums and messages of the protos"
         hint = f"did you mean '{close}'?" if close else there
+        if site.schema.warnings:  # perhaps the file that declares it
+            hint += f" ({site.schema.warnings[0]})"
         raise UsageError(f"there is no type '{type_}' for '{name}'; {hint}")
     if len(own) > 1:
         raise UsageError(f"several types are called '{type_}'; write which for '{name}': {', '.join(sorted(own))}")

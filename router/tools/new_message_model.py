@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from router.compiler import Checked
-from router.table.model import RouteTable
+from router.table.model import EnvelopeSettings, RouteTable
 from router.tools import UsageError
-from router.types.protobuf import Envelope, ProtoSchema
+from router.types.protobuf import Envelope, ProtoSchema, load_protos
 
 SCALARS = {
     "bool": "bool", "float": "float32", "double": "float64", "int32": "int32", "int64": "int64", "uint32": "uint32",
@@ -60,6 +60,7 @@ class Site:
     """What there is: a table without errors, what it refers to, and the folder of our ROS messages."""
 
     table: RouteTable
+    settings: EnvelopeSettings
     schema: ProtoSchema
     envelope: Envelope
     messages: Path
@@ -76,11 +77,13 @@ class Site:
 
 def site_of(checked: Checked, messages: Path) -> Site:
     """`checked` is a table without errors. Raises UsageError where it has no envelope."""
-    if checked.table is None or checked.schema is None or checked.envelope is None:
+    if checked.table is None or checked.envelope is None:
         raise ValueError(f"{checked.path} has errors")
-    if checked.table.envelope is None:
+    settings = checked.table.envelope
+    if settings is None:
         raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
-    return Site(checked.table, checked.schema, checked.envelope, messages)
+    schema = load_protos(settings, with_others=True)  # a field's type may be in a file of its own
+    return Site(checked.table, settings, schema, checked.envelope, messages)
 
 
 def prefix_of(board: str) -> str:

@@ -14,7 +14,7 @@ _OF_PROTOBUF = range(19_000, 20_000)
 
 def check_number(number: int, case: str, site: Site) -> None:
     """Raises UsageError, with the next free number."""
-    lock, envelope = read_lock(site.schema.root), site.envelope.name
+    lock, envelope = read_lock(site.schema.lock), site.envelope.name
     entries = lock.messages[envelope].entries if lock is not None and envelope in lock.messages else frozenset()
     holders = {entry.number: entry.name for entry in entries}
     holders |= {field.number: field.name for field in site.schema.messages[envelope].fields}

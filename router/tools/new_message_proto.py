@@ -9,16 +9,17 @@ import re
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from router.errors import Severity, SourceSpan, TableError
-from router.table.model import EnvelopeSettings, Located
+from router.errors import Severity, TableError
+from router.table.model import Located
 from router.tools import UsageError
 from router.tools.new_message_layout import aligned
 from router.tools.new_message_model import SCALARS, NewMessage, Site
 from router.types.lock import check_lock, extended_lock
-from router.types.lock_file import LOCK_NAME, write_lock
-from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
+from router.types.lock_file import lock_text
+from router.types.protobuf import find_envelope, load_protos
 
 _IMPORT = re.compile(r'\s*import\s+(?:public\s+)?"(.*)"\s*;')
 _HEAD = re.compile(r"\s*(syntax|package)\b")
@@ -27,12 +28,13 @@ _HEAD = re.compile(r"\s*(syntax|package)\b")
 def proto_texts(message: NewMessage, site: Site) -> Mapping[str, str]:
     """The contents of every file of the protos that is new or changes, by name relative to their folder, lock included.
 
+    The lock's name is its path.
     Raises UsageError when protoc or the lock refuses what came of it.
     """
     envelope_file = site.file(site.envelope.name)
     before = (site.schema.root / envelope_file).read_text(encoding="utf-8")
     texts = {site.new_file(message): _declared(message, site), envelope_file: _in_envelope(before, message, site)}
-    return {**texts, LOCK_NAME: _locked(texts, site)}
+    return {**texts, str(site.schema.lock): _locked(texts, site)}
 
 
 def _declared(message: NewMessage, site: Site) -> str:
@@ -90,18 +92,12 @@ def _locked(texts: Mapping[str, str], site: Site) -> str:
             (root / name).parent.mkdir(parents=True, exist_ok=True)
             (root / name).write_text(text, encoding="utf-8")
         try:
-            schema = load_protos(root)
-            envelope = _envelope(schema, site)
+            settings = replace(site.settings, protos=Located(root, site.settings.protos.span))
+            schema = load_protos(settings)
+            envelope = find_envelope(schema, settings)
             errors = [each for each in check_lock(schema, envelope) if each.severity is Severity.ERROR]
         except TableError as error:
             errors = list(error.diagnostics)
         if errors:
             raise UsageError("; ".join(each.message for each in errors))
-        write_lock(root, extended_lock(schema, envelope))
-        return (root / LOCK_NAME).read_text(encoding="utf-8")
-
-
-def _envelope(schema: ProtoSchema, site: Site) -> Envelope:
-    nowhere = SourceSpan(str(schema.root))
-    names = Located(site.envelope.name, nowhere), Located(site.envelope.oneof, nowhere)
-    return find_envelope(schema, EnvelopeSettings(Located(schema.root, nowhere), *names))
+        return lock_text(extended_lock(schema, envelope))

@@ -17,13 +17,10 @@ from router.engine.framing import restored
 from router.engine.payloadless import why_no_payload
 from router.errors import DecodeError, Severity, SourceSpan, TableError, did_you_mean, shown_path
 from router.table import load_table
-from router.table.model import EnvelopeSettings, Located, RouteTable
+from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, Located, RouteTable
 from router.tools import UsageError
 from router.tools.fields import set_fields
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
-
-ENVELOPE, ONEOF = "PBEnvelope", "payload"
-"""The envelope's names where there is no table to say them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +96,7 @@ def wire_of_protos(root: Path) -> Wire:
 
 
 def _wire(settings: EnvelopeSettings) -> Wire:
-    schema = load_protos(settings.protos.value, settings.protos.span)
-    return Wire(find_envelope(schema, settings))
+    return Wire(find_envelope(load_protos(settings), settings))
 
 
 def payload(case: PayloadCase, words: Sequence[str]) -> Message:

@@ -31,12 +31,15 @@ def enum_of(field: FieldDescriptor) -> EnumDescriptor:
 
 
 def declared_type(field: FieldDescriptor) -> str:
-    """`sint32`, `repeated float`, `MotorInformation.State`: what decides a field's bytes on the wire."""
+    """`sint32`, `repeated float`, `delimited Motor`: what decides a field's bytes on the wire."""
     if field.message_type is not None:
         name = field.message_type.full_name
+        if field.type == FieldDescriptor.TYPE_GROUP:
+            name = f"delimited {name}"
     elif field.enum_type is not None:
-        name = field.enum_type.full_name
+        name = f"enum {field.enum_type.full_name}"
     else:
         name = FieldDescriptorProto.Type.Name(FieldDescriptorProto.Type.ValueType(field.type))
         name = name.removeprefix("TYPE_").lower()
-    return f"repeated {name}" if field.is_repeated else name
+    label = "repeated " if field.is_repeated else "required " if field.is_required else ""
+    return label + name

@@ -1,61 +1,104 @@
-"""Field numbers are permanent: compares the `.proto` files with the lock file beside them.
+"""Field numbers are permanent: compares the `.proto` files with the lock file.
 
 A number that changes its meaning is an error, since boards in the field keep the old one. What is merely
 new is a warning until `router schema lock` records it.
+
+The wire has no names of packages and oneofs. So a locked declaration that is gone is taken for the one of the same
+name in another package, and their members are compared. A message or enum of another name is another one, whatever is
+in it: that it was only renamed cannot be told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+import shlex
+from collections import defaultdict
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from router.errors import Code, Diagnostic, Severity, TableError
+from google.protobuf.descriptor import FieldDescriptor
+
+from router.assets import asset
+from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
+from router.table.model import ENVELOPE, ONEOF, Located
 from router.types.descriptors import declared_type
-from router.types.lock_file import Declaration, Entry, Lock, by_number, read_lock
+from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, by_number, read_lock
 from router.types.proto_source import Part
 from router.types.protobuf import Envelope, ProtoSchema
 
-_TO_LOCK = "record it with `router schema lock`"
+
+@dataclass(frozen=True, slots=True)
+class Conflict:
+    """A break of the wire: what it is called for `router schema lock --accept`, and the finding.
+
+    `owner` is the message or enum. `entries` are its locked members whose numbers lose their meaning.
+    """
+
+    name: str
+    owner: str
+    finding: Diagnostic
+    entries: frozenset[Entry] = frozenset()
 
 
-def check_lock(schema: ProtoSchema, envelope: Envelope) -> list[Diagnostic]:
+def check_lock(schema: ProtoSchema, envelope: Envelope, named: Located[Path] | None = None) -> list[Diagnostic]:
     """Every difference between the `.proto` files and the lock, and what is wrong with the lock file itself.
 
-    Ordered by place.
+    `named` is where the table names the lock file: then it must exist. Ordered by place.
     """
     try:
-        lock = read_lock(schema.root)
+        lock = read_lock(schema.lock)
     except TableError as error:
         return list(error.diagnostics)
-    span = schema.span(envelope.name)
     if lock is None:
+        hint = f"write it with `{_command(schema, envelope, None)}`"
+        if named is not None:
+            return [Diagnostic(named.span, Code.BAD_FILE, f"there is no lock file {shown_path(schema.lock)}", hint)]
         message = "no lock file records the field numbers"
-        return [Diagnostic(span, Code.NOT_LOCKED, message, "write it with `router schema lock`")]
-    current = _current_lock(schema, envelope)
-    findings = [*_compared(schema, lock.messages, current.messages), *_compared(schema, lock.enums, current.enums)]
-    if (lock.message, lock.oneof) != (current.message, current.oneof):
-        message = f"the lock is for the envelope {lock.message}.{lock.oneof}, not {current.message}.{current.oneof}"
-        findings.append(Diagnostic(span, Code.NOT_LOCKED, message, _TO_LOCK))
-    elif lock.max_size != current.max_size and not any(found.severity is Severity.ERROR for found in findings):
-        message = f"{envelope.name} takes up to {current.max_size} bytes, the lock says {lock.max_size}"
-        findings.append(Diagnostic(span, Code.NOT_LOCKED, message, f"flash the boards, then {_TO_LOCK}"))
-    return sorted(findings, key=lambda finding: finding.span)
+        return [Diagnostic(schema.span(envelope.name), Code.NOT_LOCKED, message, hint)]
+    comparison = _Comparison(schema, envelope, lock)
+    errors = [conflict.finding for conflict in comparison.conflicts]
+    return sorted([*errors, *comparison.additions], key=lambda finding: finding.span)
 
 
-def extended_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
-    """The lock with everything added that is new. Nothing is ever taken out: a number stays given out.
+def conflicts(schema: ProtoSchema, envelope: Envelope) -> Sequence[Conflict]:
+    """What of the lock the `.proto` files break. Raises TableError when the lock file is broken."""
+    lock = read_lock(schema.lock)
+    return _Comparison(schema, envelope, lock).conflicts if lock is not None else []
 
-    Raises TableError when the lock file is broken. For a schema without conflicts, see `check_lock`.
+
+def extended_lock(schema: ProtoSchema, envelope: Envelope, accepted: Collection[Conflict] = ()) -> Lock:
+    """The lock with everything added that is new. Nothing else is taken out than what the accepted conflicts break.
+
+    Raises TableError when the lock file is broken. Every other conflict must have been refused, see `conflicts`.
     """
     current = _current_lock(schema, envelope)
-    lock = read_lock(schema.root)
+    lock = read_lock(schema.lock)
     if lock is None:
         return current
+    dropped: dict[str, set[Entry]] = defaultdict(set)
+    for conflict in accepted:
+        dropped[conflict.owner] |= conflict.entries
+    locked, _ = _in_new_names(lock, current)
     return replace(
         current,
-        messages=_extended(lock.messages, current.messages),
-        enums=_extended(lock.enums, current.enums),
+        messages=_extended(locked.messages, current.messages, dropped),
+        enums=_extended(locked.enums, current.enums, dropped),
     )
+
+
+def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None) -> str:
+    """What records these protos, to be typed where the router runs."""
+    known = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
+    words = ["router", "schema", "lock"]
+    if schema.root != asset("protos").resolve():
+        words += ["--protos", shown_path(schema.root)]
+    if schema.lock != schema.root / LOCK_NAME:
+        words += ["--lock", shown_path(schema.lock)]
+    if envelope.name != known[0]:
+        words += ["--message", envelope.name]
+    if envelope.oneof != known[1]:
+        words += ["--oneof", envelope.oneof]
+    return shlex.join(words)
 
 
 def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
@@ -64,8 +107,7 @@ def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
     for name in schema.messages:
         if (file := schema.sources.file(name)) in schema.files:
             fields = schema.descriptor(name).fields
-            entries = frozenset(Entry(field.number, field.name, declared_type(field)) for field in fields)
-            messages[name] = Declaration(file, entries)
+            messages[name] = Declaration(file, frozenset(map(_entry, fields)))
     enums = {}
     for name, declared in schema.enums.items():
         if (file := schema.sources.file(name)) in schema.files:
@@ -73,74 +115,212 @@ def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
     return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
 
 
+def _entry(field: FieldDescriptor) -> Entry:
+    oneof = field.containing_oneof
+    # protoc makes a oneof for each `optional` field, which is none on the wire: `_x` of `x`, or `X_x` if `_x` is taken.
+    name = "" if oneof is None or oneof.name.lstrip("X") == f"_{field.name}" else oneof.name
+    return Entry(field.number, field.name, declared_type(field), name)
+
+
 def locked_size(schema: ProtoSchema) -> int | None:
     """The envelope's largest encoding that the lock records, None without a (readable) lock."""
     try:
-        lock = read_lock(schema.root)
+        lock = read_lock(schema.lock)
     except TableError:  # a finding of check_lock
         return None
     return lock.max_size if lock is not None else None
 
 
-def _extended(locked: Mapping[str, Declaration], current: Mapping[str, Declaration]) -> Mapping[str, Declaration]:
+def _extended(
+    locked: Mapping[str, Declaration], current: Mapping[str, Declaration], dropped: Mapping[str, set[Entry]]
+) -> Mapping[str, Declaration]:
     extended = {**locked, **current}
     for name in locked.keys() & current.keys():
-        extended[name] = replace(current[name], entries=locked[name].entries | current[name].entries)
+        now = current[name].entries
+        named = {(entry.number, entry.name) for entry in now}
+        kept = {entry for entry in locked[name].entries if (entry.number, entry.name) not in named}
+        extended[name] = replace(current[name], entries=now | (kept - dropped.get(name, set())))
     return extended
 
 
-def _compared(
-    schema: ProtoSchema, locked: Mapping[str, Declaration], current: Mapping[str, Declaration]
-) -> Iterator[Diagnostic]:
-    for name, declaration in current.items():
-        if name in locked:
-            reserved = schema.reserved_numbers(name)
-            live = [entry for entry in by_number(locked[name]) if not any(entry.number in span for span in reserved)]
-            yield from _entry_findings(schema, name, live, by_number(declaration))
-        else:
-            yield Diagnostic(schema.span(name), Code.NOT_LOCKED, f"the lock does not know {name}", _TO_LOCK)
+def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
+    """The lock with its messages, enums and oneofs called as they are now, and from which name to which.
+
+    An envelope that is gone is taken for the present one: it is another then, but its numbers count.
+    """
+    moved = _moved(lock, current)
+    names = dict(moved)
+    if lock.message not in current.messages and current.message not in lock.messages:
+        names.setdefault(lock.message, current.message)
+    messages = _renamed(lock.messages, names)
+    for name in sorted(messages.keys() & current.messages):
+        if not (oneofs := _renamed_oneofs(messages[name], current.messages[name])):
+            continue
+        entries = {replace(entry, oneof=oneofs.get(entry.oneof, entry.oneof)) for entry in messages[name].entries}
+        messages[name] = replace(messages[name], entries=frozenset(entries))
+        moved |= {f"{name}.{old}": f"{name}.{new}" for old, new in oneofs.items()}
+    message = names.get(lock.message, lock.message)
+    oneof = moved.get(f"{message}.{lock.oneof}", "").rpartition(".")[2] or lock.oneof
+    enums = _renamed(lock.enums, names)
+    return replace(lock, message=message, oneof=oneof, messages=messages, enums=enums), moved
 
 
-def _entry_findings(
-    schema: ProtoSchema, owner: str, locked: Iterable[Entry], current: Iterable[Entry]
-) -> Iterator[Diagnostic]:
-    """Findings for the members of one message or enum; reserved numbers are no longer among `locked`."""
-    was = {entry.name: entry for entry in locked}
-    now = {entry.name: entry for entry in current}
-    holders = {entry.number: entry for entry in was.values()}
-    for entry in now.values():
-        if (old := was.get(entry.name)) is not None:
-            yield from _changed(schema, owner, old, entry)
-        elif (holder := holders.get(entry.number)) is None or now.get(holder.name) == holder:
-            message = f"the lock does not know {owner}.{entry.name}"
-            yield Diagnostic(schema.span(owner, entry.name), Code.NOT_LOCKED, message, _TO_LOCK)
-        else:
-            message = f"number {entry.number} of {owner} belongs to '{holder.name}', not to '{entry.name}'"
-            hint = f"the lock says {_shown(holder)}; call it that, or reserve the number and take a free one"
-            yield _conflict(schema, owner, entry, Part.NUMBER, message, hint)
-    taken = {entry.number for entry in now.values() if entry.name not in was}
-    for old in was.values():
-        if old.name not in now and old.number not in taken:
-            message = f"{owner} has no '{old.name}' any more, and number {old.number} is free to be reused"
-            hint = f"the lock says {_shown(old)}; write `reserved {old.number};` there"
-            yield Diagnostic(schema.span(owner), Code.WIRE_NUMBER_CONFLICT, message, hint)
+def _moved(lock: Lock, current: Lock) -> dict[str, str]:
+    """From the full name of what is gone to that of what is new, if only the package differs."""
+    moved: dict[str, str] = {}
+    for locked, there in ((lock.messages, current.messages), (lock.enums, current.enums)):
+        new = {_without_package(name, current.messages): name for name in there if name not in locked}
+        gone = {name: _without_package(name, lock.messages) for name in locked if name not in there}
+        moved |= {name: new[short] for name, short in gone.items() if short in new}
+    return moved
 
 
-def _changed(schema: ProtoSchema, owner: str, old: Entry, new: Entry) -> Iterator[Diagnostic]:
-    hint = f"the lock says {_shown(old)}; to change it, reserve {old.number} and add a field"
-    if new.number != old.number:
+def _without_package(name: str, messages: Container[str]) -> str:
+    """`Motor.State` of `rover.Motor.State`, if there is a message `rover.Motor`."""
+    around, _, last = name.rpartition(".")
+    return f"{_without_package(around, messages)}.{last}" if around in messages else last
+
+
+def _renamed(declared: Mapping[str, Declaration], names: Mapping[str, str]) -> dict[str, Declaration]:
+    if not names:
+        return dict(declared)
+    renamed: dict[str, Declaration] = {}
+    for name, declaration in declared.items():
+        entries = set()
+        for entry in declaration.entries:
+            label, space, type_ = entry.type.rpartition(" ")
+            entries.add(replace(entry, type=label + space + names.get(type_, type_)))
+        new = names.get(name, name)
+        before = renamed[new].entries if new in renamed else frozenset()
+        renamed[new] = replace(declaration, entries=before | entries)
+    return renamed
+
+
+def _renamed_oneofs(locked: Declaration, current: Declaration) -> dict[str, str]:
+    """From the name of a oneof that is gone to that of a new one with a member of it."""
+    was = {entry.oneof for entry in locked.entries}
+    if was == {entry.oneof for entry in current.entries}:
+        return {}
+    now = {entry.number: entry.oneof for entry in current.entries}
+    renamed: dict[str, str] = {}
+    for entry in by_number(locked):
+        new = now.get(entry.number, "")
+        is_gone, is_new = entry.oneof not in now.values(), new not in was
+        if entry.oneof and new and is_gone and is_new and new not in renamed.values():
+            renamed.setdefault(entry.oneof, new)
+    return renamed
+
+
+class _Comparison:
+    """The current declarations beside the locked ones: `conflicts`, and warnings of `additions`."""
+
+    def __init__(self, schema: ProtoSchema, envelope: Envelope, lock: Lock) -> None:
+        self._schema = schema
+        self._command = _command(schema, envelope, lock)
+        self.conflicts: list[Conflict] = []
+        self.additions: list[Diagnostic] = []
+        current = _current_lock(schema, envelope)
+        locked, names = _in_new_names(lock, current)
+        for was, now in ((locked.messages, current.messages), (locked.enums, current.enums)):
+            for name, declaration in now.items():
+                if name in was:
+                    self._compare(name, was[name], declaration)
+                else:
+                    self._add(schema.span(name), f"the lock does not know {name}")
+        self._compare_envelopes(envelope, lock, locked, names)
+
+    def _compare_envelopes(self, envelope: Envelope, lock: Lock, locked: Lock, names: Mapping[str, str]) -> None:
+        span = self._schema.span(envelope.name)
+        if (names.get(lock.message, lock.message), locked.oneof) != (envelope.name, envelope.oneof):
+            message = f"the lock is for the envelope {lock.message}.{lock.oneof}, not {envelope.name}.{envelope.oneof}"
+            self._refuse(envelope.name, "", span, message, "name that one in the table")
+        if names:
+            old = min(names)
+            more = f", and so for {len(names) - 1} more" if len(names) > 1 else ""
+            self._add(span, f"the lock has {old} for what is {names[old]} now{more}", "the wire is the same; ")
+        if lock.max_size != envelope.max_size and not self.conflicts:
+            message = f"{envelope.name} takes up to {envelope.max_size} bytes, the lock says {lock.max_size}"
+            self._add(span, message, "flash the boards, then ")
+
+    def _compare(self, owner: str, locked: Declaration, current: Declaration) -> None:
+        """Members of one message or enum, by number; locked ones whose number is reserved are out of use."""
+        reserved = self._schema.reserved_numbers(owner)
+        live = [entry for entry in by_number(locked) if not any(entry.number in span for span in reserved)]
+        moved = set()
+        for entry in by_number(current):
+            holders = [each for each in live if each.number == entry.number]
+            if any(each.name == entry.name for each in holders):
+                self._compare_types(owner, next(each for each in holders if each.name == entry.name), entry)
+            elif any(each.name == entry.name for each in live):
+                moved.add(entry.name)
+                self._refuse_number(owner, [each for each in live if each.name == entry.name], entry, holders)
+            elif holders and not any((each.number, each.name) in _names(current) for each in holders):
+                self._refuse_holder(owner, holders[0], entry)
+            else:
+                self._add(self._schema.span(owner, entry.name), f"the lock does not know {owner}.{entry.name}")
+        numbers = {entry.number for entry in current.entries}
+        for entry in live:
+            if entry.number not in numbers and entry.name not in moved:
+                number = entry.number
+                message = f"number {number} of {owner}, which was '{entry.name}', is free to be reused"
+                hint = f"the lock says {_shown(entry)}; write `reserved {number};` there"
+                self._refuse(owner, entry.name, self._schema.span(owner), message, hint, {entry})
+
+    def _compare_types(self, owner: str, old: Entry, new: Entry) -> None:
+        if (new.type, new.oneof) == (old.type, old.oneof):
+            return
+        differences = []
+        if new.type != old.type:
+            differences.append(f"is of type {new.type} instead of {old.type}")
+        if new.oneof != old.oneof:
+            differences.append(f"is {_place(new)} instead of {_place(old)}")
+        message = f"{owner}.{new.name} {' and '.join(differences)}"
+        hint = f"the lock says {_shown(old)}; to change it, reserve {old.number} and add a field"
+        part = Part.TYPE if new.type != old.type else Part.NAME
+        self._refuse(owner, new.name, self._span(owner, new, part), message, hint, {old})
+
+    def _refuse_number(self, owner: str, olds: Sequence[Entry], new: Entry, holders: Sequence[Entry]) -> None:
+        old = olds[-1]
         message = f"{owner}.{new.name} has number {new.number} instead of {old.number}"
-        yield _conflict(schema, owner, new, Part.NUMBER, message, f"the lock says {_shown(old)}")
-    elif new.type != old.type:
-        message = f"{owner}.{new.name} is of type {new.type} instead of {old.type}"
-        yield _conflict(schema, owner, new, Part.TYPE, message, hint)
+        if new.type != old.type:
+            message += f" and is of type {new.type} instead of {old.type}"
+        hint = f"the lock says {_shown(old)}"
+        if holders:
+            hint = f"{new.number} belongs to '{holders[0].name}'; {hint}"
+        span = self._span(owner, new, Part.NUMBER)
+        self._refuse(owner, new.name, span, message, hint, {*holders, *olds})
+
+    def _refuse_holder(self, owner: str, holder: Entry, new: Entry) -> None:
+        was, now = (f"'{each.name}'" for each in (holder, new))
+        if holder.type != new.type:
+            was, now = (f"'{each.type} {each.name}'" for each in (holder, new))
+        message = f"number {new.number} of {owner} belongs to {was}, not to {now}"
+        hint = f"the lock says {_shown(holder)}; call it that, or reserve the number and take a free one"
+        self._refuse(owner, new.name, self._span(owner, new, Part.NUMBER), message, hint, {holder})
+
+    def _span(self, owner: str, entry: Entry, part: Part) -> SourceSpan:
+        return self._schema.sources.span(f"{owner}.{entry.name}", part)
+
+    def _refuse(
+        self, owner: str, member: str, span: SourceSpan, message: str, hint: str, entries: Iterable[Entry] = ()
+    ) -> None:
+        name = f"{owner}.{member}" if member else owner
+        hint += f"; if it is intended, `{self._command} --accept {name}`"
+        finding = Diagnostic(span, Code.WIRE_NUMBER_CONFLICT, message, hint)
+        self.conflicts.append(Conflict(name, owner, finding, frozenset(entries)))
+
+    def _add(self, span: SourceSpan, message: str, before: str = "") -> None:
+        self.additions.append(Diagnostic(span, Code.NOT_LOCKED, message, f"{before}record it with `{self._command}`"))
 
 
-def _conflict(schema: ProtoSchema, owner: str, entry: Entry, part: Part, message: str, hint: str) -> Diagnostic:
-    span = schema.sources.span(f"{owner}.{entry.name}", part)
-    return Diagnostic(span, Code.WIRE_NUMBER_CONFLICT, message, hint)
+def _names(declared: Declaration) -> set[tuple[int, str]]:
+    return {(entry.number, entry.name) for entry in declared.entries}
+
+
+def _place(entry: Entry) -> str:
+    return f"in the oneof '{entry.oneof}'" if entry.oneof else "in no oneof"
 
 
 def _shown(entry: Entry) -> str:
-    """As a `.proto` file writes it: `float ph_value = 1`."""
+    """As in a `.proto` file: `float ph_value = 1`, but with `enum` before the type of an enum."""
     return f"`{entry.type} {entry.name} = {entry.number}`".replace("` ", "`")

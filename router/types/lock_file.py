@@ -6,7 +6,8 @@ Reads and writes it; knows no `.proto` file. What follows from a difference is `
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,21 @@ from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 
 LOCK_NAME = "envelope.lock.json"
 
+_FIELD = re.compile(r"(?:oneof (?P<oneof>\w+): )?(?P<type>\S.*) (?P<name>\w+)")
+_NUMBER = re.compile(r"-?[0-9]+")
+
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A field's or enum value's number and name; `type` as `descriptors.declared_type`, empty for enum values."""
+    """A field's or enum value's number and name; `type` as `descriptors.declared_type`, empty for enum values.
+
+    `oneof` is the one that a field is in, empty for none.
+    """
 
     number: int
     name: str
     type: str = ""
+    oneof: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +52,8 @@ class Lock:
     enums: Mapping[str, Declaration]
 
 
-def read_lock(root: Path) -> Lock | None:
-    """The lock beside the protos, None where there is no such file. Raises TableError for a broken one."""
-    path = root / LOCK_NAME
+def read_lock(path: Path) -> Lock | None:
+    """None where there is no such file. Raises TableError for a broken one."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates)
         return _parsed(content)
@@ -54,6 +61,9 @@ def read_lock(root: Path) -> Lock | None:
         return None
     except json.JSONDecodeError as error:
         span = SourceSpan(shown_path(path), error.lineno, error.colno, error.colno + 1)
+        if re.match("<{7}|={7}|>{7}", error.doc.split("\n")[error.lineno - 1]):
+            hint = "take one side; `router validate` then says how to record what the other one had"
+            raise TableError([Diagnostic(span, Code.BAD_FILE, "an unresolved merge", hint)]) from None
         problem = error.msg
     except (OSError, ValueError, RecursionError) as error:
         span = SourceSpan(shown_path(path))
@@ -62,23 +72,40 @@ def read_lock(root: Path) -> Lock | None:
     raise TableError([Diagnostic(span, Code.BAD_FILE, f"not a lock file: {problem}", hint)])
 
 
-def write_lock(root: Path, lock: Lock) -> None:
-    """Write the lock beside the protos, all of it or nothing; sorted, one line for each number. Raises TableError."""
+def lock_text(lock: Lock) -> str:
+    """As the file holds it: sorted, one line for each number."""
     content = {
         "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
         "messages": {
-            name: {"file": message.file, "fields": {str(e.number): f"{e.type} {e.name}" for e in by_number(message)}}
+            name: {"file": message.file, "fields": {str(entry.number): _field(entry) for entry in by_number(message)}}
             for name, message in sorted(lock.messages.items())
         },
         "enums": {
-            name: {"file": enum.file, "values": {entry.name: entry.number for entry in by_number(enum)}}
-            for name, enum in sorted(lock.enums.items())
+            name: {"file": enum.file, "values": _values(by_number(enum))} for name, enum in sorted(lock.enums.items())
         },
     }
-    path = root / LOCK_NAME
-    scratch = root / f".{LOCK_NAME}.new"
+    return json.dumps(content, indent=2) + "\n"
+
+
+def _field(entry: Entry) -> str:
+    """`float x`, or `oneof payload: Imu imu`."""
+    return f"oneof {entry.oneof}: {entry.type} {entry.name}" if entry.oneof else f"{entry.type} {entry.name}"
+
+
+def _values(entries: Iterable[Entry]) -> dict[str, str]:
+    """The name of each number, or its names."""
+    values: dict[str, str] = {}
+    for entry in entries:
+        known = values.get(str(entry.number))
+        values[str(entry.number)] = f"{known} {entry.name}" if known else entry.name
+    return values
+
+
+def write_lock(path: Path, lock: Lock) -> None:
+    """Write all of it or nothing. Raises TableError."""
+    scratch = path.with_name(f".{path.name}.new")
     try:
-        scratch.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        scratch.write_text(lock_text(lock), encoding="utf-8")
         scratch.replace(path)
     except OSError as error:
         scratch.unlink(missing_ok=True)
@@ -130,17 +157,18 @@ def _declarations(top: Mapping[str, Any], kind: str, members: str) -> Iterator[t
 
 def _field_entries(fields: Mapping[str, Any], message: str) -> Iterator[Entry]:
     for number, declared in fields.items():
-        type_, _, name = _text(declared, f"{message}.{number}").rpartition(" ")
-        if not number.isdecimal() or not type_:
+        found = _FIELD.fullmatch(_text(declared, f"{message}.{number}"))
+        if not number.isdecimal() or found is None:
             raise ValueError(f"{message} has '{number}: {declared}' where number, type and name belong")
-        yield Entry(int(number), name, type_)
+        yield Entry(int(number), found["name"], found["type"], found["oneof"] or "")
 
 
 def _value_entries(values: Mapping[str, Any], enum: str) -> Iterator[Entry]:
-    for name, number in values.items():
-        if not isinstance(number, int):
-            raise ValueError(f"{enum}.{name} is no number")
-        yield Entry(number, name)
+    for number, names in values.items():
+        if not _NUMBER.fullmatch(number):
+            raise ValueError(f"{enum} has '{number}: {names}' where number and name belong")
+        for name in _text(names, f"{enum}.{number}").split():
+            yield Entry(int(number), name)
 
 
 def _mapping(value: object, what: str) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""Reads the `.proto` and `.options` files of a folder and refuses what protoc would only stumble over.
+"""Reads the `.proto` and `.options` files of a folder, and finds what protoc would only stumble over.
 
 Knows no syntax beyond a file's first words.
 """
@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
@@ -20,10 +22,35 @@ _FILE_NAME = re.compile(r"[\w ./+,@-]+", re.ASCII)
 _SYNTAX = re.compile(rb"^\s*(syntax|edition)\s*=", re.MULTILINE)
 
 
-def read_folder(root: Path, blame: SourceSpan) -> dict[str, bytes]:
-    """The bytes of all files by name relative to `root`, with `/`, sorted. Hidden files are left alone.
+@dataclass(frozen=True)
+class Folder:
+    """`files` has the bytes of all readable files by name relative to `root`, with `/`, sorted.
 
-    Raises TableError with every finding; what is wrong with the folder itself is blamed on `blame`.
+    `faults` are the findings of a file, readable or not, by the same names.
+    """
+
+    root: Path
+    files: Mapping[str, bytes]
+    faults: Mapping[str, Sequence[Diagnostic]]
+
+    @property
+    def protos(self) -> Mapping[str, bytes]:
+        return {name: content for name, content in self.files.items() if name.endswith(PROTO)}
+
+    @cached_property
+    def sha256(self) -> str:
+        """Over names and contents."""
+        digest = hashlib.sha256()
+        for name, content in self.files.items():
+            digest.update(f"{name}\0{len(content)}\0".encode())
+            digest.update(content)
+        return digest.hexdigest()
+
+
+def read_folder(root: Path, blame: SourceSpan) -> Folder:
+    """The `.proto` and `.options` files below `root`; hidden ones are left alone.
+
+    What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder.
     """
     if not root.is_dir():
         raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {shown_path(root)}")])
@@ -35,22 +62,20 @@ def read_folder(root: Path, blame: SourceSpan) -> dict[str, bytes]:
     if not any(name.endswith(PROTO) for name in found):
         raise TableError([Diagnostic(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")])
     files = {}
-    findings = []
+    faults: dict[str, Sequence[Diagnostic]] = {}
     for name, path in sorted(found.items()):
         if not _FILE_NAME.fullmatch(name):
             hint = "take letters, digits, '_', '-' and '.'"
-            findings.append(Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint))
-            continue
+            faults[name] = [Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint)]
         try:
             files[name] = path.read_bytes()
         except OSError as error:
             message = f"cannot be read: {error.strerror}"
-            findings.append(Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message))
+            faults[name] = [Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]
         else:
-            findings += _text_findings(path, files[name])
-    if findings:
-        raise TableError(findings)
-    return files
+            if complaints := list(_text_findings(path, files[name])):
+                faults[name] = [*faults.get(name, ()), *complaints]
+    return Folder(root, files, faults)
 
 
 def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:
@@ -62,17 +87,3 @@ def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:
     if path.suffix == PROTO and not _SYNTAX.search(content):  # protoc would take it for proto2
         hint = 'begin it with `syntax = "proto3";`'
         yield Diagnostic(SourceSpan(shown_path(path)), Code.BAD_PROTO, "the file does not say its syntax", hint)
-
-
-def sha256_of(files: Mapping[str, bytes]) -> str:
-    """Over names and contents, in the order given."""
-    digest = hashlib.sha256()
-    for name, content in files.items():
-        digest.update(f"{name}\0{len(content)}\0".encode())
-        digest.update(content)
-    return digest.hexdigest()
-
-
-def folder_sha256(root: Path, blame: SourceSpan) -> str:
-    """Of a folder as it is now. Raises TableError, as `read_folder` does."""
-    return sha256_of(read_folder(root, blame))

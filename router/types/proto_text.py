@@ -13,6 +13,7 @@ from pathlib import Path
 from router.errors import SourceSpan, shown_path
 
 _TAB_WIDTH = 8
+_MERGE_MARK = re.compile(rb"(?:(<{7}|>{7})|={7})(?=\s|$)")
 _WORD = re.compile(rb'"[^"\n]*"?|[\w.]+|.')
 
 
@@ -49,6 +50,13 @@ class ProtoText:
             return None
         number, match = min(matches, key=lambda found: abs(found[0] - line))
         return self._span(number, match.start(), match.end())
+
+    def merge_mark(self, line: int) -> SourceSpan | None:
+        """The first mark that an unresolved merge left in the file, with `=======` only on this line."""
+        for number, text in enumerate(self._lines):
+            if (found := _MERGE_MARK.match(text)) and (found[1] or number == line):
+                return self._span(number, 0, found.end())
+        return None
 
     def before(self, line: int, column: int) -> str:
         """What stands before the place on its line, without blanks at its end."""

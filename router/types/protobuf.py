@@ -1,55 +1,64 @@
-"""The protobuf side of the type model: a folder of `.proto` files, compiled at start-up, and the envelope in it.
+"""The protobuf side of the type model: the envelope and what it imports, compiled at start-up.
 
-Knows nothing of routes; the names it is asked for come from the table's `envelope:`.
+What else is in the folder of `.proto` files is no part of it, and what is wrong there is a warning.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
-from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, shown_path
+from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
 from router.table.model import EnvelopeSettings
 from router.types.board_options import NO_OPTIONS, BoardOptions, OptionsFile, read_options
 from router.types.descriptors import container, message_of
-from router.types.lock_file import read_lock
+from router.types.envelope_file import envelope_file
+from router.types.lock_file import LOCK_NAME, read_lock
 from router.types.model import Enum, MessageType
-from router.types.proto_folder import OPTIONS, PROTO, read_folder, sha256_of
+from router.types.proto_folder import OPTIONS, PROTO, Folder, read_folder
 from router.types.proto_model import build_types
+from router.types.proto_scan import reached
 from router.types.proto_source import Part, ProtoSources
-from router.types.protoc import WELL_KNOWN, compile_protos
+from router.types.protoc import WELL_KNOWN, check_protos, compile_protos
+from router.types.protoc_errors import Homes, findings_of
 from router.types.sizes import framed_size, largest_beside, largest_encoding
 
 MessageClass = type[Message]
 
 
 class ProtoSchema:
-    """Everything that the `.proto` files below `root` declare, by full name.
+    """Everything that the compiled `.proto` files below `root` declare, by full name.
 
-    What they import of `google/protobuf` is among them. `sha256` is over the relative names and the bytes
-    of all `.proto` and `.options` files; `files` has those names.
+    What they import of `google/protobuf` is among them. `sha256` is over the relative names and the bytes of all
+    `.proto` and `.options` files of the folder; `files` has the names of the compiled ones. `envelope` is the full name
+    of the message that was asked for, `lock` the path of the lock file, `warnings` what is wrong with other files.
     """
 
     def __init__(
         self,
-        root: Path,
-        files: Mapping[str, bytes],
+        folder: Folder,
+        envelope: str,
+        lock: Path,
         compiled: FileDescriptorSet,
-        sources: ProtoSources,
         options: Mapping[str, OptionsFile],
+        warnings: Sequence[Diagnostic],
     ) -> None:
-        self.root = root
-        self.files = tuple(files)
-        self.sha256 = sha256_of(files)
-        self.sources = sources
+        self.root = folder.root
+        self.envelope = envelope
+        self.lock = lock
+        self.files = tuple(file.name for file in compiled.file if file.name in folder.files)
+        self.sha256 = folder.sha256
+        self.sources = _sources(folder, compiled)
+        self.warnings = tuple(warnings)
         self._options = options
         self._pool = DescriptorPool()
         for file in compiled.file:
@@ -57,7 +66,7 @@ class ProtoSchema:
         self.messages: Mapping[str, MessageType]
         self.enums: Mapping[str, Enum]
         names = [file.name for file in compiled.file]
-        self.messages, self.enums = build_types(self._pool, names, sources, self.board_options)
+        self.messages, self.enums = build_types(self._pool, names, self.sources, self.board_options)
 
     def message_class(self, name: str) -> MessageClass:
         """The Python class of a message, by full name. Raises KeyError."""
@@ -115,56 +124,116 @@ class Envelope:
     max_size: int
 
 
-def load_protos(root: Path, blame: SourceSpan | None = None) -> ProtoSchema:
-    """Compile all `.proto` files below `root`.
+def load_protos(settings: EnvelopeSettings, *, with_others: bool = False) -> ProtoSchema:
+    """Compile the file that declares the envelope, and what it imports.
 
-    Raises TableError with every finding. What is wrong with the folder itself is blamed on `blame`, the
-    place that names it, else on the folder.
+    Other files of the folder are checked only, `with_others` compiled too where nothing is wrong with them. Raises
+    TableError with every finding. What is wrong with the folder itself is blamed on the place that names it.
     """
-    root = root.resolve()
-    files = read_folder(root, blame or SourceSpan(shown_path(root)))
-    homes = _homes(root)
-    compiled = compile_protos(root, [name for name in files if name.endswith(PROTO)], homes)
-    paths = {file.name: (root if file.name in files else WELL_KNOWN) / file.name for file in compiled.file}
-    sources = ProtoSources(compiled.file, paths)
-    findings = _same_name_findings([file for file in compiled.file if file.name in files], sources, homes)
+    root = settings.protos.value.resolve()
+    folder = read_folder(root, settings.protos.span)
+    lock = lock_path(settings)
+    homes = cache(partial(_homes, lock))  # read where there is something to blame
+    file, envelope = envelope_file(folder, settings, homes)
+    used = reached(file, folder.files) if folder.faults else {file}
+    if faults := [finding for name in sorted(used) for finding in _faults(folder, name)]:
+        raise TableError(faults)
+    compiled = compile_protos(folder, [file], homes)
+    names = [each.name for each in compiled.file]
+    warnings, sound = _check_others(folder, names)
+    if with_others and sound:
+        compiled = compile_protos(folder, [*names, *sound], homes)
+        names = [each.name for each in compiled.file]
+    findings = _same_name_findings(folder, compiled, homes)
     options = {}
-    for name in files:
+    for name in folder.files:
         if name.endswith(OPTIONS):
-            options[name[: -len(OPTIONS)] + PROTO], complaints = read_options(root / name)
-            findings += complaints
+            proto = _proto_of(name)
+            options[proto], complaints = read_options(root / name)
+            if proto in names:
+                findings += complaints
+            else:
+                warnings += map(_unused, complaints)
     if findings:
         raise TableError(findings)
-    return ProtoSchema(root, files, compiled, sources, options)
+    return ProtoSchema(folder, envelope, lock, compiled, options, warnings)
 
 
 def without_protos() -> tuple[ProtoSchema, Envelope]:
     """What a table refers to that has no envelope: no declarations, and an envelope without payload cases."""
-    schema = ProtoSchema(Path(), {}, FileDescriptorSet(), ProtoSources((), {}), {})
+    schema = ProtoSchema(Folder(Path(), {}, {}), "", Path(), FileDescriptorSet(), {}, [])
     return schema, Envelope("", "", Empty, {}, 0)
 
 
-def _homes(root: Path) -> Mapping[str, str]:
+def lock_path(settings: EnvelopeSettings) -> Path:
+    """The lock file of these protos: beside them unless the table says where."""
+    path = settings.lock.value if settings.lock is not None else settings.protos.value / LOCK_NAME
+    return path.resolve()
+
+
+def _homes(lock: Path) -> Mapping[str, str]:
     """The files that the lock knows messages to belong to; what is wrong with the lock is `lock`'s finding."""
     try:
-        lock = read_lock(root)
+        locked = read_lock(lock)
     except TableError:
         return {}
-    return {name: message.file for name, message in lock.messages.items()} if lock is not None else {}
+    return {name: message.file for name, message in locked.messages.items()} if locked is not None else {}
 
 
-def _same_name_findings(
-    files: Sequence[FileDescriptorProto], sources: ProtoSources, homes: Mapping[str, str]
-) -> list[Diagnostic]:
+def _proto_of(name: str) -> str:
+    """The `.proto` file that a `.proto` or `.options` file is about."""
+    return name.removesuffix(OPTIONS) + PROTO if name.endswith(OPTIONS) else name
+
+
+def _faults(folder: Folder, proto: str) -> list[Diagnostic]:
+    return [each for name, faults in folder.faults.items() if _proto_of(name) == proto for each in faults]
+
+
+def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnostic], list[str]]:
+    """A warning for each file that was not compiled and has faults, and the `.proto` files among them without any."""
+    unused = [faults for name, faults in folder.faults.items() if _proto_of(name) not in compiled]
+    warnings = [_unused(faults[0], len(faults)) for faults in unused]
+    sound = [name for name in folder.protos if name not in compiled and name not in folder.faults]
+    if not sound:
+        return warnings, []
+    complaints = check_protos(folder, compiled, sound)
+    news = [complaint for complaint in complaints if complaint.file not in folder.faults]
+    files: dict[str, list[Diagnostic]] = {}
+    for finding in findings_of(news, folder, dict):
+        files.setdefault(finding.span.file, []).append(finding)
+    warnings += [_unused(findings[0], len(findings)) for findings in files.values()]
+    broken = {complaint.file for complaint in complaints}
+    return warnings, [name for name in sound if name not in broken]
+
+
+def _unused(finding: Diagnostic, count: int = 1) -> Diagnostic:
+    """The first fault of a file that is not compiled."""
+    more = f" (and {count - 1} more)" if count > 1 else ""
+    message = f"the envelope does not import this file, and it is left out: {finding.message}{more}"
+    return replace(finding, code=Code.UNUSED_PROTO, message=message)
+
+
+def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
+    names = [file.name for file in compiled.file]
+    paths = {name: (folder.root if name in folder.files else WELL_KNOWN) / name for name in names}
+    return ProtoSources(compiled.file, paths)
+
+
+def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Homes) -> list[Diagnostic]:
     """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
     names: dict[str, list[str]] = {}
-    for file in files:
+    for file in compiled.file:
+        if file.name not in folder.files:
+            continue
         for message in file.message_type:
             full = f"{file.package}.{message.name}" if file.package else message.name
             names.setdefault(message.name, []).append(full)
-    findings = []
+    findings: list[Diagnostic] = []
+    if all(len(same) == 1 for same in names.values()):
+        return findings
+    sources = _sources(folder, compiled)
     for short, same in names.items():
-        first, *others = sorted(same, key=lambda name: name not in homes)
+        first, *others = sorted(same, key=lambda name: name not in homes())
         place = sources.span(first)
         hint = f"the other is at {place.file}:{place.line}; names must differ even in different packages"
         text = f"there are two messages '{short}'"
@@ -173,17 +242,11 @@ def _same_name_findings(
 
 
 def find_envelope(schema: ProtoSchema, settings: EnvelopeSettings) -> Envelope:
-    """The message and the oneof that the table names, the message by full or short name.
+    """The message that the schema was loaded for, with the oneof that the table names.
 
-    Raises TableError: a name that does not exist, a member of the oneof that is no message.
+    Raises TableError: an oneof that does not exist, a member of it that is no message.
     """
-    wanted = settings.message
-    named = [name for name in schema.messages if wanted.value in (name, name.rpartition(".")[2])]
-    name = wanted.value if wanted.value in named else next(iter(named), None)
-    if name is None:
-        hint = did_you_mean(wanted.value, schema.messages)
-        message = f"no .proto file declares a message '{wanted.value}'"
-        raise TableError([Diagnostic(wanted.span, Code.BAD_VALUE, message, hint)])
+    name = schema.envelope
     descriptor = schema.descriptor(name)
     oneof = descriptor.oneofs_by_name.get(settings.oneof.value)
     if oneof is None:

@@ -10,13 +10,13 @@ import urllib.request
 from functools import partial
 from pathlib import Path
 
-from router.assets import asset
 from tests.acceptance.payloads import WIRE, sample
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.ros_speaker import Speaker
 from tests.acceptance.site import ROOT, RouterProcess, key, site, total, udp, wait_until
 from tests.acceptance.test_gateway import Headset, data_of, lines, repeating
 from tests.ports import free_port
+from tests.tables import PROTOS
 
 ONLY = """\
 metrics: {address: 127.0.0.1:METRICS}
@@ -28,7 +28,7 @@ gateways:
            publish_period: each, discovery_period: 200ms}
 """
 ROUTES = f"""\
-envelope: {{protos: {asset("protos")}, message: PBEnvelope, oneof: payload}}
+envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
 listen: {{rover: {{address: 127.0.0.5:LISTEN}}}}
 routes:
   imu_info: {{source: any, topics: [{{topic: gw/imu, type: comms/msg/ImuSensorInformation, fields: auto}}]}}

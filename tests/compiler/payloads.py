@@ -39,8 +39,8 @@ def rover_wire() -> Wire:
 
 
 def _wire(root: Path, name: str) -> Wire:
-    schema = load_protos(root)
     settings = EnvelopeSettings(Located(root, SPAN), Located(name, SPAN), Located("payload", SPAN))
+    schema = load_protos(settings)
     return schema, find_envelope(schema, settings)
 
 

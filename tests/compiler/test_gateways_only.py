@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from router.assets import asset
 from router.compiler import Checked, check_table
 from router.compiler.definitions import Definitions
 from router.compiler.differences import differences
@@ -14,9 +13,10 @@ from router.compiler.route_map import route_map
 from router.edges.shown import Known
 from router.edges.watching import watched_files
 from router.errors import Code, Diagnostic, Severity
+from tests.tables import PROTOS
 
 ONLY = "gateways: {headset: {transport: {udp: 127.0.0.9:8502}}}\n"
-ENVELOPE = f"envelope: {{protos: {asset('protos')}, message: PBEnvelope, oneof: payload}}\n"
+ENVELOPE = f"envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}\n"
 LISTEN = "listen: {rover: {address: 127.0.0.1:5000}}\n"
 ROUTES = "routes: {ph_info: {source: any, topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, fields: auto}]}}\n"
 
@@ -39,7 +39,7 @@ def said(found: Checked) -> list[str]:
 def test_it_compiles_and_nothing_is_to_be_said_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str
 ) -> None:
-    monkeypatch.chdir(asset("protos"))  # the lock here is none of its business
+    monkeypatch.chdir(PROTOS)  # the lock here is none of its business
     found = checked(tmp_path, version + ONLY)
     assert said(found) == []
     program = found.program

@@ -23,9 +23,8 @@ UNKNOWN_NUMBER = 30
 @cache
 def rover_envelope() -> Envelope:
     here = SourceSpan(__file__)
-    schema = load_protos(PROTOS)
-    names = Located("PBEnvelope", here), Located("payload", here)
-    return find_envelope(schema, EnvelopeSettings(Located(schema.root, here), *names))
+    settings = EnvelopeSettings(Located(PROTOS, here), Located("PBEnvelope", here), Located("payload", here))
+    return find_envelope(load_protos(settings), settings)
 
 
 def varint(value: int) -> bytes:

@@ -76,7 +76,7 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
     assert main(["new", *RADIATION, *FIELDS]) == OK
     new = added(before, contents(site))
     lock = new.pop("protos/envelope.lock.json")
-    assert '        "27": "SensorBoardRadiationInfo radiation_info"' in lock
+    assert '        "27": "oneof payload: SensorBoardRadiationInfo radiation_info"' in lock
     assert new.pop("protos/components/sensor_board/radiation.proto") == [
         "// Radiation info from the sensor board.",
         'syntax = "proto3";',
@@ -246,6 +246,25 @@ def test_a_type_that_several_messages_have_is_to_be_said_whose(site: Path, capsy
     assert main(["new", *RADIATION, "--fields", "side:Left.Side"]) == OK
 
 
+def test_the_type_of_a_field_may_be_in_a_file_that_nothing_imports_yet(site: Path) -> None:
+    proto = site / "protos/components/sensor_board/radiation_level.proto"
+    proto.write_text('syntax = "proto3";\nenum RadiationLevel { RADIATION_UNKNOWN = 0; }\n', encoding="utf-8")
+    assert main(["validate", "--strict", "routes/rover.yaml"]) == OK
+    assert main(["new", *RADIATION, "--fields", "level:RadiationLevel"]) == OK
+    text = (site / "protos/components/sensor_board/radiation.proto").read_text(encoding="utf-8")
+    assert 'import "components/sensor_board/radiation_level.proto";' in text
+    assert '"RADIATION_UNKNOWN"' in (site / "protos/envelope.lock.json").read_text(encoding="utf-8")
+
+
+def test_a_type_in_a_file_with_a_fault_is_missed_with_the_fault(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    proto = site / "protos/radiation_level.proto"
+    proto.write_text('syntax = "proto3";\nenum RadiationLevel { SENSOR_IDLE = 0; }\n', encoding="utf-8")
+    assert main(["new", *RADIATION, "--fields", "level:RadiationLevel"]) == BAD_USAGE
+    said = capsys.readouterr().err
+    assert "there is no type 'RadiationLevel' for 'level'" in said
+    assert "radiation_level.proto:2:23: warning[unused-proto]" in said
+
+
 @pytest.mark.parametrize(
     "stanza",
     [
@@ -338,7 +357,7 @@ def test_what_is_interrupted_while_it_is_checked_is_taken_back(site: Path, monke
 def test_a_number_that_was_given_out_once_stays_taken(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lock = site / "protos/envelope.lock.json"
     text = lock.read_text(encoding="utf-8")
-    was = '"26": "BasestationManualBrake manual_brake"'
+    was = '"26": "oneof payload: BasestationManualBrake manual_brake"'
     lock.write_text(text.replace(was, f'{was},\n        "27": "Gone gone_info"'), encoding="utf-8")
     envelope = site / "protos/components/common/envelope.proto"
     declared = envelope.read_text(encoding="utf-8")
@@ -391,3 +410,14 @@ def test_where_there_is_no_table_nothing_is_written(
     assert main(["new", *RADIATION]) == BAD_TABLE
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_lock_may_be_elsewhere(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lock = (site / "protos/envelope.lock.json").rename(site / "wire.lock.json")
+    for table in (site / "routes/rover.yaml", site / "routes/legacy.yaml"):
+        text = table.read_text(encoding="utf-8")
+        table.write_text(text.replace("oneof: payload", "oneof: payload, lock: ../wire.lock.json"), encoding="utf-8")
+    assert main(["new", *RADIATION]) == OK
+    assert "changed  wire.lock.json" in capsys.readouterr().out
+    assert '"27": "oneof payload: SensorBoardRadiationInfo radiation_info"' in lock.read_text(encoding="utf-8")
+    assert not (site / "protos/envelope.lock.json").exists()

@@ -32,7 +32,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
 
 @pytest.fixture
 def load(write: Write) -> Callable[[Mapping[str, str]], ProtoSchema]:
-    return lambda files: load_protos(write(files))
+    return lambda files: load_protos(settings(with_envelope(write(files))))
 
 
 @pytest.fixture
@@ -40,12 +40,22 @@ def refused(write: Write) -> Callable[[Mapping[str, str]], tuple[Diagnostic, ...
     """The findings of a folder that cannot be loaded."""
 
     def findings(files: Mapping[str, str]) -> tuple[Diagnostic, ...]:
-        root = write(files)
+        root = with_envelope(write(files))
         with pytest.raises(TableError) as caught:
-            load_protos(root)
+            load_protos(settings(root))
         return caught.value.diagnostics
 
     return findings
+
+
+def with_envelope(root: Path) -> Path:
+    """The folder with a file that declares `Envelope` and imports all others, unless one of these declares it."""
+    own = root / "zz_envelope.proto"
+    texts = {path: path.read_bytes() for path in root.rglob("*.proto") if path != own}
+    if not any(b"message Envelope" in text for text in texts.values()):
+        imports = "".join(f'import "{path.relative_to(root).as_posix()}";\n' for path in sorted(texts))
+        own.write_text(f'syntax = "proto3";\n{imports}message Envelope {{}}\n', encoding="utf-8")
+    return root
 
 
 @pytest.fixture
@@ -64,7 +74,7 @@ def settings(root: Path, message: str = "Envelope", oneof: str = "payload") -> E
 
 @pytest.fixture(scope="session")
 def rover_schema() -> ProtoSchema:
-    return load_protos(PROTOS)
+    return load_protos(settings(PROTOS, "PBEnvelope"))
 
 
 @pytest.fixture(scope="session")

@@ -62,7 +62,7 @@ def test_nested_types_have_full_names(load: Load) -> None:
     schema = load(
         {"a.proto": 'syntax = "proto3";\npackage p;\nmessage A { message B { enum C { X = 0; } C c = 1; } B b = 1; }'}
     )
-    assert list(schema.messages) == ["p.A", "p.A.B"]
+    assert list(schema.messages) == ["p.A", "p.A.B", "Envelope"]
     assert list(schema.enums) == ["p.A.B.C"]
     assert schema.messages["p.A"].fields[0].type is schema.messages["p.A.B"]
 

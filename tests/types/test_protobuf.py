@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.types.conftest import settings
 
@@ -49,7 +50,7 @@ def test_hash_changes_with_content_and_name_of_protos_and_options(load: Load) ->
 
 def test_message_class_has_a_pool_of_its_own(write: Write) -> None:
     root = write({"a.proto": ENVELOPE})
-    first, second = load_protos(root), load_protos(root)
+    first, second = load_protos(settings(root)), load_protos(settings(root))
     message = first.message_class("Imu")(x=1.5)
     assert second.message_class("Imu").FromString(message.SerializeToString()) != message
     assert second.message_class("Imu") is not first.message_class("Imu")
@@ -87,10 +88,10 @@ def test_envelope_size_counts_what_stands_beside_the_oneof(load: Load) -> None:
     assert find_envelope(load({"a.proto": text}), settings(Path())).max_size == 7 + 2 + 5
 
 
-def test_envelope_in_a_package_is_found_by_short_name(load: Load) -> None:
-    schema = load({"a.proto": ENVELOPE.replace("message Imu", "package rover;\nmessage Imu")})
-    assert find_envelope(schema, settings(Path())).name == "rover.Envelope"
-    assert find_envelope(schema, settings(Path(), "rover.Envelope")).name == "rover.Envelope"
+def test_envelope_in_a_package_is_found_by_short_name(write: Write) -> None:
+    root = write({"a.proto": ENVELOPE.replace("message Imu", "package rover;\nmessage Imu")})
+    assert load_protos(settings(root)).envelope == "rover.Envelope"
+    assert load_protos(settings(root, "rover.Envelope")).envelope == "rover.Envelope"
 
 
 @pytest.mark.parametrize(
@@ -107,10 +108,10 @@ def test_envelope_in_a_package_is_found_by_short_name(load: Load) -> None:
         ("Imu", "payload", "table.yaml:4:10: error[bad-value]: Imu has no oneof 'payload'"),
     ],
 )  # fmt: skip
-def test_wrong_name_in_the_table_is_a_finding_there(load: Load, message: str, oneof: str, finding: str) -> None:
-    schema = load({"a.proto": ENVELOPE})
+def test_wrong_name_in_the_table_is_a_finding_there(write: Write, message: str, oneof: str, finding: str) -> None:
+    named = settings(write({"a.proto": ENVELOPE}), message, oneof)
     with pytest.raises(TableError) as caught:
-        find_envelope(schema, settings(Path(), message, oneof))
+        find_envelope(load_protos(named), named)
     assert [str(found) for found in caught.value.diagnostics] == [finding]
 
 
@@ -124,3 +125,129 @@ def test_payload_case_that_is_no_message_is_a_finding_in_the_proto(load: Load) -
 
 def test_the_rovers_envelope_has_the_26_cases_of_the_existing_system(rover_envelope: Envelope) -> None:
     assert {case.number for case in rover_envelope.cases.values()} >= set(range(1, 27))
+
+
+MERGE = "keep what is right of both sides and delete the marks"
+STRAY = {
+    "does not compile": ("message A { int32 x = 1 }", 'b.proto:2:25: warning[unused-proto]: {}: Expected ";"'),
+    "imports what is not there": (
+        'import "nowhere";',
+        "b.proto:2:1: warning[unused-proto]: {}: there is no file 'nowhere' to import; known: a.proto, b.proto",
+    ),
+    "has a message of the same name": (
+        "message Imu {}",
+        'b.proto:2:9: warning[unused-proto]: {}: "Imu" is already defined in file "a.proto"',
+    ),
+    "has the envelope once more": (
+        "// message PBEnvelope\nmessage Old {\n  message Envelope {}\n}\nmessage Imu {}",
+        'b.proto:6:9: warning[unused-proto]: {}: "Imu" is already defined in file "a.proto"',
+    ),
+    "has many faults": (
+        "message Imu { float x = 1; }\nmessage Note {}\n",
+        'b.proto:2:9: warning[unused-proto]: {}: "Imu" is already defined in file "a.proto" (and 1 more)',
+    ),
+    "is in the middle of a merge": (
+        "<<<<<<< HEAD\nmessage A {}\n=======\n>>>>>>> b\n",
+        "b.proto:2:1: warning[unused-proto]: {}: an unresolved merge; " + MERGE,
+    ),
+}
+
+
+@pytest.mark.parametrize(("stray", "warning"), STRAY.values(), ids=STRAY.keys())
+def test_file_that_the_envelope_does_not_import_is_a_warning(write: Write, stray: str, warning: str) -> None:
+    schema = load_protos(settings(write({"a.proto": ENVELOPE, "b.proto": f'syntax = "proto3";\n{stray}'})))
+    said = "the envelope does not import this file, and it is left out"
+    assert [str(found) for found in schema.warnings] == [warning.format(said)]
+    assert schema.files == ("a.proto",)
+    assert list(schema.messages) == ["Imu", "Note", "Envelope"]
+
+
+def test_stray_files_that_cannot_be_read_and_their_options_are_warnings(write: Write) -> None:
+    root = write(
+        {"a.proto": ENVELOPE, "b.proto": "message B {}", "b.options": "B.x nonsense", "gr\u00f6\u00dfe.proto": ""}
+    )
+    (root / "c.proto").write_bytes(b'syntax = "proto3"; // gr\xf6sse')
+    (root / "d.proto").symlink_to("nowhere.proto")
+    warnings = load_protos(settings(root)).warnings
+    assert {(found.span.file, found.code) for found in warnings} == {
+        (name, Code.UNUSED_PROTO) for name in ("b.proto", "b.options", "c.proto", "d.proto", "table.yaml")
+    }
+
+
+def test_stray_file_without_a_fault_can_be_compiled_too(write: Write) -> None:
+    files = {
+        "a.proto": ENVELOPE,
+        "b.proto": 'syntax = "proto3"; message B {}',
+        "c.proto": 'syntax = "proto3"; import "d.proto"; message C {}',
+        "d.proto": "message D",
+    }
+    schema = load_protos(settings(write(files)), with_others=True)
+    assert set(schema.messages) == {"Imu", "Note", "Envelope", "B"}
+    assert [found.span.file for found in schema.warnings] == ["d.proto"]
+
+
+@pytest.mark.parametrize(
+    ("copy", "message", "lock", "chosen"),
+    [
+        ("", "Envelope", None, None),
+        ("", "Envelope", "b.proto", "b.proto"),
+        ("package old;", "Envelope", None, "a.proto"),
+        ("package old;", "Envelope", "a.proto", "a.proto"),
+        ("package old;", "old.Envelope", None, "b.proto"),
+    ],
+)
+def test_of_two_files_that_declare_the_envelope_the_locked_one_counts(
+    write: Write, copy: str, message: str, lock: str | None, chosen: str | None
+) -> None:
+    root = write({"a.proto": ENVELOPE, "b.proto": ENVELOPE.replace(";\n", f";\n{copy}\n", 1)})
+    if lock is not None:
+        declared = Declaration(lock, frozenset())
+        write_lock(root / LOCK_NAME, Lock("Envelope", "payload", 7, {"Envelope": declared}, {}))
+    if chosen is not None:
+        schema = load_protos(settings(root, message))
+        assert schema.sources.file(schema.envelope) == chosen
+        return
+    with pytest.raises(TableError) as caught:
+        load_protos(settings(root, message))
+    (finding,) = caught.value.diagnostics
+    assert str(finding) == (
+        "table.yaml:3:12: error[duplicate-message]: several files declare a message 'Envelope': a.proto and b.proto; "
+        "remove all but one, or give its full name if they have packages"
+    )
+
+
+DEEP = {
+    "rover/common/envelope.proto": ENVELOPE.replace("message Imu", 'import "rover/imu/imu.proto";\nmessage Old'),
+    "rover/imu/imu.proto": 'syntax = "proto3"; import "rover/imu/axis.proto"; message Imu { Axis x = 1; }',
+    "rover/imu/axis.proto": 'syntax = "proto3"; message Axis {}',
+}
+
+
+@pytest.mark.parametrize(
+    ("folder", "said"),
+    [
+        ("protos/rover", "`protos` is one folder too deep: common/envelope.proto imports 'rover/imu/imu.proto'; take"),
+        ("protos/rover/common", "`protos` is two folders too deep: envelope.proto imports 'rover/imu/imu.proto'; take"),
+        ("protos/rover/imu", "`protos` is two folders too deep: imu.proto imports 'rover/imu/axis.proto'; take"),
+        (
+            ".",
+            "`protos` is one folder too high: protos/rover/common/envelope.proto imports 'rover/imu/imu.proto'; take",
+        ),
+    ],
+)
+def test_wrong_folder_of_protos_is_said_to_be_it(write: Write, folder: str, said: str) -> None:
+    root = write({f"protos/{name}": text for name, text in DEEP.items()})
+    with pytest.raises(TableError) as caught:
+        load_protos(settings(root / folder))
+    (finding,) = caught.value.diagnostics
+    assert (finding.code, finding.span.line) == (Code.BAD_VALUE, 2)
+    assert f"{finding.message}; {finding.hint}".startswith(f"{said} protos, to which imports are relative")
+    load_protos(settings(root / "protos"))
+
+
+def test_folder_whose_imports_are_elsewhere_in_it_is_the_right_one(refused: Refused) -> None:
+    """`protos/rover` has all that the envelope imports, but not what that imports in its turn."""
+    files = {name: text for name, text in DEEP.items() if "axis" not in name}
+    (finding,) = refused({f"protos/{name}": text for name, text in files.items()})
+    assert finding.message == "there is no file 'rover/imu/imu.proto' to import"
+    assert finding.hint == "did you mean 'protos/rover/imu/imu.proto'?"

@@ -58,7 +58,7 @@ def proto(body: str) -> str:
         ),
         pytest.param(
             "message A {\n  Motr motor = 1;\n}",
-            'a.proto:3:3: error[bad-proto]: "Motr" is not defined',
+            "a.proto:3:3: error[bad-proto]: \"Motr\" is not defined; did you mean 'Motor'?",
             id="unknown type",
         ),
         pytest.param(
@@ -104,3 +104,40 @@ def test_every_broken_file_is_reported_but_not_what_imports_it(refused: Refused)
 def test_missing_import_hides_what_follows_from_it(refused: Refused) -> None:
     findings = refused({"c.proto": proto('import "nowhere.proto";\nmessage C { A a = 1; }')})
     assert [finding.message for finding in findings] == ["there is no file 'nowhere.proto' to import"]
+
+
+def test_missing_import_hides_what_another_file_imports_too(refused: Refused) -> None:
+    findings = refused(
+        {
+            "a.proto": proto('import "b.proto";\nimport "sub/c.proto";\nmessage A { B b = 1; C c = 2; }'),
+            "b.proto": proto('import "c.proto";\nmessage B { C c = 1; }'),
+            "c.proto": proto("message C {}"),
+        }
+    )
+    assert [(finding.message, finding.hint) for finding in findings] == [
+        ("there is no file 'sub/c.proto' to import", "did you mean 'c.proto'?")
+    ]
+
+
+def test_type_of_an_imported_file_with_another_package_is_told_with_its_name(refused: Refused) -> None:
+    (finding,) = refused(
+        {
+            "a.proto": proto('import "b.proto";\nmessage A { B b = 1; }'),
+            "b.proto": proto("package rover;\nmessage B {}"),
+        }
+    )
+    assert (finding.message, finding.hint) == ('"B" is not defined', "b.proto declares rover.B")
+
+
+def test_type_of_a_file_that_only_another_one_imports_needs_its_import(refused: Refused) -> None:
+    (finding,) = refused(
+        {
+            "a.proto": proto('import "b.proto";\nmessage A { C c = 1; }'),
+            "b.proto": proto('import "c.proto";\nmessage B { C c = 1; }'),
+            "c.proto": proto("message C {}"),
+        }
+    )
+    assert (finding.message, finding.hint) == (
+        '"C" is not defined',
+        'c.proto declares it: `import "c.proto";` is missing',
+    )

@@ -10,16 +10,16 @@ from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_pro
 from tests.tables import PROTOS
 
 _HERE = SourceSpan(__file__)
+_SETTINGS = EnvelopeSettings(
+    protos=Located(PROTOS, _HERE), message=Located("PBEnvelope", _HERE), oneof=Located("payload", _HERE)
+)
 
 
 @pytest.fixture(scope="session")
 def schema() -> ProtoSchema:
-    return load_protos(PROTOS)
+    return load_protos(_SETTINGS)
 
 
 @pytest.fixture(scope="session")
 def envelope(schema: ProtoSchema) -> Envelope:
-    settings = EnvelopeSettings(
-        protos=Located(schema.root, _HERE), message=Located("PBEnvelope", _HERE), oneof=Located("payload", _HERE)
-    )
-    return find_envelope(schema, settings)
+    return find_envelope(schema, _SETTINGS)
