@@ -9,16 +9,19 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.assets import asset, is_installed
-from router.cli import BAD_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import plural, print_findings
 from router.cli.tool_options import explained
-from router.errors import SourceSpan, did_you_mean, shown_path
+from router.errors import SourceSpan, TableError, did_you_mean, shown_path
+from router.table import load_table
 from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, Located
 from router.tools import UsageError
+from router.types.lock_file import short_name
 
 if TYPE_CHECKING:
     from router.types.lock import Conflict
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
 _DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there.
 A number that is reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written.
 `--accept` takes such a change when all boards get new firmware; `router validate` prints the command."""
+_PROTOS = f"folder of .proto files (default: as {DEFAULT_TABLE} says, if it is there)"
+_LOCK = "the lock file (default: as the table says, else envelope.lock.json in the folder)"
 _ACCEPT = "a change that is meant, called as the finding calls it: Message.field, Enum.VALUE, or a whole Message"
 
 
@@ -34,10 +39,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("schema", help=VERBS["schema"])
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     lock = actions.add_parser("lock", help="record new field numbers in the lock file", description=_DESCRIPTION)
-    lock.add_argument("--protos", type=Path, metavar="DIR", help="folder of .proto files (default: the rover's)")
-    lock.add_argument("--lock", type=Path, metavar="FILE", help="the lock file (default: envelope.lock.json in DIR)")
-    lock.add_argument("--message", metavar="NAME", help=f"the envelope (default: as the lock says, else {ENVELOPE})")
-    lock.add_argument("--oneof", metavar="NAME", help=f"its oneof (default: as the lock says, else {ONEOF})")
+    lock.add_argument("--protos", type=Path, metavar="DIR", help=_PROTOS)
+    lock.add_argument("--lock", type=Path, metavar="FILE", help=_LOCK)
+    lock.add_argument("--message", metavar="NAME", help=f"the envelope (default: of table or lock, else {ENVELOPE})")
+    lock.add_argument("--oneof", metavar="NAME", help=f"its oneof (default: of table or lock, else {ONEOF})")
     lock.add_argument("--accept", action="append", default=[], metavar="NAME", help=_ACCEPT)
 
 
@@ -54,8 +59,7 @@ def run(args: argparse.Namespace) -> int:
         what = f"{path} belongs to the installed router, and is lost when that is upgraded"
         raise UsageError(f"{what}; copy the protos with `router init`, and name yours: --protos protos")
     old = read_lock(path)
-    if old is not None:
-        settings = _settings(args, old.message, old.oneof)
+    settings = _with_names(settings, args, old)
     schema = load_protos(settings)
     envelope = find_envelope(schema, settings)
     found = conflicts(schema, envelope)
@@ -74,15 +78,34 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def _settings(args: argparse.Namespace, message: str = ENVELOPE, oneof: str = ONEOF) -> EnvelopeSettings:
-    root = args.protos or asset("protos")
-    span = SourceSpan(shown_path(root))
-    return EnvelopeSettings(
-        Located(root.absolute(), span),
-        Located(args.message or message, span),
-        Located(args.oneof or oneof, span),
-        Located(args.lock.absolute(), span) if args.lock is not None else None,
-    )
+def _settings(args: argparse.Namespace) -> EnvelopeSettings:
+    """Where the protos and the lock are. Raises TableError for a broken table."""
+    settings = None if args.protos else _of_default_table()
+    if settings is None:
+        root = args.protos or asset("protos")
+        span = SourceSpan(shown_path(root))
+        settings = EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))
+    return replace(settings, lock=Located(args.lock.absolute(), settings.protos.span)) if args.lock else settings
+
+
+def _of_default_table() -> EnvelopeSettings | None:
+    if not DEFAULT_TABLE.exists():
+        return None
+    table, findings = load_table(DEFAULT_TABLE)
+    if table is None:
+        raise TableError(findings)
+    if table.envelope is None:
+        raise UsageError(f"{DEFAULT_TABLE} has no 'envelope'; name the folder of the protos: --protos protos")
+    return table.envelope
+
+
+def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock | None) -> EnvelopeSettings:
+    """The envelope's names: as typed, else as the table says, else as the lock says in whatever package."""
+    locked = (short_name(lock.message), lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
+    message = args.message or settings.message.value or locked[0]
+    oneof = args.oneof or settings.oneof.value or locked[1]
+    span = settings.protos.span
+    return replace(settings, message=Located(message, span), oneof=Located(oneof, span))
 
 
 def _unknown(names: Sequence[str], found: Sequence[Conflict]) -> str:
@@ -96,13 +119,14 @@ def _unknown(names: Sequence[str], found: Sequence[Conflict]) -> str:
 
 
 def _summary(old: Lock | None, new: Lock) -> str:
-    added = _count(new) - (_count(old) if old is not None else 0)
+    added = _numbers(new) - (_numbers(old) if old is not None else set())
     size = f"an envelope takes up to {new.max_size} bytes"
     if old is not None and old.max_size != new.max_size:
         size += f" (it was {old.max_size}: flash the boards)"
-    return f"{plural(len(new.messages), 'message')}, {plural(added, 'new number')}; {size}"
+    return f"{plural(len(new.messages), 'message')}, {plural(len(added), 'new number')}; {size}"
 
 
-def _count(lock: Lock) -> int:
-    """Numbers given out."""
-    return sum(len(declared.entries) for declared in (*lock.messages.values(), *lock.enums.values()))
+def _numbers(lock: Lock) -> set[tuple[str, int, str]]:
+    """The numbers given out, whatever the package is."""
+    declared = (*lock.messages.items(), *lock.enums.items())
+    return {(short_name(owner), each.number, each.name) for owner, members in declared for each in members.entries}

@@ -90,4 +90,4 @@ def summary(table: RouteTable) -> str:
         "endpoint": len(table.endpoints),
         "gateway": len(table.gateways),
     }
-    return ", ".join(plural(count, noun) for noun, count in counts.items() if count)
+    return ", ".join(plural(count, noun) for noun, count in counts.items() if count) or "nothing to do"

@@ -19,10 +19,15 @@ from router.compiler.syntax import PLACEABLE, place
 from router.errors import SourceSpan
 
 INDENT = "    "
-_NOT_FINITE = {ast.unparse(ast.Constant(value)): str(value) for value in (math.nan, math.inf)}
-"""How Python writes them, and their names in expressions; what it writes for NaN holds infinities."""
-
 _PLACEHOLDER = re.compile(r"_expression_(\d+)_")
+
+
+class _NamedConstants(ast.NodeTransformer):
+    """Write `nan` and `inf` by name, for which Python has no literals."""
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        is_named = isinstance(node.value, float) and not math.isfinite(node.value)
+        return ast.Name(str(node.value)) if is_named else node
 
 
 class Source:
@@ -74,9 +79,7 @@ class Source:
 
         def replaced(found: re.Match[str]) -> str:
             node = self._expressions[int(found[1])]
-            text = ast.unparse(node)
-            for written, name in _NOT_FINITE.items():
-                text = text.replace(written, name)
+            text = ast.unparse(_NamedConstants().visit(copy.deepcopy(node)))
             return text if alone or isinstance(node, (ast.Constant, ast.Name, ast.Attribute, ast.Call)) else f"({text})"
 
         return _PLACEHOLDER.sub(replaced, line)

@@ -69,7 +69,13 @@ def ros_package_remedy(package: str) -> str:
     source = f"source the workspace that has the ROS package '{package}'"
     if not (ours / package).is_dir():
         return f"{source}, or install it"
-    return f"{source}; `router init` writes it to schemas/{package}, and docs/ros.md says how colcon builds it"
+    commands = (
+        "router init",
+        "export AMENT_PREFIX_PATH=$VIRTUAL_ENV",
+        f"colcon build --base-paths schemas/{package}",
+        ". install/setup.sh",
+    )
+    return f"{source}, or build it in an activated environment: `{' && '.join(commands)}`"
 
 
 def shared_memory(environ: Mapping[str, str], folder: Path = SHM) -> tuple[int, int]:

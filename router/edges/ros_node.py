@@ -39,15 +39,15 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
             # parameters fill the table's variables at start, so a service that sets them would pretend.
             context.init(list(ros_args), initialize_logging=False)
             node = Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
-        _refuse_sim_time(node)
+        _ignore_sim_time(node)
         return node
     except RCL_ERRORS as error:
         context.try_shutdown()
         raise StartError(f"the ROS node cannot be created: {error}") from error
 
 
-def _refuse_sim_time(node: Node) -> None:
-    """Warns of `use_sim_time`, and drops the subscription to /clock that the node has with it."""
+def _ignore_sim_time(node: Node) -> None:
+    """Warn of `use_sim_time`, and drop the subscription to /clock that comes with it."""
     if node.get_parameter(_SIM_TIME).value:
         logger.warning(
             f"{_SIM_TIME} is ignored: the router runs on real time (stamps, ttl, deadmen)",

@@ -33,6 +33,7 @@ _HINTS_FOR_MISSING = {
     "transport": "or say 'ignore: why'",
     "receive": "what its client publishes has to arrive somewhere",
 }
+_BELONG_TOGETHER = ("envelope", "listen", "routes")
 _HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with 'gateways' only needs none of them"
 NAME_FIELDS = ("fields", "send")
 """Keys under which the names of fields stand, each with an expression."""
@@ -137,7 +138,9 @@ def _missing_key(misfit: Misfit, tree: Node) -> Diagnostic:
     key = key_at(tree, misfit.path)
     span = key.span if key else _first_line(node_at(tree, misfit.path))
     is_whole_part = len(misfit.path) == _NAME_DEPTH
-    hint = _HINTS_FOR_MISSING.get(missing, "") if is_whole_part else "" if misfit.path else _HINT_FOR_WHOLE
+    hint = _HINTS_FOR_MISSING.get(missing, "") if is_whole_part else ""
+    if not misfit.path and missing in _BELONG_TOGETHER:
+        hint = _HINT_FOR_WHOLE
     return Diagnostic(span, Code.MISSING_KEY, f"{subject(misfit.path)} lacks the key '{missing}'", hint)
 
 

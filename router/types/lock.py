@@ -12,17 +12,17 @@ from __future__ import annotations
 
 import shlex
 from collections import defaultdict
-from collections.abc import Collection, Container, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor_pb2 import DescriptorProto
 
-from router.assets import asset
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 from router.table.model import ENVELOPE, ONEOF, Located
 from router.types.descriptors import declared_type
-from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, by_number, read_lock
+from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, by_number, read_lock, short_name
 from router.types.proto_source import Part
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -88,15 +88,13 @@ def extended_lock(schema: ProtoSchema, envelope: Envelope, accepted: Collection[
 
 def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None) -> str:
     """What records these protos, to be typed where the router runs."""
-    known = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
-    words = ["router", "schema", "lock"]
-    if schema.root != asset("protos").resolve():
-        words += ["--protos", shown_path(schema.root)]
+    message, oneof = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
+    words = ["router", "schema", "lock", "--protos", shown_path(schema.root)]
     if schema.lock != schema.root / LOCK_NAME:
         words += ["--lock", shown_path(schema.lock)]
-    if envelope.name != known[0]:
+    if short_name(envelope.name) != short_name(message):
         words += ["--message", envelope.name]
-    if envelope.oneof != known[1]:
+    if envelope.oneof != oneof:
         words += ["--oneof", envelope.oneof]
     return shlex.join(words)
 
@@ -106,8 +104,7 @@ def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
     messages = {}
     for name in schema.messages:
         if (file := schema.sources.file(name)) in schema.files:
-            fields = schema.descriptor(name).fields
-            messages[name] = Declaration(file, frozenset(map(_entry, fields)))
+            messages[name] = Declaration(file, frozenset(_entries(schema.descriptor(name))))
     enums = {}
     for name, declared in schema.enums.items():
         if (file := schema.sources.file(name)) in schema.files:
@@ -115,11 +112,13 @@ def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
     return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
 
 
-def _entry(field: FieldDescriptor) -> Entry:
-    oneof = field.containing_oneof
-    # protoc makes a oneof for each `optional` field, which is none on the wire: `_x` of `x`, or `X_x` if `_x` is taken.
-    name = "" if oneof is None or oneof.name.lstrip("X") == f"_{field.name}" else oneof.name
-    return Entry(field.number, field.name, declared_type(field), name)
+def _entries(message: Descriptor) -> Iterator[Entry]:
+    declared = DescriptorProto()
+    message.CopyToProto(declared)
+    optional = {field.number for field in declared.field if field.proto3_optional}  # protoc makes a oneof for each
+    for field in message.fields:
+        oneof = field.containing_oneof if field.number not in optional else None
+        yield Entry(field.number, field.name, declared_type(field), oneof.name if oneof is not None else "")
 
 
 def locked_size(schema: ProtoSchema) -> int | None:
@@ -233,7 +232,7 @@ class _Comparison:
         span = self._schema.span(envelope.name)
         if (names.get(lock.message, lock.message), locked.oneof) != (envelope.name, envelope.oneof):
             message = f"the lock is for the envelope {lock.message}.{lock.oneof}, not {envelope.name}.{envelope.oneof}"
-            self._refuse(envelope.name, "", span, message, "name that one in the table")
+            self._refuse(envelope.name, envelope.oneof, span, message, "name that one in the table")
         if names:
             old = min(names)
             more = f", and so for {len(names) - 1} more" if len(names) > 1 else ""
@@ -304,7 +303,7 @@ class _Comparison:
     def _refuse(
         self, owner: str, member: str, span: SourceSpan, message: str, hint: str, entries: Iterable[Entry] = ()
     ) -> None:
-        name = f"{owner}.{member}" if member else owner
+        name = f"{owner}.{member}"
         hint += f"; if it is intended, `{self._command} --accept {name}`"
         finding = Diagnostic(span, Code.WIRE_NUMBER_CONFLICT, message, hint)
         self.conflicts.append(Conflict(name, owner, finding, frozenset(entries)))

@@ -113,6 +113,11 @@ def write_lock(path: Path, lock: Lock) -> None:
         raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]) from None
 
 
+def short_name(name: str) -> str:
+    """Without package."""
+    return name.rpartition(".")[2]
+
+
 def by_number(declaration: Declaration) -> list[Entry]:
     """The members in an order that does not change from run to run."""
     return sorted(declaration.entries, key=lambda entry: (entry.number, entry.name))

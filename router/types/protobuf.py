@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from pathlib import Path
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
@@ -22,14 +21,14 @@ from router.table.model import EnvelopeSettings
 from router.types.board_options import NO_OPTIONS, BoardOptions, OptionsFile, read_options
 from router.types.descriptors import container, message_of
 from router.types.envelope_file import envelope_file
-from router.types.lock_file import LOCK_NAME, read_lock
+from router.types.lock_file import LOCK_NAME, Lock, read_lock
 from router.types.model import Enum, MessageType
 from router.types.proto_folder import OPTIONS, PROTO, Folder, read_folder
 from router.types.proto_model import build_types
 from router.types.proto_scan import reached
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos
-from router.types.protoc_errors import Homes, findings_of
+from router.types.protoc_errors import findings_of
 from router.types.sizes import framed_size, largest_beside, largest_encoding
 
 MessageClass = type[Message]
@@ -133,8 +132,9 @@ def load_protos(settings: EnvelopeSettings, *, with_others: bool = False) -> Pro
     root = settings.protos.value.resolve()
     folder = read_folder(root, settings.protos.span)
     lock = lock_path(settings)
-    homes = cache(partial(_homes, lock))  # read where there is something to blame
-    file, envelope = envelope_file(folder, settings, homes)
+    locked = _readable_lock(lock)
+    homes = {name: message.file for name, message in locked.messages.items()} if locked is not None else {}
+    file, envelope = envelope_file(folder, settings, locked)
     used = reached(file, folder.files) if folder.faults else {file}
     if faults := [finding for name in sorted(used) for finding in _faults(folder, name)]:
         raise TableError(faults)
@@ -152,8 +152,8 @@ def load_protos(settings: EnvelopeSettings, *, with_others: bool = False) -> Pro
             options[proto], complaints = read_options(root / name)
             if proto in names:
                 findings += complaints
-            else:
-                warnings += map(_unused, complaints)
+            elif complaints:
+                warnings.append(_unused(complaints[0], len(complaints)))
     if findings:
         raise TableError(findings)
     return ProtoSchema(folder, envelope, lock, compiled, options, warnings)
@@ -171,13 +171,12 @@ def lock_path(settings: EnvelopeSettings) -> Path:
     return path.resolve()
 
 
-def _homes(lock: Path) -> Mapping[str, str]:
-    """The files that the lock knows messages to belong to; what is wrong with the lock is `lock`'s finding."""
+def _readable_lock(path: Path) -> Lock | None:
+    """What is wrong with the lock is a finding of `check_lock`."""
     try:
-        locked = read_lock(lock)
+        return read_lock(path)
     except TableError:
-        return {}
-    return {name: message.file for name, message in locked.messages.items()} if locked is not None else {}
+        return None
 
 
 def _proto_of(name: str) -> str:
@@ -199,7 +198,7 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
     complaints = check_protos(folder, compiled, sound)
     news = [complaint for complaint in complaints if complaint.file not in folder.faults]
     files: dict[str, list[Diagnostic]] = {}
-    for finding in findings_of(news, folder, dict):
+    for finding in findings_of(news, folder, {}):
         files.setdefault(finding.span.file, []).append(finding)
     warnings += [_unused(findings[0], len(findings)) for findings in files.values()]
     broken = {complaint.file for complaint in complaints}
@@ -209,7 +208,7 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
 def _unused(finding: Diagnostic, count: int = 1) -> Diagnostic:
     """The first fault of a file that is not compiled."""
     more = f" (and {count - 1} more)" if count > 1 else ""
-    message = f"the envelope does not import this file, and it is left out: {finding.message}{more}"
+    message = f"the envelope does not use this file, and it is left out: {finding.message}{more}"
     return replace(finding, code=Code.UNUSED_PROTO, message=message)
 
 
@@ -219,7 +218,7 @@ def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
     return ProtoSources(compiled.file, paths)
 
 
-def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Homes) -> list[Diagnostic]:
+def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Mapping[str, str]) -> list[Diagnostic]:
     """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
     names: dict[str, list[str]] = {}
     for file in compiled.file:
@@ -233,7 +232,7 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Home
         return findings
     sources = _sources(folder, compiled)
     for short, same in names.items():
-        first, *others = sorted(same, key=lambda name: name not in homes())
+        first, *others = sorted(same, key=lambda name: name not in homes)
         place = sources.span(first)
         hint = f"the other is at {place.file}:{place.line}; names must differ even in different packages"
         text = f"there are two messages '{short}'"

@@ -6,7 +6,7 @@ Knows nothing of the type model: it hands on a FileDescriptorSet with source inf
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import grpc_tools
@@ -15,13 +15,13 @@ from grpc_tools import _protoc_compiler
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 from router.types.proto_folder import Folder
-from router.types.protoc_errors import EVERYTHING, Complaint, Homes, findings_of
+from router.types.protoc_errors import EVERYTHING, Complaint, findings_of
 
 WELL_KNOWN = Path(grpc_tools.__file__).parent / "_proto"
 """Where grpcio-tools keeps `google/protobuf/*.proto`."""
 
 
-def compile_protos(folder: Folder, names: Sequence[str], homes: Homes) -> FileDescriptorSet:
+def compile_protos(folder: Folder, names: Sequence[str], homes: Mapping[str, str]) -> FileDescriptorSet:
     """The descriptors of the named files and of what they import, dependencies first.
 
     Names are relative to the folder, with `/`, in ASCII and without quotes or backslashes. `homes`

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,9 +30,6 @@ _NOT_DEFINED = re.compile(r'^"(?P<name>[\w.]+)" is not defined\.')
 _NOT_IMPORTED = re.compile(r'^"(?P<name>[\w.]+)" seems to be defined in')
 _MEMBER_TAKEN = re.compile(r'^"\w+" is already defined in "(?P<holder>[\w.]+)"')
 
-Homes = Callable[[], Mapping[str, str]]
-"""The files that messages are known to belong to."""
-
 
 @dataclass(frozen=True, slots=True)
 class Complaint:
@@ -44,7 +41,7 @@ class Complaint:
     message: str
 
 
-def findings_of(complaints: Sequence[Complaint], folder: Folder, homes: Homes) -> list[Diagnostic]:
+def findings_of(complaints: Sequence[Complaint], folder: Folder, homes: Mapping[str, str]) -> list[Diagnostic]:
     """One finding for each fault; what only follows from another one is left out.
 
     Of two messages of one name, the one that is not where `homes` has it is blamed.
@@ -133,10 +130,10 @@ def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:
     return "; ".join(parts)
 
 
-def _newcomer(complaint: Complaint, root: Path, homes: Homes) -> Diagnostic | None:
+def _newcomer(complaint: Complaint, root: Path, homes: Mapping[str, str]) -> Diagnostic | None:
     """protoc blames the file that comes last in the alphabet; where that one had the message first, blame the other."""
     taken = _TYPE_TAKEN.match(complaint.message)
-    if taken is None or taken["other"] is None or homes().get(taken["name"]) != complaint.file:
+    if taken is None or taken["other"] is None or homes.get(taken["name"]) != complaint.file:
         return None
     short = taken["name"].rpartition(".")[2]
     span = ProtoText(root / taken["other"]).nearest(rf"(?<=\bmessage ){short}\b", 0)

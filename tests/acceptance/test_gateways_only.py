@@ -19,6 +19,7 @@ from tests.ports import free_port
 from tests.tables import PROTOS
 
 ONLY = """\
+version: 1
 metrics: {address: 127.0.0.1:METRICS}
 foxglove: {address: 127.0.0.1:FOXGLOVE}
 record: {directory: recordings, last: 10s}

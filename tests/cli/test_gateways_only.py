@@ -9,6 +9,7 @@ import pytest
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 
 TABLE = """\
+version: 1
 gateways:
   headset: {transport: {udp: 127.0.0.9:8502}}
 """

@@ -116,7 +116,7 @@ def test_what_is_accepted_by_name_is_recorded_and_the_rest_refused(
     assert capsys.readouterr().out == (
         "accepted: Motor.rpm is of type int32 instead of float\n"
         "accepted: Envelope.motor has number 3 instead of 1\n"
-        "envelope.lock.json: 2 messages, 1 new number; an envelope takes up to 15 bytes (it was 7: flash the boards)\n"
+        "envelope.lock.json: 2 messages, 2 new numbers; an envelope takes up to 15 bytes (it was 7: flash the boards)\n"
     )
     locked = json.loads(proto.with_name("envelope.lock.json").read_text())["messages"]
     assert locked["Motor"]["fields"] == {"1": "int32 rpm", "2": "bool on"}

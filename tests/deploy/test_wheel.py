@@ -161,6 +161,7 @@ def test_an_installation_is_told_how_to_get_ros_without_make(monkeypatch: pytest
     monkeypatch.setattr(router.assets, "_PACKAGE", ROOT)  # what is in the checkout is installed then
     assert ros_remedy() == ("run `pip install 'rover-router[ros]'`, or source the setup.sh of an installed ROS 2 Jazzy")
     assert ros_package_remedy("comms") == (
-        "source the workspace that has the ROS package 'comms'; `router init` writes it to schemas/comms, "
-        "and docs/ros.md says how colcon builds it"
+        "source the workspace that has the ROS package 'comms', or build it in an activated environment: "
+        "`router init && export AMENT_PREFIX_PATH=$VIRTUAL_ENV && "
+        "colcon build --base-paths schemas/comms && . install/setup.sh`"
     )

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from time import monotonic, sleep
+from typing import Any
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -50,13 +51,18 @@ def main() -> None:
     )
     rclpy.init(args=[])
     node = rclpy.create_node("peer")
+
+    def on_matched(status: Any) -> None:
+        if status.current_count_change > 0:  # not where a publisher of an earlier test is found to be gone
+            print("matched", file=lines)
+
     node.create_subscription(
         installed_class(arguments.type),
         arguments.topic,
         lambda data: print(data.hex(), file=lines),
         qos,
         raw=True,
-        event_callbacks=SubscriptionEventCallbacks(matched=lambda _: print("matched", file=lines)),
+        event_callbacks=SubscriptionEventCallbacks(matched=on_matched),
     )
     spin_until_stdin_ends(node)
 

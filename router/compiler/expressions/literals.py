@@ -45,7 +45,7 @@ def folded(result: Typed) -> Typed:
     except ArithmeticError as error:
         raise Finding(result.span, Code.OUT_OF_RANGE, str(error)) from None
     if isinstance(value, float) and not math.isfinite(value):
-        raise Finding(result.span, Code.OUT_OF_RANGE, f"this is {value}")
+        raise Finding(result.span, Code.OUT_OF_RANGE, f"this is always {value}", f"write {value} if that is meant")
     kind = IntKind(value, value) if isinstance(value, int) else result.kind
     return Typed.at(result.span, kind, ast.Constant(value))
 
