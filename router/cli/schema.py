@@ -68,6 +68,9 @@ def run(args: argparse.Namespace) -> int:
     accepted = [each for each in found if each.name in args.accept or each.owner in args.accept]
     if refused := [each for each in found if each not in accepted]:
         print_findings(sorted((each.finding for each in refused), key=lambda finding: finding.span), sys.stdout)
+        if len(found) > 1:
+            names = " ".join(f"--accept {each.name}" for each in found)
+            print(f"nothing was written; if all of it is intended, say so in one command: {names}")
         return BAD_TABLE
     new = extended_lock(schema, envelope, accepted)
     if new != old:

@@ -15,6 +15,7 @@ from router.edges.log import logger
 from router.edges.udp import Listener
 from router.errors import StartError
 from router.table.model import RouteTable
+from router.types.proto_folder import walk
 
 PERIOD = 0.5
 """Seconds between two looks. A change is told when the second look finds it the same: editors write in pieces."""
@@ -103,7 +104,7 @@ def watched_files(table: RouteTable) -> list[Path]:
     paths = [config.path for config in configs if config.path is not None]
     protos: Iterable[Path] = ()
     if table.envelope is not None:
-        protos = table.envelope.protos.value.rglob("*")
+        protos = walk(table.envelope.protos.value)
         if table.envelope.lock is not None:
             paths.append(table.envelope.lock.value)
     return [*table.files, *paths, *protos]

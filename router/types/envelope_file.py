@@ -21,13 +21,14 @@ def envelope_file(folder: Folder, settings: EnvelopeSettings, locked: Lock | Non
     Raises TableError when there is none or more than one, and when `protos` is the wrong folder.
     """
     wanted = settings.message.value
-    found = declaring(wanted, folder.protos)
+    declared = declaring(wanted, folder.protos)
+    found = [(file, name) for file, name in declared if name in scan(folder.files[file]).messages]
     if not found:
         raise TableError(_missing(folder, settings))
     envelope = locked.messages.get(locked.message) if locked is not None else None
 
-    def rank(declared: tuple[str, str]) -> tuple[bool, bool, bool]:
-        file, name = declared
+    def rank(each: tuple[str, str]) -> tuple[bool, bool, bool]:
+        file, name = each
         is_locked = envelope is not None and file == envelope.file
         return is_locked, name == wanted, scan(folder.files[file]).is_top_level(name)
 
@@ -50,7 +51,7 @@ def _missing(folder: Folder, settings: EnvelopeSettings) -> list[Diagnostic]:
         if (above := _folder_above(folder, file)) is not None:
             return [_too_deep(folder, settings, above, file)]
     wanted = settings.message
-    hint = did_you_mean(wanted.value, [name for content in folder.protos.values() for name in scan(content).names])
+    hint = did_you_mean(wanted.value, [name for content in folder.protos.values() for name in scan(content).messages])
     message = f"no .proto file declares a message '{wanted.value}'"
     faults = [each for found in folder.faults.values() for each in found]
     return [Diagnostic(wanted.span, Code.BAD_VALUE, message, hint), *faults]

@@ -11,7 +11,7 @@ in it: that it was only renamed cannot be told.
 from __future__ import annotations
 
 import shlex
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -104,11 +104,13 @@ def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
     messages = {}
     for name in schema.messages:
         if (file := schema.sources.file(name)) in schema.files:
-            messages[name] = Declaration(file, frozenset(_entries(schema.descriptor(name))))
+            entries = frozenset(_entries(schema.descriptor(name)))
+            messages[name] = Declaration(file, entries, _reserved(schema, name))
     enums = {}
     for name, declared in schema.enums.items():
         if (file := schema.sources.file(name)) in schema.files:
-            enums[name] = Declaration(file, frozenset(Entry(number, value) for value, number in declared.values))
+            entries = frozenset(Entry(number, value) for value, number in declared.values)
+            enums[name] = Declaration(file, entries, _reserved(schema, name))
     return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
 
 
@@ -119,6 +121,10 @@ def _entries(message: Descriptor) -> Iterator[Entry]:
     for field in message.fields:
         oneof = field.containing_oneof if field.number not in optional else None
         yield Entry(field.number, field.name, declared_type(field), oneof.name if oneof is not None else "")
+
+
+def _reserved(schema: ProtoSchema, name: str) -> frozenset[tuple[int, int]]:
+    return frozenset((numbers.start, numbers.stop - 1) for numbers in schema.reserved_numbers(name))
 
 
 def locked_size(schema: ProtoSchema) -> int | None:
@@ -138,7 +144,8 @@ def _extended(
         now = current[name].entries
         named = {(entry.number, entry.name) for entry in now}
         kept = {entry for entry in locked[name].entries if (entry.number, entry.name) not in named}
-        extended[name] = replace(current[name], entries=now | (kept - dropped.get(name, set())))
+        reserved = locked[name].reserved | current[name].reserved
+        extended[name] = replace(current[name], entries=now | (kept - dropped.get(name, set())), reserved=reserved)
     return extended
 
 
@@ -165,12 +172,14 @@ def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
 
 
 def _moved(lock: Lock, current: Lock) -> dict[str, str]:
-    """From the full name of what is gone to that of what is new, if only the package differs."""
+    """From the full name of what is gone to that of what is new, if only the package differs, and that is certain."""
     moved: dict[str, str] = {}
     for locked, there in ((lock.messages, current.messages), (lock.enums, current.enums)):
-        new = {_without_package(name, current.messages): name for name in there if name not in locked}
-        gone = {name: _without_package(name, lock.messages) for name in locked if name not in there}
-        moved |= {name: new[short] for name, short in gone.items() if short in new}
+        new = [(_without_package(name, current.messages), name) for name in there if name not in locked]
+        gone = [(_without_package(name, lock.messages), name) for name in locked if name not in there]
+        counts = Counter(short for short, _ in gone)
+        known = dict(new)
+        moved |= {name: known[short] for short, name in gone if short in known and counts[short] == 1}
     return moved
 
 
@@ -255,6 +264,10 @@ class _Comparison:
                 self._refuse_number(owner, [each for each in live if each.name == entry.name], entry, holders)
             elif holders and not any((each.number, each.name) in _names(current) for each in holders):
                 self._refuse_holder(owner, holders[0], entry)
+            elif any(first <= entry.number <= last for first, last in locked.reserved):
+                message = f"number {entry.number} of {owner} is reserved, and given to '{entry.name}'"
+                hint = "the lock has it as reserved: take a free one"
+                self._refuse(owner, entry.name, self._span(owner, entry, Part.NUMBER), message, hint)
             else:
                 self._add(self._schema.span(owner, entry.name), f"the lock does not know {owner}.{entry.name}")
         numbers = {entry.number for entry in current.entries}

@@ -18,6 +18,7 @@ LOCK_NAME = "envelope.lock.json"
 
 _FIELD = re.compile(r"(?:oneof (?P<oneof>\w+): )?(?P<type>\S.*) (?P<name>\w+)")
 _NUMBER = re.compile(r"-?[0-9]+")
+_RANGE = re.compile(r"(-?[0-9]+) to (-?[0-9]+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +36,14 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Declaration:
-    """A message or an enum: the file that declares it, relative to the folder of the protos, and its members."""
+    """A message or an enum: the file that declares it, relative to the folder of the protos, and its members.
+
+    `reserved` are ranges of numbers, the first and the last of each.
+    """
 
     file: str
     entries: frozenset[Entry]
+    reserved: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,14 +82,22 @@ def lock_text(lock: Lock) -> str:
     content = {
         "envelope": {"message": lock.message, "oneof": lock.oneof, "max_size": lock.max_size},
         "messages": {
-            name: {"file": message.file, "fields": {str(entry.number): _field(entry) for entry in by_number(message)}}
+            name: _declaration(message, "fields", {str(each.number): _field(each) for each in by_number(message)})
             for name, message in sorted(lock.messages.items())
         },
         "enums": {
-            name: {"file": enum.file, "values": _values(by_number(enum))} for name, enum in sorted(lock.enums.items())
+            name: _declaration(enum, "values", _values(by_number(enum))) for name, enum in sorted(lock.enums.items())
         },
     }
     return json.dumps(content, indent=2) + "\n"
+
+
+def _declaration(declared: Declaration, kind: str, members: Mapping[str, str]) -> dict[str, object]:
+    """`reserved` is a list of ranges, the first and the last number of each; left out where there is none."""
+    content: dict[str, object] = {"file": declared.file, kind: members}
+    if declared.reserved:
+        content["reserved"] = [f"{first} to {last}" for first, last in sorted(declared.reserved)]
+    return content
 
 
 def _field(entry: Entry) -> str:
@@ -144,20 +157,32 @@ def _parsed(content: object) -> Lock:
         oneof=_text(envelope.get("oneof"), "envelope.oneof"),
         max_size=max_size,
         messages={
-            name: Declaration(file, frozenset(_field_entries(members, name)))
-            for name, file, members in _declarations(top, "messages", "fields")
+            name: Declaration(file, frozenset(_field_entries(members, name)), reserved)
+            for name, file, members, reserved in _declarations(top, "messages", "fields")
         },
         enums={
-            name: Declaration(file, frozenset(_value_entries(members, name)))
-            for name, file, members in _declarations(top, "enums", "values")
+            name: Declaration(file, frozenset(_value_entries(members, name)), reserved)
+            for name, file, members, reserved in _declarations(top, "enums", "values")
         },
     )
 
 
-def _declarations(top: Mapping[str, Any], kind: str, members: str) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+def _declarations(
+    top: Mapping[str, Any], kind: str, members: str
+) -> Iterator[tuple[str, str, Mapping[str, Any], frozenset[tuple[int, int]]]]:
     for name, content in _mapping(top.get(kind), kind).items():
-        declaration = _mapping(content, name)
-        yield name, _text(declaration.get("file"), f"{name}.file"), _mapping(declaration.get(members), name)
+        declared = _mapping(content, name)
+        file = _text(declared.get("file"), f"{name}.file")
+        reserved = frozenset(_range(text, f"{name}.reserved") for text in declared.get("reserved", ()))
+        yield name, file, _mapping(declared.get(members), name), reserved
+
+
+def _range(text: object, what: str) -> tuple[int, int]:
+    """`20 to 29`."""
+    found = _RANGE.fullmatch(_text(text, what))
+    if found is None:
+        raise ValueError(f"{what} has '{text}' where two numbers belong")
+    return int(found[1]), int(found[2])
 
 
 def _field_entries(fields: Mapping[str, Any], message: str) -> Iterator[Entry]:

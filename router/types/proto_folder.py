@@ -6,6 +6,7 @@ Knows no syntax beyond a file's first words.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ OPTIONS = ".options"
 
 _HIDDEN = re.compile(r"(^|/)\.")
 _FILE_NAME = re.compile(r"[\w ./+,@-]+", re.ASCII)
-_SYNTAX = re.compile(rb"^\s*(syntax|edition)\s*=", re.MULTILINE)
+_SYNTAX = re.compile(rb"^(?:\xef\xbb\xbf|\s|/\*.*?\*/)*(?:syntax|edition)\s*=", re.MULTILINE | re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Folder:
         """Over names and contents."""
         digest = hashlib.sha256()
         for name, content in self.files.items():
-            digest.update(f"{name}\0{len(content)}\0".encode())
+            digest.update(os.fsencode(f"{name}\0{len(content)}\0"))
             digest.update(content)
         return digest.hexdigest()
 
@@ -56,7 +57,7 @@ def read_folder(root: Path, blame: SourceSpan) -> Folder:
         raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {shown_path(root)}")])
     found = {
         name: path
-        for path in root.rglob("*")
+        for path in walk(root)
         if path.suffix in (PROTO, OPTIONS) and not _HIDDEN.search(name := path.relative_to(root).as_posix())
     }
     if not any(name.endswith(PROTO) for name in found):
@@ -76,6 +77,15 @@ def read_folder(root: Path, blame: SourceSpan) -> Folder:
             if complaints := list(_text_findings(path, files[name])):
                 faults[name] = [*faults.get(name, ()), *complaints]
     return Folder(root, files, faults)
+
+
+def walk(root: Path) -> Iterator[Path]:
+    """All files and folders below a folder, through links to other folders as well, each folder once."""
+    seen = set()
+    for folder, inner, files in os.walk(root, followlinks=True):
+        seen.add(os.path.realpath(folder))
+        inner[:] = [name for name in inner if os.path.realpath(Path(folder, name)) not in seen]
+        yield from (Path(folder, name) for name in (*inner, *files))
 
 
 def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:

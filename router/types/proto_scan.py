@@ -20,10 +20,11 @@ _SIGNS = frozenset("{;}")
 
 @dataclass(frozen=True, slots=True)
 class Scanned:
-    """`names` are the full names of all messages and enums, nested ones as well."""
+    """`names` are the full names of all messages and enums, nested ones as well; `messages` those of messages."""
 
     package: str
     names: tuple[str, ...]
+    messages: frozenset[str]
     imports: tuple[str, ...]
 
     def is_top_level(self, name: str) -> bool:
@@ -34,6 +35,7 @@ def scan(content: bytes) -> Scanned:
     """The declarations and imports of a file, in order."""
     package = ""
     names: list[str] = []
+    messages: set[str] = set()
     imports: list[str] = []
     blocks: list[str] = []  # for each open brace the full name of the message, or that of the one around
     for statement, opens in _statements(content):
@@ -42,16 +44,18 @@ def scan(content: bytes) -> Scanned:
                 package = name
             case ["import", *_, name]:
                 imports.append(name.strip("\"'"))
-            case ["message" | "enum", name] if opens:
+            case [*_, ("message" | "enum") as kind, name] if opens:  # `export` or `local` may stand before it
                 around = blocks[-1] if blocks else package
                 names.append(f"{around}.{name}" if around else name)
+                if kind == "message":
+                    messages.add(names[-1])
                 blocks.append(names[-1])
                 continue
             case ["}"]:
                 del blocks[-1:]
         if opens:
             blocks.append(blocks[-1] if blocks else package)
-    return Scanned(package, tuple(names), tuple(imports))
+    return Scanned(package, tuple(names), frozenset(messages), tuple(imports))
 
 
 def _statements(content: bytes) -> Iterator[tuple[list[str], bool]]:
@@ -72,7 +76,7 @@ def _statements(content: bytes) -> Iterator[tuple[list[str], bool]]:
 
 def declaring(name: str, files: Mapping[str, bytes]) -> list[tuple[str, str]]:
     """The files that declare a message or an enum of this full or short name, each with the full name."""
-    short = re.compile(rb"\b(?:message|enum)\s+" + re.escape(name.rpartition(".")[2].encode()) + rb"\b")
+    short = re.compile(rb"\b" + re.escape(name.rpartition(".")[2].encode()) + rb"\b")
     return [
         (file, full)
         for file, content in files.items()

@@ -54,7 +54,7 @@ class ProtoSchema:
         self.root = folder.root
         self.envelope = envelope
         self.lock = lock
-        self.files = tuple(file.name for file in compiled.file if file.name in folder.files)
+        self.files = tuple(file.name for file in compiled.file if (folder.root / file.name).is_file())
         self.sha256 = folder.sha256
         self.sources = _sources(folder, compiled)
         self.warnings = tuple(warnings)
@@ -214,7 +214,7 @@ def _unused(finding: Diagnostic, count: int = 1) -> Diagnostic:
 
 def _sources(folder: Folder, compiled: FileDescriptorSet) -> ProtoSources:
     names = [file.name for file in compiled.file]
-    paths = {name: (folder.root if name in folder.files else WELL_KNOWN) / name for name in names}
+    paths = {name: path if (path := folder.root / name).is_file() else WELL_KNOWN / name for name in names}
     return ProtoSources(compiled.file, paths)
 
 
@@ -222,7 +222,7 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Mapp
     """Messages of two packages under one short name: ROS interfaces and the table only have short names."""
     names: dict[str, list[str]] = {}
     for file in compiled.file:
-        if file.name not in folder.files:
+        if not (folder.root / file.name).is_file():
             continue
         for message in file.message_type:
             full = f"{file.package}.{message.name}" if file.package else message.name

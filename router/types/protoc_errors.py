@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +28,7 @@ _RESERVED = re.compile(r'Field "(?P<field>\w+)" uses reserved number (?P<number>
 _TYPE_TAKEN = re.compile(r'^"(?P<name>[\w.]+)" is already defined(?: in file "(?P<other>[^"]+)")?')
 _NOT_DEFINED = re.compile(r'^"(?P<name>[\w.]+)" is not defined\.')
 _NOT_IMPORTED = re.compile(r'^"(?P<name>[\w.]+)" seems to be defined in')
+_NOT_A_TYPE = re.compile(r'^"(?P<name>[\w.]+)" is not a type')
 _MEMBER_TAKEN = re.compile(r'^"\w+" is already defined in "(?P<holder>[\w.]+)"')
 
 
@@ -78,8 +79,9 @@ def _without_consequences(complaints: Sequence[Complaint], names: Container[str]
         if (taken := _TYPE_TAKEN.match(complaint.message)) and taken["name"].rpartition(".")[0] in twice:
             continue  # so too where the other message is in another file
         used = _NOT_IMPORTED.match(complaint.message)
-        if used and used["name"] in twice:
-            continue  # it means the other message of that name
+        meant = used or _NOT_A_TYPE.match(complaint.message)
+        if meant and meant["name"] in twice:
+            continue  # it means the other declaration of that name
         if complaint.file in lacking and (_NOT_DEFINED.match(complaint.message) or used):
             continue  # it would be, by the import
         if (imported := _IMPORT_FAILED.fullmatch(complaint.message)) and imported["name"] in names:
@@ -96,7 +98,8 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
     if reserved := _RESERVED.match(complaint.message):  # protoc blames the `reserved`, not who breaks it
         span = text.nearest(rf"\b{reserved['field']}\s*=\s*{reserved['number']}\b", complaint.line) or span
     if missing := _IMPORT_FAILED.fullmatch(complaint.message):
-        hint = _import_hint(missing["name"], complaint.file, files)
+        others = files.keys() - {complaint.file, *scan(files.get(complaint.file, b"")).imports}
+        hint = _import_hint(missing["name"], complaint.file, others)
         return Diagnostic(span, Code.BAD_PROTO, f"there is no file '{missing['name']}' to import", hint)
     if undefined := _NOT_DEFINED.match(complaint.message) or _NOT_IMPORTED.match(complaint.message):
         hint = _type_hint(undefined["name"], complaint.file, files)
@@ -105,8 +108,8 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
     return Diagnostic(span, _code(complaint, text), what.rstrip("."), advice.rstrip("."))
 
 
-def _import_hint(name: str, importer: str, files: Iterable[str]) -> str:
-    """The file that is meant: beside the importing one, or of that name elsewhere, or of a similar name."""
+def _import_hint(name: str, importer: str, files: Collection[str]) -> str:
+    """Which of `files`, not imported yet, is meant: beside the importing one, or of that name elsewhere, or similar."""
     beside = posixpath.normpath(posixpath.join(posixpath.dirname(importer), name))
     same = [file for file in files if posixpath.basename(file).lower() == posixpath.basename(name).lower()]
     if beside in same:
@@ -122,7 +125,7 @@ def _type_hint(name: str, user: str, files: Mapping[str, bytes]) -> str:
     if not found:
         close = nearest(name, [known for content in files.values() for known in scan(content).names])
         return f"did you mean '{close}'?" if close else ""
-    imported = scan(files[user]).imports
+    imported = scan(files.get(user, b"")).imports
     parts = []
     for file, full in found:
         declared = f"{file} declares it" if full == name else f"{file} declares {full}"
@@ -136,7 +139,7 @@ def _newcomer(complaint: Complaint, root: Path, homes: Mapping[str, str]) -> Dia
     if taken is None or taken["other"] is None or homes.get(taken["name"]) != complaint.file:
         return None
     short = taken["name"].rpartition(".")[2]
-    span = ProtoText(root / taken["other"]).nearest(rf"(?<=\bmessage ){short}\b", 0)
+    span = ProtoText(root / taken["other"]).nearest(rf"(?<=\bmessage ){short}\b|\b{short}\b(?=\s*=)", 0)
     message = f'"{taken["name"]}" is already defined in file "{complaint.file}"'
     return Diagnostic(span, Code.DUPLICATE_MESSAGE, message) if span is not None else None
 

@@ -111,7 +111,10 @@ def test_what_is_accepted_by_name_is_recorded_and_the_rest_refused(
     assert lock("--accept", "Motor.rpm") == 78
     out = capsys.readouterr().out
     assert "Envelope.motor has number 3 instead of 1" in out
-    assert "Motor.rpm" not in out
+    assert "Motor.rpm is of type" not in out
+    assert out.endswith(
+        "; if all of it is intended, say so in one command: --accept Motor.rpm --accept Envelope.motor\n"
+    )
     assert lock("--accept", "Motor.rpm", "--accept", "Envelope.motor") == 0
     assert capsys.readouterr().out == (
         "accepted: Motor.rpm is of type int32 instead of float\n"

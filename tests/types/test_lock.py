@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.types.lock import check_lock, extended_lock, locked_size
+from router.types.lock import check_lock, conflicts, extended_lock, locked_size
 from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, read_lock, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.types.conftest import settings
@@ -207,6 +207,43 @@ def test_number_stays_taken_after_its_reservation_is_gone(write: Write, envelope
     schema = load_protos(settings(write({"motor.proto": PROTO.replace("float rpm = 1", "bool on = 1")})))
     (finding,) = [found for found in check_lock(schema, envelope(schema)) if found.code is Code.WIRE_NUMBER_CONFLICT]
     assert "belongs to 'float rpm'" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("owner", "old", "reserved", "new", "error"),
+    [
+        ("Motor", "float voltage = 3;", "reserved 7, 9 to 12;", "bool on = 10;", "number 10 of Motor is reserved, and"),
+        ("State", "BUSY = 1;", "reserved 5;", "DONE = 5;", "number 5 of State is reserved, and given to 'DONE'"),
+    ],
+)
+def test_number_that_was_reserved_before_the_first_lock_stays_taken(
+    write: Write, envelope: Find, owner: str, old: str, reserved: str, new: str, error: str
+) -> None:
+    root = write({"motor.proto": PROTO.replace(old, f"{old} {reserved}")})
+    lock(root, envelope)
+    schema = load_protos(settings(write({"motor.proto": PROTO.replace(old, f"{old} {new}")})))
+    (conflict,) = conflicts(schema, envelope(schema))
+    assert conflict.finding.message.startswith(error)
+    write_lock(schema.lock, extended_lock(schema, envelope(schema), [conflict]))
+    assert check_lock(schema, envelope(schema)) == []
+
+
+def test_enums_of_one_name_are_not_taken_for_each_other(write: Write, envelope: Find) -> None:
+    """Package `pb` becomes `qb`, and what used the enum of `pa` uses its."""
+    enum = 'syntax = "proto3"; package {0}; enum St {{ {0}0 = 0; {0}1 = 1; }} message M{0} {{ St s = 1; }}'
+    uses = 'syntax = "proto3"; import "a.proto"; import "b.proto"; message Envelope { oneof payload { %s } } '
+    cases = "pa.Mpa a = 1; %s.Mpb b = 2;"
+    root = write({"a.proto": enum.format("pa"), "b.proto": enum.format("pb"), "e.proto": uses % (cases % "pb")})
+    lock(root, envelope)
+    moved = enum.format("pb").replace("package pb", "package qb")
+    gone = 'syntax = "proto3"; package pa; import "b.proto"; message Mpa { qb.St s = 1; }'
+    schema = load_protos(settings(write({"a.proto": gone, "b.proto": moved, "e.proto": uses % (cases % "qb")})))
+    assert "pa.Mpa.s" in {conflict.name for conflict in conflicts(schema, envelope(schema))}
+
+
+def test_oneof_that_is_called_as_protoc_calls_its_own_is_a_oneof(changed: Callable[..., list[Diagnostic]]) -> None:
+    findings = changed("float rpm = 1;", "oneof _rpm { float rpm = 1; }")
+    assert [found.message for found in findings] == ["Motor.rpm is in the oneof '_rpm' instead of in no oneof"]
 
 
 def test_another_name_for_an_enum_value_is_an_addition(changed: Callable[..., list[Diagnostic]]) -> None:
@@ -443,6 +480,7 @@ def lock_text(**changes: object) -> str:
         (lock_text(messages={"A": {}}), 1),
         (lock_text(messages={"A": {"file": "a.proto", "fields": {"1": "x"}}}), 1),
         (lock_text(messages={"A": {"file": "a.proto", "fields": {"one": "float x"}}}), 1),
+        (lock_text(messages={"A": {"file": "a.proto", "fields": {}, "reserved": ["1 to"]}}), 1),
         (lock_text(enums={"A": {"file": "a.proto", "values": {"X": "1"}}}), 1),
         (lock_text(enums={"A": {"file": "a.proto", "values": {"1": 1}}}), 1),
     ],
@@ -476,6 +514,7 @@ messages = st.dictionaries(
     st.builds(
         Declaration,
         file=st.text(),
+        reserved=st.frozensets(st.tuples(st.integers(-9, 9), st.integers(-9, 9))),
         entries=st.dictionaries(st.integers(1, 2**29 - 1), FIELDS)
         .map(lambda fields: frozenset(Entry(number, *declared) for number, declared in fields.items())),
     ),
@@ -485,6 +524,7 @@ enums = st.dictionaries(
     st.builds(
         Declaration,
         file=st.text(),
+        reserved=st.frozensets(st.tuples(st.integers(-9, 9), st.integers(-9, 9))),
         entries=st.frozensets(st.builds(Entry, st.integers(-3, 2**31 - 1), names)),
     ),
 )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.types.lock import extended_lock
 from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.types.conftest import settings
@@ -132,7 +134,7 @@ STRAY = {
     "does not compile": ("message A { int32 x = 1 }", 'b.proto:2:25: warning[unused-proto]: {}: Expected ";"'),
     "imports what is not there": (
         'import "nowhere";',
-        "b.proto:2:1: warning[unused-proto]: {}: there is no file 'nowhere' to import; known: a.proto, b.proto",
+        "b.proto:2:1: warning[unused-proto]: {}: there is no file 'nowhere' to import; known: a.proto",
     ),
     "has a message of the same name": (
         "message Imu {}",
@@ -172,6 +174,62 @@ def test_stray_files_that_cannot_be_read_and_their_options_are_warnings(write: W
     assert {(found.span.file, found.code) for found in warnings} == {
         (name, Code.UNUSED_PROTO) for name in ("b.proto", "b.options", "c.proto", "d.proto", "table.yaml")
     }
+
+
+def test_enum_of_the_envelopes_name_is_none(write: Write) -> None:
+    enum = 'syntax = "proto3";\nenum Envelope {\n  E_NONE = 0;\n}\n'
+    schema = load_protos(settings(write({"a.proto": ENVELOPE, "b.proto": enum})))
+    assert [(found.span.file, found.code) for found in schema.warnings] == [("b.proto", Code.UNUSED_PROTO)]
+    with pytest.raises(TableError) as caught:
+        load_protos(settings(write({"a.proto": enum, "b.proto": 'syntax = "proto3"; message Imu {}'})))
+    assert caught.value.diagnostics[0].message == "no .proto file declares a message 'Envelope'"
+
+
+def test_file_name_that_is_not_utf8_is_a_warning(write: Write) -> None:
+    root = write({"a.proto": ENVELOPE})
+    Path(os.fsdecode(os.fsencode(root) + b"/caf\xe9.proto")).write_text('syntax = "proto3";')
+    schema = load_protos(settings(root))
+    assert [found.code for found in schema.warnings] == [Code.UNUSED_PROTO]
+    assert len(schema.sha256) == 64
+
+
+@pytest.mark.parametrize(
+    "first", ["\ufeffsyntax", "/* licence\n */ syntax", "// licence\n\n  syntax", "/* a */\n/* syntax = */\tsyntax"]
+)
+def test_syntax_may_stand_after_comments(write: Write, first: str) -> None:
+    assert load_protos(settings(write({"a.proto": ENVELOPE.replace("syntax", first, 1)}))).warnings == ()
+
+
+@pytest.mark.parametrize("linked", ["linked", ".hidden"])
+def test_imported_files_are_the_folders_own_wherever_they_are(write: Write, tmp_path: Path, linked: str) -> None:
+    """In a folder that is a link to a submodule, say."""
+    files = {
+        "rover/a.proto": ENVELOPE.replace("message Imu { float x = 1; }", f'import "{linked}/imu.proto";'),
+        "other/imu.proto": 'syntax = "proto3"; message Imu { float x = 1; }',
+    }
+    root = write(files) / "rover"
+    (root / linked).symlink_to(tmp_path / "other")
+    (root / "again").symlink_to(root)
+    schema = load_protos(settings(root))
+    assert schema.files == (f"{linked}/imu.proto", "a.proto")
+    assert schema.span("Imu").file == f"rover/{linked}/imu.proto"
+
+
+def test_merge_of_two_envelopes_in_one_file_is_said_to_be_one(refused: Refused) -> None:
+    (finding,) = refused({"a.proto": f"<<<<<<< HEAD\n{ENVELOPE}=======\n{ENVELOPE}>>>>>>> b\n"})
+    assert (finding.message, finding.span.line) == ("an unresolved merge", 1)
+
+
+def test_enum_values_that_are_named_as_messages_are_blamed(write: Write) -> None:
+    root = write({"z.proto": ENVELOPE})
+    named = settings(root)
+    schema = load_protos(named)
+    write_lock(root / LOCK_NAME, extended_lock(schema, find_envelope(schema, named)))
+    types = 'syntax = "proto3";\nenum Types {\n  NONE = 0;\n  Imu = 1;\n}\n'
+    write({"a.proto": types, "z.proto": ENVELOPE.replace("message Imu", 'import "a.proto";\nmessage Imu')})
+    with pytest.raises(TableError) as caught:
+        load_protos(named)
+    assert [(found.span.file, found.span.line) for found in caught.value.diagnostics] == [("a.proto", 4)]
 
 
 def test_stray_file_without_a_fault_can_be_compiled_too(write: Write) -> None:
