@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -76,5 +77,7 @@ def _proven(
         results += prove(file, only, coverage)
         if coverages is not None and coverage is not None:
             coverages.setdefault(file.checked.path, coverage).add(coverage)
+    for coverage, other in itertools.permutations((coverages or {}).values(), 2):
+        coverage.learn(other)
     findings.update(dict.fromkeys(finding for result in results for finding in result.findings))
     return results, in_order(list(findings))

@@ -6,8 +6,9 @@ only in a step that the test looks at, an expression only where the message that
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from router.compiler.checked import CheckedRoute
 from router.compiler.program import Program
@@ -66,6 +67,16 @@ class Coverage:
         self._targets |= other._targets
         self._outcomes |= other._outcomes
 
+    def learn(self, other: Coverage) -> None:
+        """What the tests of another table have touched counts here too, where it stands at the same place of a file."""
+        routes = {(name, _place(span)) for name, span in other._all_routes() if name in other._routes}
+        self._routes |= {name for name, span in self._all_routes() if (name, _place(span)) in routes}
+        targets = {(key, _place(span)) for key, span in other._all_targets() if key in other._targets}
+        self._targets |= {key for key, span in self._all_targets() if (key, _place(span)) in targets}
+        parts = {replace(part, span=_place(part.span)): part for part in self.probes.parts}
+        placed = [(replace(part, span=_place(part.span)), outcome) for part, outcome in other._outcomes]
+        self._outcomes |= {(parts[part], outcome) for part, outcome in placed if part in parts}
+
     @property
     def is_complete(self) -> bool:
         return not list(self.gaps())
@@ -81,9 +92,9 @@ class Coverage:
         return {kind: (count - missing.count(kind), count) for kind, count in there.items()}
 
     def gaps(self) -> Iterator[Gap]:
-        for checked in self.routes:
-            if checked.route.name not in self._routes:
-                yield Gap(checked.route.span, "route", f"no test has a message for the route {checked.route.name}")
+        for name, span in self._all_routes():
+            if name not in self._routes:
+                yield Gap(span, "route", f"no test has a message for the route {name}")
         for key, span in self._all_targets():
             if key not in self._targets:
                 route, target, by_deadman = key
@@ -106,6 +117,9 @@ class Coverage:
             return ""
         return f"this gave nothing but zero {where}" if outcomes else f"this was never used {where}"
 
+    def _all_routes(self) -> Iterator[tuple[Route, SourceSpan]]:
+        return ((checked.route.name, checked.route.span) for checked in self.routes)
+
     def _all_targets(self) -> Iterator[tuple[tuple[Route, Target, bool], SourceSpan]]:
         """Each once, with whether it is a deadman's."""
         seen = set()
@@ -119,6 +133,11 @@ class Coverage:
                 if key not in seen:
                     seen.add(key)
                     yield key, span
+
+
+def _place(span: SourceSpan) -> SourceSpan:
+    """The same for each path that a table may be extended by."""
+    return replace(span, file=os.path.realpath(span.file))
 
 
 def _compared(happened: Happened) -> Iterator[tuple[Route, Target, bool]]:

@@ -121,6 +121,28 @@ def test_what_no_test_touches_is_listed_and_fails(rover: Path, capsys: pytest.Ca
     assert "NavSatStatus.STATUS_FIX if fix_quality == GPSFixQuality.PPS_FIX" in out
 
 
+def test_a_table_that_extends_another_needs_tests_of_what_it_changes_only(
+    rover: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = rover.parents[1] / "lab" / "scale.yaml"
+    table.parent.mkdir()
+    topic = "{topic: scale, type: std_msgs/msg/Float32, fields: {data: force_newtons}}"
+    table.write_text(f"version: 1\nextends: ../routes/rover.yaml\nroutes:\n  load_cell_info: {{topics: [{topic}]}}\n")
+    tests = table.with_name("scale.test.yaml")
+    tests.write_text("tests:\n  a: {expect: nothing}\n")
+    assert main(["test", "--coverage", "--format", "json", "routes", "lab"]) == FAILED
+    inherited, changed = json.loads(capsys.readouterr().out)["coverage"]
+    assert inherited["gaps"] == []
+    lacking = [(gap["kind"], gap["file"]) for gap in changed["gaps"]]
+    assert lacking == [(kind, "lab/scale.yaml") for kind in ("route", "target", "expression")]
+    assert all(changed[kind]["touched"] == changed[kind]["all"] - 1 for kind in ("routes", "targets", "expressions"))
+    given = "given: {case: load_cell_info, from: sensor_board, fields: {force_newtons: 2}}"
+    tests.write_text(f"tests:\n  a: {{{given}, expect: {{sent: basestation, published: {{scale: {{data: 2}}}}}}}}\n")
+    assert main(["test", "--coverage", "routes", "lab"]) == OK
+    assert "not covered" not in capsys.readouterr().out
+    assert main(["test", "--coverage", "lab"]) == FAILED  # nothing has run that covers what it inherits
+
+
 def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(rover, "pressure_kpa * 1000", "pressure_kpa * 100")
     assert main(["test", "--coverage", "--format", "json"]) == FAILED

@@ -10,6 +10,7 @@ import json
 import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -21,7 +22,7 @@ from typing import Any
 import pytest
 
 from tests.ports import free_port
-from tests.tables import PROTOS
+from tests.tables import PROTOS, ship
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "deploy" / "ros" / "rover_router"
@@ -136,17 +137,18 @@ def test_executable_is_the_command_line_of_the_version_that_was_installed(instal
     assert output(start(installed, "--version")) == f"router {version}\n"
 
 
-def test_installed_tables_are_in_order(installed: Path) -> None:
-    routes = installed / "share" / "rover_router" / "routes"
-    said = output(start(installed, "validate", routes))
-    tables = {path.stem for path in routes.glob("*.yaml") if not path.name.endswith(".test.yaml")}
-    assert tables >= {"legacy", "rover", "sim"}
-    assert set(re.findall(r"(\w+)\.yaml: ok", said)) == tables
+def test_tables_are_valid_where_they_are_installed(installed: Path, tmp_path: Path) -> None:
+    prefix = shutil.copytree(installed, tmp_path / "install")
+    ship(prefix / "share" / "rover_router")
+    said = output(start(prefix, "validate", prefix / "share" / "rover_router" / "routes"))
+    assert re.findall(r"(\w+)\.yaml: ok", said) == ["legacy", "rover", "sim"]
 
 
 def test_its_examples_can_be_copied(installed: Path, tmp_path: Path) -> None:
     output(start(installed, "init", tmp_path / "copy"))
-    assert (tmp_path / "copy" / "routes" / "rover.yaml").is_file()
+    [assets] = installed.rglob("_assets")
+    names = [{path.relative_to(root) for path in root.rglob("*")} for root in (assets, tmp_path / "copy")]
+    assert names[0] == names[1] > {Path("routes/rover.yaml"), Path("schemas/comms/package.xml")}
 
 
 def test_without_a_verb_it_routes_and_takes_parameters_as_nodes_do(installed: Path, table: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 import router.assets
 from router.edges.ros_environment import ros_package_remedy, ros_remedy
+from tests import tables
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
@@ -84,7 +85,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def ship(packages: Path, proto: str) -> Path:
-    """Puts protos of the test's own into the wheel, in place of those that a team edits, and without a lock."""
+    """Puts one proto of the test's own into the wheel, in place of those that a team edits, and without a lock."""
     shipped = packages / "router" / "_assets" / "protos"
     shutil.rmtree(shipped)
     shipped.mkdir()
@@ -93,6 +94,7 @@ def ship(packages: Path, proto: str) -> Path:
 
 
 def test_the_examples_are_copied_and_work_where_they_are(routed: Router, packages: Path, tmp_path: Path) -> None:
+    tables.ship(packages / "router" / "_assets")
     assert "`router init` writes example tables there" in routed("validate").stdout
     assert routed("init").returncode == 0
     copied = tmp_path / "here"
