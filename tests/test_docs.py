@@ -22,7 +22,7 @@ from router.gateway.compression import compress
 from router.gateway.documents import PublishRequest, request
 from router.gateway.json_code import json_writer
 from router.gateway.json_reading import cdr_builder
-from router.gateway.packets import Packet, pack
+from router.gateway.packets import Packet, pack, unpack
 from router.gateway.schema_text import schema_text
 from router.gateway.style import Style
 from router.table.shape import table_schema
@@ -174,6 +174,18 @@ def sent_again_and_again(packets: Sequence[bytes], port: int) -> Iterator[None]:
     finally:
         ended.set()
         sending.join()
+
+
+def test_the_udp_client_that_sends_sends_a_packet_that_the_gateway_reads(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
+        gateway.bind(("127.0.0.1", 0))
+        gateway.settimeout(PATIENCE)
+        with program(tmp_path, "send.py", *gateway.getsockname()):
+            sent = unpack(gateway.recv(65535))
+    assert (sent.topic, sent.type_name, sent.is_compressed) == ("/cmd_vel", "geometry_msgs/msg/Twist", False)
+    twist = ros_interfaces().get(sent.type_name)
+    assert twist is not None
+    assert cdr_builder(twist, Style.WRAPPED)(json.loads(sent.payload))
 
 
 def test_the_client_that_sends_sends_what_the_simulated_rover_lets_in(tmp_path: Path) -> None:

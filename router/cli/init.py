@@ -1,6 +1,6 @@
-"""`router init [DIR]`: the files that come with the router, as files of one's own.
+"""`router init [DIR]`: copy `routes/`, `protos/` and `schemas/` of the router into a folder.
 
-They are then where a checkout has them, so that everything which is written about a checkout holds there.
+The layout is that of a checkout, so that the documentation holds for both.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
             if target.exists():
                 raise UsageError(f"{shown_path(target)} is there already; nothing was written")
         for part, target in targets.items():
-            shutil.copytree(asset(part), target, copy_function=shutil.copyfile)  # theirs may be read-only
+            shutil.copytree(asset(part), target, copy_function=shutil.copyfile)  # drops read-only modes
             print(f"{shown_path(target)}: {_PARTS[part]}")
     except OSError as error:
         raise UsageError(str(error)) from error

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from router.compiler.definitions import Definitions
 from router.compiler.expressions import Finding, Reads, Scope, Typed, check
@@ -124,5 +125,8 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
     package, short = name.partition("/")[0], name.rpartition("/")[2]
     namesakes = [full for full in known if full.rpartition("/")[2] == short]
     siblings = [full for full in known if full.partition("/")[0] == package]
+    source = Path("schemas", package, "msg", f"{short}.msg")
+    if source.is_file():  # in an installation, what is built and sourced counts
+        return f"it is in {source.parent}, but not built: build and source {package}"
     general = "neither schemas/ nor an installed package has it; types are written as in sensor_msgs/msg/Imu"
     return did_you_mean(name, namesakes or siblings) or general

@@ -18,7 +18,7 @@ OWN_KEYS = {"mode": "mode", "connect/endpoints": "connect", "listen/endpoints": 
 
 
 CLIENT = "client"
-"""The mode that listens nowhere, and connects to nobody but to whom it was told of or found by multicast."""
+"""The mode without a listener; connects only to `connect` or to what multicast finds."""
 
 
 def library_config(config: ZenohConfig | None) -> zenoh.Config:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import socket
 import struct
 from collections.abc import Iterator
@@ -13,7 +14,8 @@ from time import monotonic
 from router.compiler.program import Program
 from router.edges.port_holder import port_holder
 from router.edges.udp_kernel import interface_is_up
-from router.table.model import Address, Transport, bound_to
+from router.table.address import BadAddressError, parse_address
+from router.table.model import Address, Located, Transport, bound_to
 from router.tools.doctor_report import Finding, fine, problem, warning
 
 PATIENCE = 1.0
@@ -32,10 +34,12 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
         yield fine("ports", "the running router has them")
         return
     wanted: list[tuple[str, Address, str | None, str]] = []
-    wanted += [("tcp", address, None, what) for address, what in _tcp(program)]
+    wanted += [("tcp", found.value, None, what) for found, what in _pages(program) if found is not None]
+    gateways = [(protocol, address, None, what) for protocol, address, what in _gateways(program)]
+    wanted += gateways
     if with_listeners:
         wanted += [("udp", each.address, each.interface, f"listener '{each.name}'") for each in program.listeners]
-    refused = [finding for each in wanted for finding in _port(*each)]
+    refused = [finding for each in wanted for finding in _port(*each, waits=each in gateways)]
     free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
     yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])
 
@@ -56,18 +60,26 @@ def interfaces(program: Program) -> Iterator[Finding]:
             yield problem("interfaces", f"{about} is down: nothing comes in", f"ip link set {listener.interface} up")
 
 
-def _tcp(program: Program) -> Iterator[tuple[Address, str]]:
-    table = program.table
-    if table.metrics is not None:
-        yield table.metrics.value, "metrics.address"
-    if table.foxglove is not None:
-        yield table.foxglove.value, "foxglove.address"
-    for gateway in table.gateways.values():
+def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
+    return (program.table.metrics, "metrics.address"), (program.table.foxglove, "foxglove.address")
+
+
+def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
+    """What gateways bind. Of Zenoh's locators those of tcp; a name or IPv6 in one is not looked at."""
+    for gateway in program.table.gateways.values():
+        what = f"gateway '{gateway.name}'"
+        if gateway.receive is not None:
+            yield "udp", gateway.receive.value, what
         if gateway.address is not None and gateway.transport.value in (Transport.TCP, Transport.WEBSOCKET):
-            yield gateway.address.value, f"gateway '{gateway.name}'"
+            yield "tcp", gateway.address.value, what
+        for locator in gateway.zenoh.listen if gateway.zenoh is not None else ():
+            if locator.startswith("tcp/"):
+                with suppress(BadAddressError):
+                    yield "tcp", parse_address(re.split("[?#]", locator[4:])[0]), what
 
 
-def _port(protocol: str, address: Address, interface: str | None, what: str) -> Iterator[Finding]:
+def _port(protocol: str, address: Address, interface: str | None, what: str, waits: bool) -> Iterator[Finding]:
+    """`waits`: whether the router waits for an address that no interface has yet."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM) as probe:
         if protocol == "tcp":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as a server has it
@@ -78,13 +90,14 @@ def _port(protocol: str, address: Address, interface: str | None, what: str) -> 
         except OSError as error:
             if error.errno == errno.ENODEV:  # `interfaces` tells
                 return
-            yield from _refused(protocol, address, what, error)
+            yield from _refused(protocol, address, what, error, waits)
 
 
-def _refused(protocol: str, address: Address, what: str, error: OSError) -> Iterator[Finding]:
+def _refused(protocol: str, address: Address, what: str, error: OSError, waits: bool) -> Iterator[Finding]:
     if error.errno == errno.EADDRNOTAVAIL:
         remedy = "give the interface that address (`ip address`), or have the table say 0.0.0.0"
-        yield problem("ports", f"{what}: no interface of this computer has {address.host}", remedy)
+        grade = warning if waits else problem
+        yield grade("ports", f"{what}: no interface of this computer has {address.host}", remedy)
         return
     if error.errno != errno.EADDRINUSE:
         yield problem("ports", f"{what} cannot use {address}: {error.strerror}", "choose another port")

@@ -1,6 +1,6 @@
-"""Reads the `.proto` and `.options` files of a folder, and finds what protoc would only stumble over.
+"""Read the `.proto` and `.options` files of a folder, and find faults for which protoc has no good message.
 
-Knows no syntax beyond a file's first words.
+Names, encoding and the `syntax` line are checked; nothing else is parsed.
 """
 
 from __future__ import annotations

@@ -53,6 +53,16 @@ def test_what_its_clients_may_publish_is_checked_as_anywhere(tmp_path: Path) -> 
     assert finding.code is Code.UNKNOWN_ROS_TYPE
 
 
+def test_a_type_whose_source_is_here_but_not_built_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = Path("schemas", "ours", "msg", "Lamp.msg")
+    source.parent.mkdir(parents=True)
+    source.write_text("bool is_on\n")
+    inbound = "receive: 127.0.0.1:8500, inbound: [{topic: /lamp, type: ours/msg/Lamp}]"
+    [finding] = checked(tmp_path, ONLY.replace("8502}", "8502}, " + inbound)).diagnostics
+    assert finding.hint == "it is in schemas/ours/msg, but not built: build and source ours"
+
+
 @pytest.mark.parametrize("envelope", [ENVELOPE, "extends: base.yaml\n"])
 def test_an_envelope_that_nothing_uses_asks_for_no_routes(tmp_path: Path, envelope: str) -> None:
     (tmp_path / "base.yaml").write_text(ENVELOPE)

@@ -92,6 +92,44 @@ def test_a_port_that_somebody_has_is_told_with_his_name(table: Path) -> None:
     assert [each.grade for each in ports(program, running=False)] == [Grade.FINE]
 
 
+@pytest.mark.parametrize(
+    ("kind", "protocol", "gateway"),
+    [
+        (socket.SOCK_DGRAM, "udp", "{{transport: {{udp: 127.0.0.9:8502}}, receive: 127.0.0.1:{port}}}"),
+        (socket.SOCK_STREAM, "tcp", "{{transport: {{tcp: 127.0.0.1:{port}}}}}"),
+        (
+            socket.SOCK_STREAM,
+            "tcp",
+            "{{transport: {{zenoh: {{key: k, listen: [tcp/127.0.0.1:{port}?so_sndbuf=65000]}}}}}}",
+        ),
+    ],
+)
+def test_a_port_of_a_gateway_that_somebody_has_is_told(
+    tmp_path: Path, kind: socket.SocketKind, protocol: str, gateway: str
+) -> None:
+    port = free_port(kind=kind)
+    path = tmp_path / "gateway.yaml"
+    path.write_text(f"version: 1\ngateways: {{headset: {gateway.format(port=port)}}}\n")
+    program = compiled(path)
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind(("127.0.0.1", port))
+        if kind is socket.SOCK_STREAM:
+            taken.listen()
+        [found] = ports(program, running=False)
+        assert found.grade is Grade.PROBLEM
+        assert "gateway 'headset': " in found.text
+        assert f"(pid {os.getpid()}) has {protocol} port {port}" in found.text
+    assert [each.grade for each in ports(program, running=False)] == [Grade.FINE]
+
+
+def test_an_address_that_a_gateway_waits_for_is_a_warning(tmp_path: Path) -> None:
+    path = tmp_path / "gateway.yaml"
+    gateway = "{transport: {udp: 127.0.0.9:8502}, receive: 192.0.2.1:8500}"
+    path.write_text(f"version: 1\ngateways: {{headset: {gateway}}}\n")
+    [found] = ports(compiled(path), running=False)
+    assert (found.grade, "no interface of this computer has 192.0.2.1" in found.text) == (Grade.WARNING, True)
+
+
 def test_a_port_that_systemd_keeps_is_the_services(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = compiled(table)
     monkeypatch.setattr(doctor_network, "port_holder", lambda *_: "systemd (pid 1)")
