@@ -173,7 +173,10 @@ def _declarations(
     for name, content in _mapping(top.get(kind), kind).items():
         declared = _mapping(content, name)
         file = _text(declared.get("file"), f"{name}.file")
-        reserved = frozenset(_range(text, f"{name}.reserved") for text in declared.get("reserved", ()))
+        ranges = declared.get("reserved", [])
+        if not isinstance(ranges, list):
+            raise ValueError(f"{name}.reserved is no list")
+        reserved = frozenset(_range(text, f"{name}.reserved") for text in ranges)
         yield name, file, _mapping(declared.get(members), name), reserved
 
 

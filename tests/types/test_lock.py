@@ -481,6 +481,7 @@ def lock_text(**changes: object) -> str:
         (lock_text(messages={"A": {"file": "a.proto", "fields": {"1": "x"}}}), 1),
         (lock_text(messages={"A": {"file": "a.proto", "fields": {"one": "float x"}}}), 1),
         (lock_text(messages={"A": {"file": "a.proto", "fields": {}, "reserved": ["1 to"]}}), 1),
+        (lock_text(messages={"A": {"file": "a.proto", "fields": {}, "reserved": 1}}), 1),
         (lock_text(enums={"A": {"file": "a.proto", "values": {"X": "1"}}}), 1),
         (lock_text(enums={"A": {"file": "a.proto", "values": {"1": 1}}}), 1),
     ],
