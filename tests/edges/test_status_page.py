@@ -101,7 +101,7 @@ def test_the_map_shows_the_whole_table(page: Page) -> None:
 
 def test_a_table_with_gateways_only_is_shown_as_well(browser: Browser, tmp_path: Path) -> None:
     table = tmp_path / "only.yaml"
-    table.write_text("gateways: {headset: {transport: {udp: 127.0.0.9:8502}}}\n")
+    table.write_text("version: 1\ngateways: {headset: {transport: {udp: 127.0.0.9:8502}}}\n")
     program = check_table(table).program
     assert program is not None
     opened = FakeRunning(program)
