@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 import warnings
 
 import pytest
@@ -68,6 +69,14 @@ LARGE = [
 ]  # fmt: skip
 
 
+class NamedConstants(ast.NodeTransformer):
+    """NaN and infinity by name, as they are shown: Python has no literals for them."""
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        is_named = isinstance(node.value, float) and not math.isfinite(node.value)
+        return ast.Name(str(node.value)) if is_named else node
+
+
 def check_ends_well(text: str) -> Finding | None:
     """The finding, or None for an expression that is well-formed; then it also compiles and shows."""
     with warnings.catch_warnings():
@@ -78,7 +87,7 @@ def check_ends_well(text: str) -> Finding | None:
             return finding
         out = Source()
         out.line(f"it = {out.expression(typed.node)}", SPAN)
-        assert ast.unparse(ast.parse(out.text())) == ast.unparse(out.tree())
+        assert ast.unparse(ast.parse(out.text())) == ast.unparse(NamedConstants().visit(out.tree()))
         assert str(typed.kind)
         return None
 
@@ -122,7 +131,7 @@ _TOKENS = st.sampled_from(
         "received_at", "has", "abs", "clamp", "wrap", "round", "str", "int", "len", "min", "0", "1", "2", "-1", "0.5",
         "'a'", "''", "True", "None", "(", ")", "[", "]", ",", ".", "+", "-", "*", "/", "//", "%", "**", "<", "<=", "==",
         "!=", "in", "not", "and", "or", "if", "else", "is", "lambda", ":", ":=", "{", "}", "@", "~", "=", "seconds",
-        "time_from_seconds", "float32",
+        "time_from_seconds", "float32", "nan", "inf",
     ]
 )  # fmt: skip
 
