@@ -26,8 +26,11 @@ class _NamedConstants(ast.NodeTransformer):
     """Write `nan` and `inf` by name, for which Python has no literals."""
 
     def visit_Constant(self, node: ast.Constant) -> ast.expr:
-        is_named = isinstance(node.value, float) and not math.isfinite(node.value)
-        return ast.Name(str(node.value)) if is_named else node
+        return ast.Name(str(node.value)) if _is_named(node) else node
+
+
+def _is_named(node: ast.AST) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, float) and not math.isfinite(node.value)
 
 
 class Source:
@@ -79,7 +82,9 @@ class Source:
 
         def replaced(found: re.Match[str]) -> str:
             node = self._expressions[int(found[1])]
-            text = ast.unparse(_NamedConstants().visit(copy.deepcopy(node)))
+            if any(map(_is_named, ast.walk(node))):
+                node = _NamedConstants().visit(copy.deepcopy(node))
+            text = ast.unparse(node)
             return text if alone or isinstance(node, (ast.Constant, ast.Name, ast.Attribute, ast.Call)) else f"({text})"
 
         return _PLACEHOLDER.sub(replaced, line)
