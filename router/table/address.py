@@ -12,6 +12,9 @@ from router.table.model import Address
 _EXAMPLE = "write an IPv4 address and a port, such as 192.168.0.30:8"
 _NUMBERS = re.compile(r"[0-9]+(?:\.[0-9]+)*")
 
+LOCATOR = re.compile(r"(?P<protocol>[a-z]+/)(?P<address>[^?#]*)(?P<rest>(?:[?#].*)?)")
+"""Zenoh's: tcp/192.168.0.10:7447. What may follow the address is no address of another machine."""
+
 
 class BadAddressError(ValueError):
     """Why a text is no address, and what to do about it."""

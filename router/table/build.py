@@ -9,7 +9,6 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from ipaddress import IPv4Network
-from pathlib import Path
 from typing import TypeVar, Union
 
 from router.assets import asset
@@ -36,6 +35,7 @@ from router.table.model import (
 from router.table.nodes import Entry, MappingNode, Node, SequenceNode, is_sound, marked_broken
 from router.table.reading import (
     UnsoundError,
+    beside,
     boolean,
     duration,
     integer,
@@ -174,16 +174,11 @@ def _envelope(entry: Entry) -> EnvelopeSettings:
     settings = mapping(entry.value)
     protos, lock = optional_text(settings, "protos"), optional_text(settings, "lock")
     return EnvelopeSettings(
-        _beside(protos) if protos else Located(asset("protos"), entry.key.span),
+        beside(protos) if protos else Located(asset("protos"), entry.key.span),
         text(settings, "message"),
         text(settings, "oneof"),
-        _beside(lock) if lock else None,
+        beside(lock) if lock else None,
     )
-
-
-def _beside(path: Located[str]) -> Located[Path]:
-    """A path relative to the file that names it."""
-    return Located(Path(path.span.file).absolute().parent / path.value, path.span)
 
 
 def _node(entry: Entry) -> NodeSettings:
@@ -202,10 +197,10 @@ def _address(entry: Entry) -> Located[Address]:
 
 def _record(entry: Entry) -> RecordSettings:
     settings = mapping(entry.value)
-    directory, last = text(settings, "directory"), duration(settings, "last")
+    directory, last = beside(text(settings, "directory")), duration(settings, "last")
     return RecordSettings(
         span=entry.key.span,
-        directory=Path(directory.span.file).absolute().parent / directory.value,
+        directory=directory.value,
         continuous=settings.get("continuous") is None or boolean(settings, "continuous"),
         last=last.value if last else None,
         max_size=_parsed(settings, "max_size", parse_disk_size, DEFAULT_MAX_SIZE),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 
 from router.errors import Code, Diagnostic, SourceSpan, shown_path
 from router.table.build_addresses import local_address, remote_address
@@ -32,6 +31,7 @@ from router.table.nodes import Entry, MappingNode, Node, SequenceNode, to_data
 from router.table.nodes import Path as Steps
 from router.table.reading import (
     UnsoundError,
+    beside,
     duration,
     integer,
     items,
@@ -120,7 +120,7 @@ def _zenoh_config(entry: Entry) -> ZenohConfig:
     if isinstance(entry.value, MappingNode):
         return ZenohConfig(entry.key.span, json.dumps(to_data(entry.value)), places=dict(_places(entry.value)))
     written = located(entry.value)
-    path = Path(written.span.file).absolute().parent / written.value
+    path = beside(written).value
     try:
         if path.exists() and not path.is_file():
             raise OSError(0, "it is no ordinary file")

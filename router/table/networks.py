@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import ipaddress
-import re
 from collections.abc import Iterator, Sequence
 
 from router.errors import Code, Diagnostic
-from router.table.address import BadAddressError, parse_address
+from router.table.address import LOCATOR, BadAddressError, parse_address
 from router.table.model import Networks
 from router.table.nodes import MappingNode, Node, Path, ScalarNode, SequenceNode
 
@@ -21,9 +20,6 @@ ADDRESSES: tuple[Path, ...] = (
     *(("gateways", "*", "transport", "zenoh", name, "*") for name in ("connect", "listen")),
 )
 """Where addresses stand in a table; `*` is any name, or any item of a list."""
-
-_LOCATOR = re.compile(r"(?P<protocol>[a-z]+/)(?P<address>[^?#]*)(?P<rest>(?:[?#].*)?)")
-"""Zenoh's: tcp/192.168.0.10:7447. What may follow the address is no address of another machine."""
 
 
 def outside_findings(root: MappingNode, networks: Networks, files: Sequence[str]) -> Iterator[Diagnostic]:
@@ -50,7 +46,7 @@ def _found(node: Node, pattern: Path, here: Path) -> Iterator[tuple[Path, Scalar
 
 def _outside(path: Path, node: ScalarNode, networks: Networks, is_extended: bool) -> Iterator[Diagnostic]:
     is_locator = "zenoh" in path[3:]
-    locator = _LOCATOR.fullmatch(node.text) if is_locator else None
+    locator = LOCATOR.fullmatch(node.text) if is_locator else None
     name, key = ".".join(map(str, path[:-1])), path[-1]
     try:
         address = parse_address(locator["address"] if locator else node.text)

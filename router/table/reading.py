@@ -7,6 +7,7 @@ table's fault: a value of the right shape that means nothing.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 from router.errors import Code, Diagnostic
@@ -60,6 +61,11 @@ def located(node: Node | None) -> Located[str]:
     """A scalar's text as it was written."""
     found = scalar(node)
     return Located(found.text, found.span)
+
+
+def beside(written: Located[str]) -> Located[Path]:
+    """A path relative to the file that names it, made absolute."""
+    return Located(Path(written.span.file).absolute().parent / written.value, written.span)
 
 
 def text(settings: MappingNode, key: str) -> Located[str]:

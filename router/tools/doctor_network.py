@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import socket
 import struct
 from collections.abc import Iterator
@@ -14,7 +13,7 @@ from time import monotonic
 from router.compiler.program import Program
 from router.edges.port_holder import port_holder
 from router.edges.udp_kernel import interface_is_up
-from router.table.address import BadAddressError, parse_address
+from router.table.address import LOCATOR, BadAddressError, parse_address
 from router.table.model import Address, Located, Transport, bound_to
 from router.tools.doctor_report import Finding, fine, problem, warning
 
@@ -73,9 +72,9 @@ def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
         if gateway.address is not None and gateway.transport.value in (Transport.TCP, Transport.WEBSOCKET):
             yield "tcp", gateway.address.value, what
         for locator in gateway.zenoh.listen if gateway.zenoh is not None else ():
-            if locator.startswith("tcp/"):
+            if (found := LOCATOR.fullmatch(locator)) and found["protocol"] == "tcp/":
                 with suppress(BadAddressError):
-                    yield "tcp", parse_address(re.split("[?#]", locator[4:])[0]), what
+                    yield "tcp", parse_address(found["address"]), what
 
 
 def _port(protocol: str, address: Address, interface: str | None, what: str, waits: bool) -> Iterator[Finding]:
