@@ -26,8 +26,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
-from router.edges.ros_node import close_node, open_node
-from tests.edges.ros_opening import HELLO, open_ros, string_topic
+from router.ros.node import close_node, open_node
+from tests.ros.ros_opening import HELLO, open_ros, string_topic
 
 SUBSCRIBED = tuple(f"command_{number}" for number in range(6))
 PUBLISHED = tuple(f"telemetry_{number}" for number in range(24))

@@ -7,8 +7,8 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from router.recording.reader_mcap import Recording
 from router.table.model import RouteTable
-from router.tools.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)

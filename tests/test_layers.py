@@ -14,7 +14,7 @@ LAYERS = ("errors", "assets", "table", "types", "compiler", "engine", "edges", "
 MODULES = sorted(ROUTER.rglob("*.py"))
 
 CONFINED = {
-    "rclpy": ("edges/ros.py", "edges/ros_"),
+    "rclpy": ("ros/node_and_publishers.py", "edges/ros_"),
     "socket": ("edges/", "tools/"),
 }
 

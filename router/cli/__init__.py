@@ -14,8 +14,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from router.edges.ros_environment import ADDRESS_SPACE, address_space
 from router.errors import RouterError, TableError
+from router.ros.environment import ADDRESS_SPACE, address_space
 
 OK = 0
 BAD_USAGE = 2

@@ -1,6 +1,6 @@
 """`router explain --diff OLD NEW`: what one table does otherwise than another, a line each.
 
-Prints what `router.compiler.differences` found; finds out nothing itself.
+Prints what `router.tools.differences` found; finds out nothing itself.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from router.cli import BAD_TABLE, OK
 from router.cli.findings import print_findings
 from router.compiler import check_table
 from router.compiler.definitions import Definitions
-from router.compiler.differences import differences
+from router.tools.differences import differences
 
 
 def print_differences(old: Path, new: Path) -> int:

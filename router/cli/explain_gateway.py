@@ -13,9 +13,9 @@ from router.cli.explain_words import at_start, quality
 from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import resolved
-from router.edges.ros_environment import check_environment, ros_remedy
 from router.errors import StartError, shown_path
 from router.gateway.following import by_frequency
+from router.ros.environment import check_environment, ros_remedy
 from router.table.model import (
     EACH,
     Gateway,
@@ -43,8 +43,8 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
     """The same with all that a node has discovered after so long. Raises StartError."""
     check_environment(os.environ)
     try:
-        from router.edges.ros_node import close_node, open_node
-        from router.edges.ros_topics import RosTopics
+        from router.ros.node import close_node, open_node
+        from router.ros.topics import RosTopics
     except ImportError as error:
         raise StartError(f"--live needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
     node = open_node("router_explain")

@@ -54,7 +54,7 @@ def _save_last(args: argparse.Namespace) -> int:
 
 
 def _record(args: argparse.Namespace) -> int:
-    from router.edges.background import background_threads
+    from router.threads.background import background_threads
     from router.tools.recording_tap import TapRecording
     from router.tools.running_router import tap
     from router.tools.wire import read_table, wire_of_table

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from router.compiler import Checked
     from router.compiler.definitions import Definitions
-    from router.tools.recording import Recording
+    from router.recording.reader_mcap import Recording
     from router.tools.replaying import Resent
 
 DIFFERENT = 1
@@ -56,7 +56,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 @explained
 def run(args: argparse.Namespace) -> int:
-    from router.tools.recording import Recording
+    from router.recording.reader_mcap import Recording
 
     if args.against is not None and (args.rate or args.to or args.origin):
         raise UsageError("--against sends nothing: --rate, --to and --from have no part in it")
@@ -106,8 +106,8 @@ def _advise(resent: Resent) -> int:
 
 def _compare(args: argparse.Namespace, recording: Recording) -> int:
     from router.compiler.definitions import Definitions
-    from router.tools.replaying_against import Against
-    from router.tools.replaying_report import Report
+    from router.rehearsal.replaying_against import Against
+    from router.rehearsal.replaying_report import Report
 
     definitions = Definitions()
     old, new = (_checked(path, definitions) for path in (args.table or DEFAULT_TABLE, args.against))

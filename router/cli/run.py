@@ -15,14 +15,14 @@ from pathlib import Path
 
 import yaml
 
+from router.app import Router, tune_interpreter
+from router.app.supervision import supervised
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table
-from router.edges.log import LEVELS as LOG_LEVELS
-from router.edges.log import configure_log
-from router.edges.supervision import supervised
 from router.errors import StartError
-from router.runtime import Router, tune_interpreter
+from router.log import LEVELS as LOG_LEVELS
+from router.log import configure_log
 
 _DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router reload').
 SIGUSR1: save the last datagrams, where the table keeps them ('record').

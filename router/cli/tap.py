@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import add_url_option, add_wire_options, explained, load_wire, running_url, whole
-from router.edges.ros_environment import check_environment, ros_remedy
 from router.errors import StartError, nearest
+from router.ros.environment import check_environment, ros_remedy
 from router.tools import UsageError
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def _print(batches: Iterable[Sequence[Heard | HeardMessage]], args: argparse.Nam
 
 
 def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> None:
-    from router.edges.background import background_threads
+    from router.threads.background import background_threads
     from router.tools.conditions import Condition
     from router.tools.places import peer_names
     from router.tools.running_router import tap
@@ -156,7 +156,7 @@ def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Ite
 def _topic(args: argparse.Namespace) -> Iterator[Iterator[HeardMessage]]:
     try:
         check_environment(os.environ)
-        from router.edges.ros_listen import TopicListener
+        from router.ros.listen import TopicListener
     except StartError as error:
         raise UsageError(str(error)) from error
     except ImportError as error:

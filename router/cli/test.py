@@ -13,11 +13,11 @@ from router.cli.findings import FORMATS, print_findings
 from router.cli.test_report import print_results, summary
 from router.compiler.definitions import Definitions
 from router.errors import Diagnostic, TableError
+from router.rehearsal.coverage import Coverage
+from router.rehearsal.reading import read_test_file
+from router.rehearsal.running import Result
+from router.rehearsal.tests import find_test_files, prove
 from router.table import in_order
-from router.tools.table_tests import find_test_files, prove
-from router.tools.table_tests_coverage import Coverage
-from router.tools.table_tests_reading import read_test_file
-from router.tools.table_tests_running import Result
 
 FAILED = 1
 DEFAULT = Path("routes")

@@ -13,9 +13,9 @@ from typing import TextIO
 from router.cli.findings import as_data as finding_data
 from router.cli.findings import excerpt, github_escaped, is_coloured, plural, visible
 from router.errors import Diagnostic, SourceSpan, shown_path
-from router.tools.table_tests_comparing import Failure
-from router.tools.table_tests_coverage import Coverage
-from router.tools.table_tests_running import Result
+from router.rehearsal.comparing import Failure
+from router.rehearsal.coverage import Coverage
+from router.rehearsal.running import Result
 
 _RESET, _BOLD, _RED, _GREEN, _CYAN, _YELLOW = "\x1b[0m", "\x1b[1m", "\x1b[31m", "\x1b[32m", "\x1b[36m", "\x1b[33m"
 

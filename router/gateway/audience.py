@@ -6,13 +6,13 @@ import asyncio
 from collections.abc import Callable, Sequence
 from itertools import count
 
-from router.edges.gateway_transport import Client, Frame, Transport
-from router.edges.log import FloodLog, logger
 from router.gateway.encoding import LARGE, Encoding
 from router.gateway.history import History
 from router.gateway.ledger import Ledger
 from router.gateway.subscriber import Subscriber
 from router.gateway.tasks import Tasks
+from router.gateway.transport.base import Client, Frame, Transport
+from router.log import FloodLog, logger
 
 PUMPED, PUMP_S = 32, 0.001
 """Datagrams of a large frame that go out at a time, and the seconds between: other topics pass between them."""

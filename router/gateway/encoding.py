@@ -7,13 +7,13 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from itertools import count
 from math import inf
 
-from router.edges.gateway_transport import Frame
 from router.gateway.documents import data_document, schema_document
 from router.gateway.fragments import capacity, datagrams
 from router.gateway.letters import DocumentLetter, Letter, PacketLetter
 from router.gateway.packets import HEAD, prefix
 from router.gateway.samples import Sample
 from router.gateway.style import Style
+from router.gateway.transport.base import Frame
 from router.table.model import Gateway, GatewayFormat, Transport
 from router.table.units import LARGEST_DATAGRAM
 

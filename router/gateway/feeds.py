@@ -13,7 +13,7 @@ from router.gateway.following import Choice
 from router.gateway.samples import ReadyType, Sample
 
 if TYPE_CHECKING:  # which imports rclpy
-    from router.edges.ros_topics import RosTopics, TopicTap
+    from router.ros.topics import RosTopics, TopicTap
 
 DEPTH = 100
 """Messages that wait on a topic of which every one is wanted; the oldest go first."""

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:  # which imports rclpy
-    from router.edges.ros_topics import SeenPublisher
+    from router.ros.topics import SeenPublisher
 
 
 class Choice(NamedTuple):

@@ -11,7 +11,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from itertools import islice
 from typing import NamedTuple
 
-from router.edges.gateway_transport import Frame
+from router.gateway.transport.base import Frame
 
 MOST_BYTES = 1 << 20
 MOST_FRAMES = 1000

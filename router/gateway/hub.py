@@ -19,7 +19,7 @@ from router.types.model import MessageType
 from router.types.ros import RosInterfaces
 
 if TYPE_CHECKING:  # which imports rclpy
-    from router.edges.ros_topics import RosTopics
+    from router.ros.topics import RosTopics
 
 
 class Hub:

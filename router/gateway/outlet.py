@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Hashable, Iterable, Sequence
 
-from router.edges.gateway_transport import Frame
 from router.gateway.encoding import LARGE, Encoding
 from router.gateway.ledger import Ledger
 from router.gateway.samples import Sample
@@ -16,6 +15,7 @@ from router.gateway.served import MOST_UNCONVERTED, Served
 from router.gateway.style import UnreadableError
 from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks
+from router.gateway.transport.base import Frame
 from router.table.model import EACH, Gateway, Transport
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Union
 
-from router.edges.gateway_transport import Client
 from router.gateway.documents import SchemaRequest
 from router.gateway.encoding import Encoding
 from router.gateway.inlet import Checked, Inlet, RefusedError
@@ -20,6 +19,7 @@ from router.gateway.json_reading import InvalidMessageError
 from router.gateway.letters import Letter
 from router.gateway.packets import PacketError, TooLargeError
 from router.gateway.tasks import Tasks
+from router.gateway.transport.base import Client
 
 MOST_READING = 16 << 20
 """Bytes of JSON that are read beside the loop or wait for that, of all clients. A single message may be longer."""

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 
 from router.compiler.program import GatewayPlan
-from router.edges.gateway_transport import Client, Frame, Transport
 from router.gateway.audience import Audience
 from router.gateway.documents import (
     InboundRow,
@@ -26,6 +25,7 @@ from router.gateway.style import Style
 from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks
 from router.gateway.topics import Topics
+from router.gateway.transport.base import Client, Frame, Transport
 from router.table.model import Transport as Way
 
 _TELL_S = _SETTLE_S = 1.0

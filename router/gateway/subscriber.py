@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 
-from router.edges.gateway_transport import HIGH_WATER, Client, Frame
 from router.gateway.history import History
+from router.gateway.transport.base import HIGH_WATER, Client, Frame
 
 OnWire = Callable[[Sequence[Frame]], Sequence[Frame]]
 

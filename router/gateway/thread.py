@@ -9,12 +9,9 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from router.clock import monotonic_ns, wall_ns
 from router.compiler.books import Books
 from router.compiler.program import GatewayPlan, Program
-from router.edges.clock import monotonic_ns, wall_ns
-from router.edges.daemon_thread import DaemonThread
-from router.edges.gateway_transport import Ears, Transport
-from router.edges.gateway_udp import UdpTransport
 from router.engine import Report
 from router.engine.deadman import FeedMaker
 from router.errors import StartError
@@ -25,13 +22,16 @@ from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
 from router.gateway.subscriber import Subscriber
 from router.gateway.surroundings import Surroundings
+from router.gateway.transport.base import Ears, Transport
+from router.gateway.transport.udp import UdpTransport
 from router.gateway.transports import new_transport
 from router.table.model import Gateway
 from router.table.sameness import are_same
+from router.threads.daemon_thread import DaemonThread
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy
-    from router.edges.ros import RosEdge
+    from router.ros.node_and_publishers import RosEdge
 
 T = TypeVar("T")
 

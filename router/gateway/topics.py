@@ -13,8 +13,6 @@ from itertools import chain, count, repeat
 
 from router.compiler.program import GatewayPlan
 from router.compiler.selection import TopicSelector
-from router.edges.gateway_transport import Frame
-from router.edges.log import logger
 from router.errors import StartError
 from router.gateway.documents import TopicRow
 from router.gateway.feeds import Feed
@@ -25,6 +23,8 @@ from router.gateway.samples import Sample
 from router.gateway.served import Served
 from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks
+from router.gateway.transport.base import Frame
+from router.log import logger
 from router.table.model import EACH, GatewayFormat, Transport
 
 RUN = 32

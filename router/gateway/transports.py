@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from router.edges.gateway_tcp import TcpTransport
-from router.edges.gateway_transport import Ears, Transport
-from router.edges.gateway_udp import UdpTransport
-from router.edges.gateway_websocket import WebsocketTransport
+from router.gateway.transport.base import Ears, Transport
+from router.gateway.transport.tcp import TcpTransport
+from router.gateway.transport.udp import UdpTransport
+from router.gateway.transport.websocket import WebsocketTransport
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as Way
 
@@ -22,7 +22,7 @@ def new_transport(settings: Gateway, ears: Ears) -> Transport:
     address = settings.address
     most = settings.max_message if settings.inbound else MOST_ASKED
     if settings.zenoh is not None:
-        from router.edges.gateway_zenoh import ZenohTransport  # takes 50 ms to import
+        from router.gateway.transport.zenoh import ZenohTransport  # takes 50 ms to import
 
         return ZenohTransport(settings.zenoh, ears, most)
     assert address is not None  # noqa: S101 - the schema wants one for all others

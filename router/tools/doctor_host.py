@@ -12,8 +12,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from router.compiler.program import Program
-from router.edges.recorder_directory import kept_bytes
-from router.edges.ros_environment import SHM
+from router.recording.directory import kept_bytes
+from router.ros.environment import SHM
 from router.tools.doctor_report import Finding, fine, problem, warning
 
 RMEM_MAX = Path("/proc/sys/net/core/rmem_max")

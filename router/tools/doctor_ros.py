@@ -7,9 +7,9 @@ import socket
 from collections.abc import Iterator, Mapping
 
 from router.compiler.program import Program
-from router.edges.ros_environment import obstacles, ros_package_remedy, ros_remedy
-from router.edges.udp_kernel import interface_is_up
 from router.errors import StartError
+from router.net.kernel import interface_is_up
+from router.ros.environment import obstacles, ros_package_remedy, ros_remedy
 from router.tools.doctor_report import Finding, fine, problem, warning
 
 
@@ -22,7 +22,7 @@ def ros(program: Program) -> Iterator[Finding]:
     if found:  # to load it would end this process
         return
     try:
-        from router.edges.ros_installation import middleware, usable_class
+        from router.ros.installation import middleware, usable_class
     except ImportError as error:
         yield problem("ROS", f"the table has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
         return

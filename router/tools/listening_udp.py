@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from router.edges.udp_kernel import ask_for_receive_buffer, drops
 from router.gateway.packets import Packet, pack
+from router.net.kernel import ask_for_receive_buffer, drops
 from router.table.model import Address
 from router.table.units import LARGEST_DATAGRAM
 from router.tools import places

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from prometheus_client.parser import text_string_to_metric_families
 
 from router.compiler.books import INTENDED_REASONS, METRICS
-from router.edges.status_numbers import DELIVERED
+from router.observe.status_numbers import DELIVERED
 
 Labels = tuple[str, ...]
 Counts = Mapping[Labels, float]

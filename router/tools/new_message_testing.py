@@ -9,11 +9,11 @@ import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from router.rehearsal.shape import read_shape
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.tools.new_message_layout import WIDEST, stanza_at, with_stanza_after
 from router.tools.new_message_model import SCALARS, NewMessage, Site
 from router.tools.new_message_tables import told_endpoints
-from router.tools.table_tests_shape import read_shape
 from router.types.model import Bool, Enum, Float, MessageType, Type
 
 

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import cache
 
 from router.compiler.network import recognisers
-from router.edges.udp_kernel import interface_address
 from router.errors import did_you_mean
+from router.net.kernel import interface_address
 from router.table.model import Address, Listener, RouteTable
 from router.tools import UsageError
 

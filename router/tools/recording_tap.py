@@ -6,13 +6,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import monotonic_ns, time_ns
 
-from router.edges.mirror import Seen
-from router.edges.recorder_channels import Channels
-from router.edges.recorder_encoding import Encoder
-from router.edges.recorder_file import RecordingFile
-from router.edges.recorder_intake import PERIOD
-from router.edges.shown import Known
-from router.edges.tap_stream import Lost
+from router.observe.tap_stream import Lost
+from router.recording.channels import Channels
+from router.recording.encoding import Encoder
+from router.recording.file import RecordingFile
+from router.recording.mirror import Seen
+from router.recording.mirrored import Known
+from router.recording.queue import PERIOD
 from router.table.model import RouteTable
 from router.tools import UsageError
 from router.types.protobuf import Envelope

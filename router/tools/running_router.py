@@ -14,10 +14,10 @@ from contextlib import closing, contextmanager
 from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from router.edges.http_callers import COLLECTED_AT
-from router.edges.mirror import Seen
-from router.edges.tap_stream import Lost, StreamReader
 from router.errors import TransportError
+from router.observe.http_callers import COLLECTED_AT
+from router.observe.tap_stream import Lost, StreamReader
+from router.recording.mirror import Seen
 from router.table.model import RouteTable
 from router.tools import UsageError
 from router.tools.places import reachable

@@ -21,7 +21,7 @@ from router.tools.show import compact, one_line
 from router.tools.wire import Decoded, Wire
 
 if TYPE_CHECKING:
-    from router.edges.ros_listen import TopicListener
+    from router.ros.listen import TopicListener
 
 PATIENCE = 0.2
 """Seconds after which Ctrl-C is noticed at the latest, while no message comes."""

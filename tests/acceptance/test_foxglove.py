@@ -12,7 +12,7 @@ from time import monotonic
 
 from tests.acceptance.payloads import generated
 from tests.acceptance.site import ROVER, RouterProcess, Site, balance, site, total
-from tests.edges.foxglove_client import PATIENCE, FoxgloveClient
+from tests.observe.foxglove_client import PATIENCE, FoxgloveClient
 from tests.ports import free_port
 
 MANY = 500

@@ -11,11 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from time import sleep
 
-from router.tools.recording import Recorded, Recording
+from router.recording.reader_mcap import Recorded, Recording
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS
 from tests.acceptance.site import ROOT, RouterProcess, Site, site, total, wait_until
-from tests.edges.recorder_rig import imu
+from tests.recording.recorder_rig import imu
 
 TABLE = """\
 version: 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import runpy
 
-from router.edges import http_answers
+from router.observe import http_answers
 
 if __name__ == "__main__":
     http_answers.KEPT_SECONDS = 0

@@ -179,7 +179,7 @@ def test_live_shows_topics_of_the_network_with_who_publishes_them(
     table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    from tests.edges.ros_publisher import Publisher
+    from tests.ros.ros_publisher import Publisher
 
     with closing(Publisher("greeting", "std_msgs/msg/String")):
         while "~" not in (told := explained(capsys, table, "net", "--live", "0.5")):

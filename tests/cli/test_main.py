@@ -103,5 +103,5 @@ def test_validate_imports_neither_ros_nor_what_a_person_looks_at() -> None:
     script = "import sys; from router.cli import main; main(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
     command = [sys.executable, "-c", script, "validate", str(ROUTES)]
     result = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
-    unwanted = {"rclpy", "rich", "structlog", "prometheus_client", "router.runtime", "router.cli.run"}
+    unwanted = {"rclpy", "rich", "structlog", "prometheus_client", "router.app", "router.cli.run"}
     assert unwanted.isdisjoint(result.stderr.split())

@@ -14,10 +14,10 @@ from router.assets import asset
 from router.cli import BAD_TABLE, BAD_USAGE, OK, findings, main
 from router.cli.test import FAILED
 from router.compiler.definitions import Definitions
+from router.rehearsal.reading import read_test_file
+from router.rehearsal.shape import SCHEMA
+from router.rehearsal.tests import prove
 from router.table import shape
-from router.tools.table_tests import prove
-from router.tools.table_tests_reading import read_test_file
-from router.tools.table_tests_shape import SCHEMA
 from tests.tables import PROTOS, RIG, ROUTES
 
 REPOSITORY = Path(__file__).parents[2]

@@ -11,9 +11,6 @@ from router.compiler.expressions import ParsedReads, Scope, Typed, check
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.program import Handler, Program
-from router.compiler.reference import fill
-from router.compiler.reference_cdr import cdr
-from router.compiler.reference_expressions import Context, View
 from router.compiler.source import Source
 from router.engine.binding import bind
 from router.engine.freshness import Freshness
@@ -23,6 +20,9 @@ from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.places import TextPlace
 from router.types.model import Enum, MessageType, Type
 from tests.engine.plain import plain_outlets
+from tests.oracles.reference import fill
+from tests.oracles.reference_cdr import cdr
+from tests.oracles.reference_expressions import Context, View
 
 SPAN = SourceSpan("table.yaml", 7, 3, 9)
 RECEIVED_AT = 1_700_000_000_123_456_789

@@ -13,13 +13,13 @@ from router.compiler.expressions import ParsedReads, Reads, Scope
 from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
-from router.compiler.reference import fill_given
-from router.compiler.reference_protobuf import envelope_of
 from router.compiler.source import Source
 from router.table.model import EnvelopeSettings, FieldMap, Located
 from router.types.model import Field, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of
+from tests.oracles.reference import fill_given
+from tests.oracles.reference_protobuf import envelope_of
 from tests.tables import PROTOS
 
 Wire = tuple[ProtoSchema, Envelope]

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from router.compiler.definitions import Definitions
-from router.compiler.reference import fill
 from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import MessageType
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer
 from tests.compiler.generated_types import mirror, values
 from tests.compiler.in_use import ROS_TYPES
+from tests.oracles.reference import fill
 
 pytest.importorskip("rclpy")
 

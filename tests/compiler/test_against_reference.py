@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from router.compiler import Checked
 from router.compiler.checked import CheckedRoute
 from router.compiler.program import Program
-from router.compiler.reference import fill
-from router.compiler.reference_cdr import cdr
 from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import Published, context_of
 from tests.compiler.in_use import INBOUND_CASES
+from tests.oracles.reference import fill
+from tests.oracles.reference_cdr import cdr
 
 GOLDEN: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "wire" / "golden_envelopes.json").read_text(encoding="utf-8")

@@ -10,8 +10,6 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.reference import Value
-from router.compiler.reference_cdr import cdr, parse
 from router.engine.outcome import MAPPING_FAILURES
 from router.errors import MappingError
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
@@ -19,6 +17,8 @@ from tests.compiler.comparing import same
 from tests.compiler.compiling import outcome
 from tests.compiler.generated_types import values
 from tests.compiler.reading import TIMES, WHOLE, Path, at, field_values, messages, paths, plain, reader, wanted_paths
+from tests.oracles.reference import Value
+from tests.oracles.reference_cdr import cdr, parse
 
 MANY = settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 

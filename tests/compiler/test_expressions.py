@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from router.compiler.expressions import Finding
 from router.compiler.kinds import BoolKind, FloatKind, IntKind, Kind, StringKind
 from router.compiler.mapping import build
-from router.compiler.reference_expressions import evaluate
 from router.compiler.source import Source
 from router.engine.outcome import MAPPING_FAILURES
 from router.errors import Code
@@ -33,6 +32,7 @@ from tests.compiler.compiling import (
     written,
 )
 from tests.compiler.generated_types import values
+from tests.oracles.reference_expressions import evaluate
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300), ("LESS", -7)))
 INNER = MessageType("Inner", (Field("value", Int(16, True)), Field("ratio", Float(64))))

@@ -6,9 +6,9 @@ import pytest
 
 from router.compiler.functions import FUNCTIONS
 from router.compiler.kinds import FloatKind, IntKind, StringKind, TimeKind
-from router.compiler.reference_expressions import evaluate
 from router.types.model import MessageType
 from tests.compiler.compiling import compiled, context_of, scope_of, written
+from tests.oracles.reference_expressions import evaluate
 
 NOTHING = MessageType("Nothing")
 EXAMPLES = [(name, text, value) for name, function in FUNCTIONS.items() for text, value in function.examples]

@@ -17,8 +17,8 @@ from router.compiler.books import (
     QOS_POLICIES,
     TOPIC_STATES,
 )
-from router.edges.gateway_zenoh_config import session_config
 from router.errors import Code
+from router.gateway.transport.zenoh_config import session_config
 from tests.compiler.conftest import CheckText
 
 UDP = "transport: {udp: 127.0.0.9:8502}, receive: 127.0.0.1:8500"

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import get_types_from_msg
 
-from router.compiler.reference import Value, fill
-from router.compiler.reference_cdr import cdr
 from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import AUTO, context_of, outcome, reference_bytes, scope_of, serializer
 from tests.compiler.generated_types import STATE, pairs, values
+from tests.oracles.reference import Value, fill
+from tests.oracles.reference_cdr import cdr
 
 MANY = settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 

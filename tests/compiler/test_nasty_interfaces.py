@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from router.compiler.reference import fill
-from router.compiler.reference_cdr import cdr
 from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import Field, Int, MessageType, String
 from tests.compiler.comparing import assert_same_message, same
@@ -18,6 +16,8 @@ from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope
 from tests.compiler.generated_types import mirror, values
 from tests.compiler.interface_package import MESSAGES, InterfacePackage, built, declared_type, is_buildable
 from tests.compiler.reading import WHOLE, field_values, reader
+from tests.oracles.reference import fill
+from tests.oracles.reference_cdr import cdr
 
 pytest.importorskip("rclpy")
 pytestmark = pytest.mark.skipif(not is_buildable(), reason="cmake and the ROS interface generators are needed")

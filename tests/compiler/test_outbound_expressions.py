@@ -12,13 +12,13 @@ from router.compiler.cdr import CdrReads
 from router.compiler.expressions import Finding, Scope, Typed, check
 from router.compiler.kinds import MessageKind, TimeKind, kind_of
 from router.compiler.namespace import NAMESPACE
-from router.compiler.reference import Value
-from router.compiler.reference_cdr import cdr
 from router.compiler.source import Source
 from router.compiler.syntax import load
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String
 from tests.compiler.compiling import SPAN, written
 from tests.compiler.reading import TIMES
+from tests.oracles.reference import Value
+from tests.oracles.reference_cdr import cdr
 
 _UINT8 = Int(8, signed=False)
 _, TIME = TIMES

@@ -14,8 +14,6 @@ from router.compiler.cdr import CdrReads
 from router.compiler.definitions import Definitions
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
-from router.compiler.reference import fill
-from router.compiler.reference_cdr import cdr
 from router.engine.outcome import MAPPING_FAILURES
 from router.errors import MappingError
 from router.table.model import FieldMap
@@ -23,6 +21,8 @@ from router.types.model import MessageType
 from tests.compiler.compiling import AUTO, SPAN, context_of, field_map, outcome, scope_of
 from tests.compiler.generated_types import mirror, payload_sources, values
 from tests.compiler.payloads import Wire, compiled_envelope, made_wire, reference_envelope, rover_wire
+from tests.oracles.reference import fill
+from tests.oracles.reference_cdr import cdr
 
 GOLDEN: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "wire" / "golden_envelopes.json").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import router.assets
-from router.edges.ros_environment import ros_package_remedy, ros_remedy
+from router.ros.environment import ros_package_remedy, ros_remedy
 from tests import tables
 
 ROOT = Path(__file__).parents[2]

@@ -12,11 +12,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, cast
 
+from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.program import GatewayPlan, Program
-from router.edges.clock import monotonic_ns, wall_ns
-from router.edges.gateway_transport import Client, Ears, Frame
-from router.edges.ros_topics import RosTopics, SeenPublisher
 from router.engine import Report
 from router.errors import StartError
 from router.gateway.hub import Hub
@@ -25,6 +23,8 @@ from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
 from router.gateway.style import Style
 from router.gateway.surroundings import Surroundings
+from router.gateway.transport.base import Client, Ears, Frame
+from router.ros.topics import RosTopics, SeenPublisher
 from router.table.model import Address
 from router.types.model import MessageType
 from router.types.ros import ros_interfaces

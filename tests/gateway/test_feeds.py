@@ -27,8 +27,8 @@ from router.gateway.samples import ReadyType, Sample
 from router.gateway.style import Style, UnreadableError
 from router.types.ros import RosInterfaces, ros_interfaces
 from router.types.ros_sources import MsgFiles, RosbagsDefinitions
-from tests.edges.ros_opening import HELLO, STRING, cdr, open_ros, padded, string_topic
-from tests.edges.ros_publisher import Publisher
+from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, padded, string_topic
+from tests.ros.ros_publisher import Publisher
 
 INT32 = "std_msgs/msg/Int32"
 FIVE = bytes.fromhex("0001000005000000")

@@ -9,8 +9,8 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.edges.ros_topics import SeenPublisher
 from router.gateway.following import Choice, choice
+from router.ros.topics import SeenPublisher
 
 RELIABLE = SeenPublisher("a/msg/A", is_reliable=True, keeps=False, is_ours=False)
 LATCHED = RELIABLE._replace(keeps=True)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.edges.gateway_transport import HIGH_WATER, Frame
 from router.gateway.history import History
 from router.gateway.subscriber import Subscriber
+from router.gateway.transport.base import HIGH_WATER, Frame
 
 MS = 1_000_000
 

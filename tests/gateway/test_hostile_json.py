@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from router.compiler.reference_cdr import parse
 from router.gateway.json_reading import InvalidMessageError, cdr_builder, example, parse_json
 from router.gateway.style import Style
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String
 from router.types.ros import ros_interfaces
 from tests.gateway.client_json import tree
+from tests.oracles.reference_cdr import parse
 
 EVERYTHING = MessageType(
     "made/msg/Everything",

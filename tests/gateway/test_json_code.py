@@ -15,15 +15,15 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.reference_cdr import cdr, parse
 from router.errors import MappingError
 from router.gateway.json_code import JsonCode, json_writer
-from router.gateway.reference_json import reference_text
 from router.gateway.style import PLACEHOLDER, Style, UnreadableError
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.ros import ros_interfaces
 from tests.compiler.generated_types import values
 from tests.compiler.reading import field_values, messages
+from tests.oracles.reference_cdr import cdr, parse
+from tests.oracles.reference_json import reference_text
 
 MANY = settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 FEW = settings(max_examples=3, suppress_health_check=list(HealthCheck))

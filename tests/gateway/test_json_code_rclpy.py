@@ -13,16 +13,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from router.gateway.json_code import json_writer
-from router.gateway.reference_json import reference_text
 from router.gateway.style import Style
 from router.types.model import MessageType
 from router.types.ros import RosInterfaces, ros_interfaces
 from tests.compiler.generated_types import values
 from tests.compiler.reading import field_values
+from tests.oracles.reference_json import reference_text
 
 pytest.importorskip("rclpy")
 
-from router.edges.ros_definitions import installed_type
+from router.ros.definitions import installed_type
 from tests.compiler.comparing import without_nul
 from tests.compiler.ros_objects import serialized
 

@@ -10,8 +10,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.reference import initial
-from router.compiler.reference_cdr import cdr
 from router.gateway.json_code import json_writer
 from router.gateway.json_reading import InvalidMessageError, cdr_builder, example, parse_json
 from router.gateway.style import PLACEHOLDER, Style
@@ -20,6 +18,8 @@ from router.types.ros import ros_interfaces
 from tests.compiler.generated_types import defaults
 from tests.compiler.reading import messages
 from tests.gateway.client_json import FORMS, tree, values, written
+from tests.oracles.reference import initial
+from tests.oracles.reference_cdr import cdr
 
 BYTE = Int(8, signed=False)
 

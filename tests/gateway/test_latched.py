@@ -12,9 +12,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from tests.edges.ros_opening import STRING, cdr, open_ros
-from tests.edges.ros_publisher import Publisher
 from tests.gateway.stage import Played, Stage, program
+from tests.ros.ros_opening import STRING, cdr, open_ros
+from tests.ros.ros_publisher import Publisher
 
 GATEWAY = (
     "{{transport: {{tcp: 127.0.0.1:{port}}}, format: json_lines, publish_period: {period}, "

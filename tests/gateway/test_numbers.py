@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.gateway.numbers import DOUBLES, FLOATS, double_text
-from router.gateway.reference_json import reference_number
+from tests.oracles.reference_json import reference_number
 
 GOLDEN = [
     line.split(" ") for line in Path(__file__).with_name("golden").joinpath("doubles.txt").read_text().splitlines()

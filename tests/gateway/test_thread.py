@@ -13,9 +13,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.compiler.program import Program
-from router.edges.gateway_tcp import TcpTransport
 from router.errors import StartError
 from router.gateway.thread import GatewayThread
+from router.gateway.transport.tcp import TcpTransport
 from tests.gateway.stage import Graph, program
 from tests.ports import free_port
 

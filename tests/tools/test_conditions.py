@@ -6,7 +6,7 @@ import pytest
 
 from router.tools import UsageError
 from router.tools.conditions import Condition
-from tests.edges.fake_running import sim_program
+from tests.observe.fake_running import sim_program
 
 CASES = sim_program().envelope.cases
 

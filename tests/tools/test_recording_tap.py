@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from router.cli import main
-from router.edges.tap_stream import Lost
+from router.observe.tap_stream import Lost
 from router.tools import UsageError
 from router.tools import recording_tap as module
 from router.tools.recording_tap import TapRecording
-from tests.edges.recorder_rig import again, imu, read, seen, table, wire
 from tests.ports import free_port
+from tests.recording.recorder_rig import again, imu, read, seen, table, wire
 from tests.tables import RIG
 
 TABLE = table()

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from router.cli import main
+from router.recording.reader_mcap import Recorded, Recording
 from router.tools import UsageError
-from router.tools.recording import Recorded, Recording
 from router.tools.replaying import on_time, parse_rate
-from tests.edges.recorder_rig import MILLISECOND, START, imu, recorded, seen
 from tests.ports import free_port
+from tests.recording.recorder_rig import MILLISECOND, START, imu, recorded, seen
 from tests.tables import PROTOS
 
 BOARD, STRANGER = ("127.0.6.30", 40001), ("127.0.6.99", 40002)

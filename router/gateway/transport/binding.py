@@ -1,0 +1,94 @@
+"""Opens what needs a local address: now, or as soon as this machine has that address. Knows no protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+
+from router.errors import StartError
+from router.log import logger
+from router.net.port_holder import port_taken
+from router.table.model import Address
+
+RETRY_SECONDS = 1.0
+"""Between attempts at an address that is not there."""
+
+MOST_UNACCEPTED = 1024
+"""Connections that the kernel keeps for a listener that is busy: as many clients may come at once."""
+
+RECEIVE_BUFFER = 64 * 1024
+"""Bytes that the kernel keeps of what a client sends. Little is sent, and a thousand clients are to cost little."""
+
+
+class Binding:
+    """Calls `attempt` until it works. `protocol` is udp or tcp. `is_ready` once it has."""
+
+    def __init__(self, protocol: str, address: Address, attempt: Callable[[], Awaitable[None]]) -> None:
+        self.is_ready = False
+        self._protocol = protocol
+        self._address = address
+        self._attempt = attempt
+        self._retrying: asyncio.Task[None] | None = None
+
+    async def open(self) -> None:
+        """Raises StartError, unless it is only that no network interface has the address yet."""
+        try:
+            await self._attempt()
+        except OSError as error:
+            if error.errno != errno.EADDRNOTAVAIL:
+                raise StartError(self._why_not(error)) from error
+            logger.warning("no network interface has this address yet: waiting for it", address=str(self._address))
+            self._retrying = asyncio.get_running_loop().create_task(self._retry())
+        else:
+            self.is_ready = True
+
+    async def close(self) -> None:
+        self.is_ready = False
+        if self._retrying is not None:
+            self._retrying.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._retrying
+
+    async def _retry(self) -> None:
+        told = errno.EADDRNOTAVAIL
+        while not self.is_ready:
+            await asyncio.sleep(RETRY_SECONDS)
+            try:
+                await self._attempt()
+            except OSError as error:
+                if error.errno not in (None, errno.EADDRNOTAVAIL, told):
+                    told = error.errno
+                    logger.error("this address cannot be used: trying on", why=self._why_not(error))
+            except Exception as error:  # noqa: BLE001 - a fault of the router, told loudly, is no reason to give up
+                what = {"message": f"a fault in the router itself kept {self._address} closed", "exception": error}
+                asyncio.get_running_loop().call_exception_handler(what)
+            else:
+                self.is_ready = True
+                logger.info("the address is here now, and used", address=str(self._address))
+
+    def _why_not(self, error: OSError) -> str:
+        what = f"{self._address} cannot be used"
+        if error.errno == errno.EADDRINUSE:
+            return f"{what}: {port_taken(self._protocol, self._address.port)}"
+        if error.errno == errno.EACCES:
+            return f"{what}: ports below 1024 need a privilege; choose a higher port, or grant CAP_NET_BIND_SERVICE"
+        return f"{what}: {error.strerror}"
+
+
+def listen_at(address: Address) -> socket.socket:
+    """A non-blocking TCP socket that listens at `address`. Raises OSError."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        # A restarted router need not wait for old connections to end; a port that another listens at stays refused.
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        opened.setblocking(False)
+        opened.bind(address)
+        opened.listen(MOST_UNACCEPTED)
+    except OSError:
+        opened.close()
+        raise
+    return opened

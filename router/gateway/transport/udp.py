@@ -1,0 +1,185 @@
+"""A gateway's UDP socket: sends to one client, and hears that client's host. Knows no packet.
+
+Unconnected, so that a client may send from any port; news about unreachable hosts does not reach such a socket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections import deque
+from collections.abc import Iterable, Sequence
+
+from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Ears, Frame
+from router.gateway.transport.binding import Binding
+from router.net.kernel import arrivals, ask_for_receive_buffer, drops
+from router.table.model import Address
+from router.table.units import LARGEST_DATAGRAM
+
+SEND_BUFFER = 4 << 20
+"""Bytes that the kernel is asked to keep for a network that is busy."""
+
+RECEIVE_BUFFER = 1 << 20
+"""Bytes that the kernel is asked to keep of what the client sends while the loop is busy."""
+
+BURST = 64
+BURST_BYTES = 128 * 1024
+PAUSE_SECONDS = 0.001
+"""So much is sent at once, and so long is waited before more: what a receiver with a default buffer can stand."""
+
+RECEIVED_PER_TURN = 32
+"""Datagrams that are taken before other work of the loop has its turn."""
+
+
+class UdpTransport:
+    """Its one client is there from the start. Without `local`, any port is sent from and nothing is received.
+
+    `most` bounds what is received, in bytes.
+    """
+
+    def __init__(self, remote: Address, local: Address | None, ears: Ears, most: int = LARGEST_DATAGRAM) -> None:
+        self.address: Address | None = None
+        self._remote = remote
+        self._local = local
+        self._ears = ears
+        self._most = most
+        self._binding = Binding("udp", local or Address("0.0.0.0", 0), self._bind)
+        self._client: UdpClient | None = None
+        self._socket: socket.socket | None = None
+        self._drops_at_close = 0
+
+    @property
+    def is_ready(self) -> bool:
+        return self._binding.is_ready
+
+    async def open(self) -> None:
+        await self._binding.open()
+
+    async def close(self) -> None:
+        await self._binding.close()
+        if self._socket is None or self._client is None:
+            return
+        if self._local is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
+        self._client.close()
+        self._drops_at_close = self.kernel_drops()
+        self._socket.close()
+        self._socket = None
+
+    def kernel_drops(self) -> int:
+        """Datagrams of whomever that the kernel threw away before they were received. For any thread."""
+        opened = self._socket
+        return self._drops_at_close if opened is None else drops(opened)
+
+    def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
+        for client in clients:
+            client.write(frames)
+
+    async def _bind(self) -> None:
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened.setblocking(False)
+        try:
+            # Never SO_REUSEADDR: with it, a second router would steal the port unnoticed.
+            opened.bind(self._local or ("", 0))
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+            if self._local is not None:
+                ask_for_receive_buffer(opened, RECEIVE_BUFFER)
+                self._arrived_at = arrivals(opened)
+        except OSError:
+            opened.close()
+            raise
+        self._socket = opened
+        self.address = Address(*opened.getsockname())
+        self._client = UdpClient(opened, self._remote, self._ears)
+        if self._local is not None:
+            asyncio.get_running_loop().add_reader(opened, self._receive, opened, self._client)
+        self._ears.joined(self._client)
+
+    def _receive(self, opened: socket.socket, client: UdpClient) -> None:
+        for _ in range(RECEIVED_PER_TURN):
+            try:
+                data, sender = opened.recvfrom(self._most + 1)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._ears.failed(client, error, 0)
+                return
+            if sender[0] != self._remote.host:
+                self._ears.refused("source_mismatch")
+            elif len(data) > self._most:
+                self._ears.refused("too_large")
+            else:
+                self._ears.received(client, data, self._arrived_at())
+
+
+class UdpClient:
+    """Whoever hears at the remote address. Each frame is one datagram; bursts are paced."""
+
+    def __init__(self, opened: socket.socket, remote: Address, ears: Ears) -> None:
+        self.label = str(remote)
+        self._send = opened.sendto
+        self._remote = remote
+        self._ears = ears
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[bytes] = deque()
+        self._backlog = 0
+        self._was_high = False
+        self._is_open = True
+        self._resume: asyncio.TimerHandle | None = None
+        self._burst_ends = 0.0  # by the loop's clock
+        self._burst = 0
+        self._burst_bytes = 0
+
+    def write(self, frames: Sequence[Frame]) -> None:
+        if not self._is_open:
+            return
+        self._waiting.extend(frame.data for frame in frames)
+        self._backlog += sum(len(frame.data) for frame in frames)
+        if self._resume is None:
+            self._send_burst()
+        self._was_high = self._was_high or self._backlog >= HIGH_WATER
+
+    def backlog(self) -> int:
+        return self._backlog
+
+    def close(self) -> None:
+        if not self._is_open:
+            return
+        self._is_open = False
+        self._waiting.clear()
+        self._backlog = 0
+        if self._resume is not None:
+            self._resume.cancel()
+        self._ears.left(self)
+
+    def _send_burst(self) -> None:
+        """Sends what may be sent now, and the rest later. Of errors, the last one stands for all of the burst."""
+        self._resume = None
+        now = self._loop.time()
+        if now >= self._burst_ends:
+            self._burst_ends = now + PAUSE_SECONDS
+            self._burst = self._burst_bytes = 0
+        lost = 0
+        failure: OSError | None = None
+        while self._waiting and self._burst < BURST and self._burst_bytes < BURST_BYTES:
+            data = self._waiting.popleft()
+            self._backlog -= len(data)
+            self._burst += 1
+            self._burst_bytes += len(data)
+            try:
+                self._send(data, self._remote)
+            except OSError as error:
+                failure, lost = error, lost + 1
+                if isinstance(error, BlockingIOError):  # the network is slower than this burst
+                    self._burst = BURST
+        if self._waiting:
+            self._resume = self._loop.call_at(self._burst_ends, self._send_burst)
+        if failure is not None:
+            self._ears.failed(self, failure, lost)
+        if self._was_high and self._backlog < LOW_WATER:
+            self._was_high = False
+            self._loop.call_soon(self._tell_drained)
+
+    def _tell_drained(self) -> None:
+        if self._is_open:
+            self._ears.drained(self)

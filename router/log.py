@@ -1,0 +1,144 @@
+"""The log: readable lines on a terminal, JSON lines elsewhere, both to stderr; floods are summarised.
+
+Knows nothing about what is logged.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import select
+import sys
+import threading
+from collections.abc import Callable, Hashable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, TextIO
+
+import structlog
+
+from router.clock import monotonic_ns
+
+logger: structlog.typing.FilteringBoundLogger = structlog.get_logger("router")
+
+LEVELS = ("debug", "info", "warning", "error")
+
+SUMMARY_INTERVAL_NS = 10_000_000_000
+MOST_KEYS = 1000
+
+
+def configure_log(level: str = "info", *, coloured: bool = False) -> None:
+    """Sets up structlog for the whole process. `level` is one of LEVELS; colours are for terminals only."""
+    on_terminal = sys.stderr.isatty()
+    rendering: list[structlog.typing.Processor] = (
+        # The plain traceback names file and line of the route table and nothing else is worth drawing boxes for.
+        [
+            structlog.dev.ConsoleRenderer(
+                colors=coloured, sort_keys=False, exception_formatter=structlog.dev.plain_traceback
+            )
+        ]
+        if on_terminal
+        else [structlog.processors.format_exc_info, structlog.processors.JSONRenderer(default=str)]
+    )
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="%H:%M:%S.%f" if on_terminal else "iso", utc=not on_terminal),
+            *rendering,
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
+        logger_factory=structlog.PrintLoggerFactory(_Expendable(sys.stderr)),  # type: ignore[arg-type]
+        cache_logger_on_first_use=True,
+    )
+
+
+class _Expendable:
+    """A stream whose reader may go away or stand still, or whose disk may fill up: that costs lines, never the caller.
+
+    The counters still tell what the lines would have told. Lines are written whole, when flushed.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._line = ""
+        self._room = select.poll()
+        self._is_file = _is_file(stream)
+        if self._is_file:
+            self._room.register(stream, select.POLLOUT)
+
+    def write(self, text: str) -> None:
+        self._line += text
+
+    def flush(self) -> None:
+        line, self._line = self._line, ""
+        with suppress(OSError):
+            if not self._is_file or self._room.poll(0):
+                self._stream.write(line)
+                self._stream.flush()
+
+
+def _is_file(stream: TextIO) -> bool:
+    try:
+        stream.fileno()
+    except io.UnsupportedOperation:  # a test's, in memory
+        return False
+    return True
+
+
+Emit = Callable[..., None]
+"""Called as `emit(event, **values)`, like a method of a structlog logger."""
+
+
+@dataclass(slots=True)
+class _Flood:
+    """One kind of event: when its last line was written, and what has happened since."""
+
+    emit: Emit
+    event: str
+    values: dict[str, Any]
+    last_line_ns: int
+    pending: int = 0
+
+
+@dataclass(slots=True)
+class FloodLog:
+    """Writes the first event of a kind at once, then at most one line per 10 s: the last one, and how many there were.
+
+    Thread-safe. `flush()` has to be called now and then, so that the end of a flood is told as well.
+    Beyond `MOST_KEYS` kinds, further ones share a summary.
+    """
+
+    clock_ns: Callable[[], int] = monotonic_ns
+    _floods: dict[Hashable, _Flood] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def note(self, key: Hashable, emit: Emit, event: str, exc_info: BaseException | None = None, **values: Any) -> None:
+        """One more event of the kind `key`. The first line carries the traceback of `exc_info`."""
+        now = self.clock_ns()
+        with self._lock:
+            flood = self._floods.get(key)
+            if flood is None and len(self._floods) >= MOST_KEYS:
+                flood = self._floods.get(None)
+                key, event, values = None, "events of many further kinds", {}
+            if flood is not None:
+                flood.values = values
+                flood.pending += 1
+                if now - flood.last_line_ns >= SUMMARY_INTERVAL_NS:
+                    _summarise(flood, now)
+                return
+            self._floods[key] = _Flood(emit, event, values, now)
+        emit(event, exc_info=exc_info, **values)
+
+    def flush(self, *, final: bool = False) -> None:
+        """Writes the summaries that are due; all that are pending when `final`."""
+        now = self.clock_ns()
+        with self._lock:
+            for flood in self._floods.values():
+                if flood.pending and (final or now - flood.last_line_ns >= SUMMARY_INTERVAL_NS):
+                    _summarise(flood, now)
+
+
+def _summarise(flood: _Flood, now: int) -> None:
+    seconds = round((now - flood.last_line_ns) / 1e9, 1)
+    flood.emit(flood.event, **flood.values, more=flood.pending, in_seconds=seconds)
+    flood.pending, flood.last_line_ns = 0, now

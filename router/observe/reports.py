@@ -1,0 +1,70 @@
+"""Says in the log what was lost and what deadmen do. Knows reports; what is counted is counted elsewhere."""
+
+from __future__ import annotations
+
+import threading
+
+from router.engine import Report
+from router.log import SUMMARY_INTERVAL_NS, FloodLog, logger
+
+
+class Reporter:
+    """Floods of reports become one line and then one per 10 s, which a thread of its own writes when it is due."""
+
+    def __init__(self) -> None:
+        self._floods = FloodLog()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._summarise, name="log")
+        self._thread.start()
+
+    def close(self) -> None:
+        """Says what has not been said yet."""
+        self._stopped.set()
+        self._thread.join()
+        self._floods.flush(final=True)
+
+    def report(self, report: Report) -> None:
+        if report.kind == "reject":
+            self._floods.note(
+                (report.place, report.reason),
+                logger.warning,
+                "datagram rejected",
+                listener=report.place,
+                reason=report.reason,
+                detail=report.detail,
+            )
+            return
+        # A traceback through generated code shows the line of the route table; others would show only the router.
+        traceback = report.error if report.reason in ("mapping_error", "non_finite") else None
+        event = "message dropped" if report.kind == "drop" else "the deadman could not send"
+        detail = {"detail": report.detail} if report.detail else {}
+        error = {"error": str(report.error)} if report.error is not None else {}
+        self._floods.note(
+            (report.kind, report.place, report.target, report.reason),
+            logger.warning,
+            event,
+            traceback,
+            route=report.place,
+            target=report.target,
+            reason=report.reason,
+            **error,
+            **detail,
+        )
+
+    def failed(self, error: Exception) -> None:
+        self._floods.note(
+            ("bug", type(error)),
+            logger.critical,
+            "a fault in the router itself lost a message; please report it",
+            error,
+        )
+
+    def deadman_changed(self, route: str, active: bool) -> None:
+        if active:
+            logger.warning("commands stopped coming: the deadman sends in their place", route=route)
+        else:
+            logger.warning("commands come again: the deadman is released", route=route)
+
+    def _summarise(self) -> None:
+        while not self._stopped.wait(SUMMARY_INTERVAL_NS / 1e9):
+            self._floods.flush()

@@ -1,0 +1,99 @@
+"""A ROS node in a context of its own, and the transports that Fast DDS uses for it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rclpy.context import Context
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from router.errors import StartError
+from router.log import logger
+
+RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
+"""What rclpy raises for bad arguments, names and settings: its own errors derive from RuntimeError."""
+
+RCL = ctypes.CDLL(rclpy_implementation.__file__)
+"""rcl, which rclpy's library has loaded. Calls through it release the interpreter lock; those of rclpy hold it."""
+
+UDP_ON_LOCALHOST = Path(__file__).with_name("fastdds_udp_localhost.xml")
+"""A profile of Fast DDS: UDP as its only transport, discovery on this computer only."""
+
+_SIM_TIME = "use_sim_time"
+_PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+
+
+def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> Node:
+    """Raises StartError. Signals are left alone, and rclpy's global context as well; close it with `close_node`."""
+    context = Context()
+    try:
+        with _environment(_transport_variables(os.environ)):
+            # The router has a log of its own: no log file of ROS, no /rosout. Nor parameter services:
+            # parameters fill the table's variables at start, so a service that sets them would pretend.
+            context.init(list(ros_args), initialize_logging=False)
+            node = Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
+        _ignore_sim_time(node)
+        return node
+    except RCL_ERRORS as error:
+        context.try_shutdown()
+        raise StartError(f"the ROS node cannot be created: {error}") from error
+
+
+def _ignore_sim_time(node: Node) -> None:
+    """Warn of `use_sim_time`, and drop the subscription to /clock that comes with it."""
+    if node.get_parameter(_SIM_TIME).value:
+        logger.warning(
+            f"{_SIM_TIME} is ignored: the router runs on real time (stamps, ttl, deadmen)",
+            remedy=f"leave {_SIM_TIME} out for this node, or set it to false; docs/ros.md says what to expect",
+        )
+        node.set_parameters([Parameter(_SIM_TIME, value=False)])
+
+
+def close_node(node: Node) -> None:
+    node.destroy_node()
+    node.context.try_shutdown()
+
+
+def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
+    """What to set for the node, so that FASTDDS_BUILTIN_TRANSPORTS=UDPv4 holds with a discovery range of LOCALHOST too.
+
+    For that range rmw_fastrtps opens shared memory and UDP, whatever the variable says. Our profile does the rest of
+    what the range does, and the range SUBNET leaves the profile alone.
+    """
+    wanted = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
+    is_local = any(variables.get(name) == value for name, value in wanted.items())
+    if not is_local or variables.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4":
+        return {}
+    if taken := next((name for name in _PROFILES if variables.get(name)), None):
+        logger.warning(
+            f"{taken} is set: with a discovery range of LOCALHOST, Fast DDS uses shared memory although "
+            "FASTDDS_BUILTIN_TRANSPORTS is UDPv4",
+            remedy=f"unset {taken}, or make it what {UDP_ON_LOCALHOST} is and set ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
+        )
+        return {}
+    chosen = {_PROFILES[0]: str(UDP_ON_LOCALHOST), "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET"}
+    if "ROS_LOCALHOST_ONLY" in variables:  # rcl warns where it is set at all
+        chosen["ROS_LOCALHOST_ONLY"] = "0"
+    return chosen
+
+
+@contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Sets variables of the process meanwhile: the middleware reads them from there."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,695 @@
+"""Reloads of a whole router in this process, while datagrams come: what is kept, what is counted, what is refused."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import os
+import random
+import re
+import shutil
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import time
+from unittest.mock import ANY
+
+import pytest
+from structlog.testing import capture_logs
+
+from router.app import Router, reloading, watching
+from router.app.accounts import Accounts
+from router.app.edges import Edges
+from router.app.watching import watched_files
+from router.compiler import check_table
+from router.compiler.books import Books
+from router.net.receiver import ReceiveThread
+from tests.acceptance.site import wait_until
+from tests.ports import free_port
+from tests.tables import PROTOS
+
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+{listen}
+endpoints:
+  sensor_board: {{address: 127.0.0.30:8, kind: board}}
+  basestation: {{address: "127.0.0.1:{basestation}", kind: basestation}}
+{more}"""
+PH = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
+TOPIC = """\
+  ph_info:
+    source: sensor_board
+    destinations: [basestation]
+    topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}]
+"""
+FROM_ROS = """\
+  rock_measure_result:
+    source: ros
+    topics: [{topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}]
+    fields: auto
+    destinations: [basestation]
+"""
+DRIVE, BRAKE = bytes.fromhex("c201021005"), bytes.fromhex("ca01020801")
+
+
+def turns(timeout: str, at_start: str = "silent") -> str:
+    deadman = f"timeout: {timeout}, send: {{manual_brake: {{brake: true}}}}, to: [basestation], repeat: 10ms"
+    return f"""\
+  manual_drive:
+    source: sensor_board
+    destinations: [basestation]
+    deadman: {{{deadman}, at_start: {at_start}}}
+"""
+
+
+def operator(port: int, timeout: str) -> str:
+    """A gateway that lets a topic in."""
+    return f"""\
+gateways:
+  operator:
+    transport: {{tcp: 127.0.0.1:{port}}}
+    format: json_lines
+    inbound:
+      - topic: word
+        type: std_msgs/msg/Bool
+        deadman: {{timeout: {timeout}, send: {{data: false}}}}
+"""
+
+
+def numbered(number: int) -> bytes:
+    """A `ph_info` with a number in it."""
+    return bytes.fromhex("0a050d") + struct.pack("<f", number)
+
+
+def let_rest(path: Path) -> None:
+    """As if it had been written a minute ago: a reload waits for what is being written."""
+    os.utime(path, (time() - 60,) * 2)
+
+
+@contextmanager
+def later(write: Callable[[], object]) -> Iterator[None]:
+    """Writes a moment after this was entered, as a slow copy goes on."""
+    timer = threading.Timer(0.2, write)
+    timer.start()
+    yield
+    timer.join()
+
+
+def udp(host: str) -> socket.socket:
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    opened.bind((host, 0))
+    opened.settimeout(10)
+    return opened
+
+
+@dataclass
+class Site:
+    """A folder for the table, a board that sends and a basestation that receives."""
+
+    folder: Path
+    board: socket.socket
+    basestation: socket.socket
+    listen: int
+    sent: list[int] = field(default_factory=list)
+    received: list[int] = field(default_factory=list)
+    """The numbers of what has arrived at the basestation, by `take`."""
+
+    def write(self, routes: str, *, listen: str | None = None, endpoints: str = "") -> Path:
+        path = self.folder / "table.yaml"
+        listeners = listen or f'  rover: {{address: "127.0.0.1:{self.listen}"}}'
+        destination = self.basestation.getsockname()[1]
+        path.write_text(
+            TABLE.format(protos=PROTOS, listen=listeners, basestation=destination, more=f"{endpoints}routes:\n{routes}")
+        )
+        let_rest(path)
+        return path
+
+    @contextmanager
+    def router(self, routes: str) -> Iterator[Router]:
+        program = check_table(self.write(routes)).program
+        assert program is not None
+        with Router(program) as router:
+            yield router
+
+    def send(self, *datagrams: bytes, port: int | None = None) -> None:
+        for datagram in datagrams:
+            self.board.sendto(datagram, ("127.0.0.1", port or self.listen))
+
+    @contextmanager
+    def under_load(self) -> Iterator[None]:
+        """Numbered datagrams come all the time, 2,000 per second."""
+        ended = threading.Event()
+
+        def load() -> None:
+            while not ended.wait(0.0005):
+                self.send(numbered(len(self.sent)))
+                self.sent.append(len(self.sent))
+                self.take()
+
+        thread = threading.Thread(target=load)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def take(self) -> None:
+        """What has arrived by now."""
+        self.basestation.setblocking(False)
+        with suppress(BlockingIOError):
+            while datagram := self.basestation.recv(1000):
+                self.received.append(int(struct.unpack("<f", datagram[3:])[0]))
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    with udp("127.0.0.30") as board, udp("127.0.0.1") as basestation:
+        yield Site(tmp_path, board, basestation, free_port())
+
+
+def settled(router: Router) -> dict[str, float]:
+    return {
+        f"{name}{sorted(labels.values())}": value
+        for name, labels, value in router.samples()
+        if name.startswith("router_config_")
+    }
+
+
+def test_nothing_is_lost_or_doubled_or_out_of_order_while_tables_change(site: Site) -> None:
+    choice = random.Random(6)
+    rover = f'address: "127.0.0.1:{site.listen}"'
+    tool = '  tool: {address: "127.0.0.1:9", kind: tool}\n'
+    with site.router(PH) as router:
+        first = router.listeners["rover"].socket
+        with site.under_load():
+            for _ in range(25):
+                listen = choice.choice([f"  rover: {{{rover}}}", f"  other: {{{rover}, coalesce: never}}"])
+                routes = choice.choice([PH, TOPIC, PH + turns("1s"), PH.replace("}", ", ttl: 5s}")])
+                site.write(routes, listen=listen, endpoints=choice.choice(["", tool]))
+                assert router.reload().ok
+                assert next(iter(router.listeners.values())).socket is first
+    site.take()
+    assert site.received == site.sent
+    assert router.total("datagrams_received") == len(site.sent)
+    assert router.total("datagrams_sent") == len(site.sent)
+    assert router.total("config_reloads") == 25
+
+
+def test_a_table_with_errors_changes_nothing_and_is_told(site: Site) -> None:
+    with site.router(PH) as router:
+        before = router.program
+        site.write(PH.replace("basestation", "nobody"))
+        result = router.reload()
+        assert (result.ok, result.text) == (False, "the table has 1 error")
+        assert "nobody" in str(result.findings[-1])
+        assert router.program is before
+        told = settled(router)
+        assert told["router_config_last_reload_successful[]"] == 0
+        assert told["router_config_reloads_total['invalid']"] == 1
+        site.send(numbered(3))
+        assert site.basestation.recv(1000) == numbered(3)
+        site.write(PH)
+        assert router.reload().text == "nothing changed"
+        assert settled(router)["router_config_last_reload_successful[]"] == 1
+
+
+def test_an_address_outside_of_the_networks_changes_nothing(site: Site) -> None:
+    with site.router(PH) as router:
+        before = router.program
+        here = "networks: [127.0.0.0/8]\n"
+        site.write(PH, endpoints=f"  camera: {{address: 192.168.0.60:8, kind: tool}}\n{here}")
+        result = router.reload()
+        assert (result.ok, router.program is before) == (False, True)
+        assert "error[outside-networks]" in str(result.findings[0])
+        site.write(PH, endpoints=f"  camera: {{address: 127.0.0.60:8, kind: tool}}\n{here}")
+        assert router.reload().ok
+
+
+def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
+    with site.router(PH) as router, udp("127.0.0.1") as taken:
+        both = (
+            f'  rover: {{address: "127.0.0.1:{site.listen}"}}\n'
+            f'  second: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}'
+        )
+        site.write(PH, listen=both)
+        result = router.reload()
+        assert not result.ok
+        assert "has the port" in result.text
+        assert "no route for the payload cases" in str(result.findings[0])  # warnings are told all the same
+        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        assert list(router.listeners) == ["rover"]
+        site.write(PH, listen=f'  rover: {{address: "0.0.0.0:{site.listen}"}}')
+        assert f"the router itself (pid {os.getpid()}) has the port; restart it" in router.reload().text
+
+
+def test_what_only_a_start_can_change_is_refused(site: Site) -> None:
+    with site.router(PH) as router:
+        path = site.write(PH)
+        unchanged = path.read_text()
+        for node in ("name: another", "diagnostics: true"):
+            path.write_text(f"{unchanged}node: {{{node}}}\n")
+            result = router.reload()
+            assert not result.ok
+            assert "table.yaml:10:1: error[bad-value]: 'node' cannot change while the router runs; restart it" in str(
+                result.findings[-1]
+            )
+
+
+def test_what_has_arrived_on_a_listener_that_goes_is_routed_before_it_goes(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    second = free_port()
+    both = f'  rover: {{address: "127.0.0.1:{site.listen}"}}\n  second: {{address: "127.0.0.1:{second}"}}'
+    with site.router(PH) as router:
+        site.write(PH, listen=both)
+        assert router.reload().ok
+        finish = ReceiveThread.finish
+
+        def finish_late(thread: ReceiveThread, listener: object) -> None:
+            site.send(*map(numbered, range(50)), port=second)  # while nobody receives
+            finish(thread, listener)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(ReceiveThread, "finish", finish_late)
+        site.write(PH)
+        assert router.reload().ok
+        assert [site.basestation.recv(1000) for _ in range(50)] == [numbered(number) for number in range(50)]
+        counted = {str(labels): value for name, labels, value in router.samples() if name.endswith("received_total")}
+        assert counted["{'listener': 'second'}"] == 50  # what happened does not vanish with who it happened to
+
+
+def test_a_deadman_stays_armed_when_its_table_is_reloaded(site: Site) -> None:
+    with site.router(turns("300ms")) as router:
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        site.write(turns("300ms") + PH)
+        assert router.reload().ok
+        assert site.basestation.recv(1000) == BRAKE
+
+
+def test_a_deadman_with_another_timeout_inherits_the_last_command(site: Site) -> None:
+    with site.router(turns("1h")) as router:
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        site.write(turns("50ms"))
+        assert router.reload().ok
+        assert site.basestation.recv(1000) == BRAKE
+        site.write(turns("60ms"))  # tripped
+        assert router.reload().ok
+        assert router.total("deadman_active") == 1
+        site.send(DRIVE)
+        while site.basestation.recv(1000) != DRIVE:
+            pass
+        assert site.basestation.recv(1000) == BRAKE
+        wait_until(lambda: router.total("deadman_trips") == 2)
+
+
+def test_a_deadman_that_goes_has_the_last_word_if_it_was_armed(site: Site) -> None:
+    with site.router(turns("1h") + PH) as router:
+        site.write(PH)
+        assert router.reload().ok  # nothing to say: no command came
+        site.write(turns("1h", "send") + PH)  # a reload is no start
+        assert router.reload().ok
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        site.write(PH)
+        assert router.reload().ok
+        assert site.basestation.recv(1000) == BRAKE
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)
+    assert router.total("deadman_datagrams_sent") == 1
+
+
+def test_a_rate_is_kept_over_a_reload(site: Site) -> None:
+    slow = "  ph_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 0.001}]}\n"
+    with site.router(slow) as router:
+        site.send(numbered(0))
+        assert site.basestation.recv(1000) == numbered(0)
+        site.write(slow + turns("1s"))
+        assert router.reload().ok
+        site.send(numbered(1))
+        wait_until(lambda: router.total("datagrams_received") == 2)
+    assert router.total("messages_dropped") == 1
+
+
+def test_reloads_leave_nothing_behind(site: Site) -> None:
+    sizes = []
+    with site.router(PH) as router, site.under_load():
+        for number in range(12):
+            site.write([TOPIC + turns("1s"), PH][number % 2])
+            assert router.reload().ok
+            if number % 2:
+                gc.collect()
+                sizes.append(len(gc.get_objects()))
+    assert sizes[-1] <= sizes[1] + 50
+    site.take()
+    assert site.received == site.sent
+
+
+def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(site: Site) -> None:
+    path = site.write(PH)
+    path.write_text("reload: {on_change: true}\n" + path.read_text())
+    program = check_table(path).program
+    assert program is not None
+    with Router(program) as router:
+        path.write_text(path.read_text() + turns("1s"))
+        wait_until(lambda: len(router.program.table.routes) == 2, "the change")
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+
+
+def test_a_reload_waits_for_files_that_are_being_written(site: Site) -> None:
+    """What is there meanwhile is valid: the base that the table extends, whose routes go elsewhere."""
+    with site.router(PH) as router:
+        table = router.program.table.path
+        table.rename(site.folder / "base.yaml")
+        beginning = "version: 1\nextends: base.yaml\n"
+        table.write_text(beginning)
+        with later(lambda: table.write_text(f"{beginning}routes:\n{turns('1s')}")):
+            assert router.reload().text == "route manual_drive added"
+
+
+def test_a_reload_waits_for_files_that_only_the_new_table_names(site: Site) -> None:
+    with site.router(PH) as router:
+        table, base = router.program.table.path, site.folder / "base.yaml"
+        beginning = table.read_text()
+        table.write_text("version: 1\nextends: base.yaml\n")
+        let_rest(table)
+        base.write_text(beginning)
+        with later(lambda: base.write_text(beginning + turns("1s"))):
+            assert router.reload().text == "route manual_drive added"
+
+
+def test_a_reload_refuses_files_that_do_not_come_to_rest(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reloading, "PATIENCE", 1.0)
+    with site.router(PH) as router:
+        path, ended = site.write(PH + turns("1s")), threading.Event()
+
+        def write() -> None:
+            while not ended.wait(0.05):
+                path.write_text(path.read_text() + "# more\n")
+
+        writing = threading.Thread(target=write)
+        writing.start()
+        wait_until(lambda: path.read_text().endswith("more\n"), "the first line")
+        result = router.reload()
+        ended.set()
+        writing.join()
+        assert (result.ok, result.text) == (False, f"these files are still being written: {path}")
+        assert len(router.program.table.routes) == 1
+        let_rest(path)
+        assert router.reload().ok
+
+
+def test_a_reload_waits_for_nothing_where_files_rest(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def sleep(seconds: float) -> None:
+        raise AssertionError(f"it waits for {seconds} s")
+
+    monkeypatch.setattr(watching, "sleep", sleep)
+    with site.router(PH) as router:
+        os.utime(site.write(PH + turns("1s")), (time() + 60,) * 2)  # by a clock that was set back since
+        assert router.reload().ok
+
+
+def test_a_reload_that_moves_every_endpoint_is_warned_about(site: Site) -> None:
+    with site.router(PH) as router:
+        path = site.write(PH)
+        text = path.read_text()
+        port = site.basestation.getsockname()[1]
+
+        def warned(*moves: tuple[str, str]) -> list[object]:
+            path.write_text(functools.reduce(lambda text, move: text.replace(*move), moves, text))
+            let_rest(path)
+            with capture_logs() as logged:
+                assert router.reload().ok
+            return [line["endpoints"] for line in logged if line["log_level"] == "warning"]
+
+        one = ("127.0.0.30:8", "127.0.0.31:8")
+        two = (f"127.0.0.1:{port}", f"127.0.0.2:{port}")
+        assert warned(one) == warned() == []
+        assert warned(one, two) == [
+            ["sensor_board 127.0.0.30:8 -> 127.0.0.31:8", f"basestation 127.0.0.1:{port} -> 127.0.0.2:{port}"]
+        ]
+
+
+def test_a_gateway_keeps_its_clients_unless_it_changes_itself(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateway = f"  dashboard: {{transport: {{tcp: 127.0.0.1:{port}}}, publish_period: %s}}\n"
+    with site.router(TOPIC) as router:
+        site.write(TOPIC + "gateways:\n" + gateway % "1s")
+        assert router.reload().text == "gateway dashboard added"
+        with socket.create_connection(("127.0.0.1", port)) as client:
+            client.settimeout(10)
+            wait_until(lambda: client_count(router) == 1, "the client")
+            site.write(PH + "# a line more\ngateways:\n" + gateway % "1s")
+            assert router.reload().text == "route ph_info changed"
+            assert client_count(router) == 1
+            site.write(PH + "gateways:\n" + gateway % "2s")
+            assert router.reload().text == "gateway dashboard changed"
+            while client.recv(4096):
+                pass
+        socket.create_connection(("127.0.0.1", port)).close()
+        site.write(PH)
+        assert router.reload().text == "gateway dashboard removed"
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port))
+
+
+def test_a_gateway_that_made_room_in_vain_is_opened_again(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateways = f"gateways:\n  dashboard: {{transport: {{tcp: 127.0.0.1:{port}}}, publish_period: %s}}\n"
+    with socket.create_server(("127.0.0.1", 0)) as taken, site.router(PH + gateways % "1s") as router:
+        another = f"  another: {{transport: {{tcp: 127.0.0.1:{taken.getsockname()[1]}}}}}\n"
+        for _ in range(2):
+            site.write(PH + gateways % "2s" + another)
+            assert "gateway 'another' cannot be opened" in router.reload().text
+            with socket.create_connection(("127.0.0.1", port)):
+                wait_until(lambda: client_count(router) == 1)
+        site.write(PH + gateways % "2s")
+        assert router.reload().text == "gateway dashboard changed"
+        with socket.create_connection(("127.0.0.1", port)):
+            wait_until(lambda: client_count(router) == 1)
+
+
+def client_count(router: Router) -> int:
+    return int(sum(value for name, _, value in router.samples() if name == "router_gateway_clients"))
+
+
+def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = (
+        "  ph_info: {{source: sensor_board, destinations: [{{endpoint: basestation, keep: latest, max_rate: {}}}]}}\n"
+    )
+    with site.router(held.format(0.001)) as router:
+        site.send(*map(numbered, range(2)))
+        wait_until(lambda: router.total("datagrams_received") >= 2)
+        finish = Edges._finish
+
+        def finish_late(edges: Edges, *args: object) -> None:
+            site.send(numbered(2))
+            wait_until(lambda: router.total("datagrams_received") >= 3)
+            finish(edges, *args)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(Edges, "_finish", finish_late)
+        site.write(held.format(1000))
+        assert router.reload().ok
+        assert [site.basestation.recv(1000) for _ in range(3)] == [numbered(number) for number in range(3)]
+
+
+def test_what_waits_for_a_budget_is_counted_when_its_route_goes(site: Site) -> None:
+    board = f'  slow: {{address: "127.0.0.1:{site.basestation.getsockname()[1]}", kind: tool, budget: 1 kB/s}}\n'
+    others = "  pump_info: {source: sensor_board, destinations: [slow]}\n"
+    slow = PH.replace("basestation", "slow") + others
+    program = check_table(site.write(slow, endpoints=board)).program
+    assert program is not None
+    with Router(program) as router:
+        site.send(*map(numbered, range(200)))
+        wait_until(lambda: router.total("datagrams_received") >= 200)
+        site.write(others, endpoints=board)
+        assert router.reload().ok
+        assert router.total("datagrams_sent") == 200
+    site.take()
+    assert site.received == list(range(200))
+
+
+def test_what_a_gateway_let_in_is_stopped_when_a_reload_ends_that(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateway = operator(port, "1h")
+    with site.router(PH + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
+        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
+        wait_until(lambda: router.total("messages_published") == 1)
+        site.write(PH)
+        assert router.reload().ok
+        assert router.total("deadman_datagrams_sent") == 1
+
+
+def test_a_deadman_brakes_while_the_middleware_blocks_that_of_a_gateway(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    gateway = operator(port, "10ms")
+    with site.router(turns("500ms") + gateway) as router, socket.create_connection(("127.0.0.1", port)) as client:
+        is_in, go_on = threading.Event(), threading.Event()
+
+        def blocked(_: bytes) -> None:
+            is_in.set()
+            go_on.wait()
+
+        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
+        wait_until(lambda: router.total("messages_published") == 1)
+        assert router._edges._ros is not None
+        monkeypatch.setitem(router._edges._ros.publish, "/word", blocked)
+        assert is_in.wait(20)
+        site.send(DRIVE)
+        site.basestation.settimeout(20)
+        try:
+            assert [site.basestation.recv(64) for _ in range(3)] == [DRIVE, BRAKE, BRAKE]
+        finally:
+            go_on.set()
+
+
+def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    from router.ros.threads import MessageThread
+
+    go_on, do_tasks = threading.Event(), MessageThread._do_tasks
+
+    def stand_still(thread: MessageThread) -> None:
+        go_on.wait(10)
+        do_tasks(thread)
+
+    with site.router(PH + FROM_ROS) as router:
+        site.write(PH + FROM_ROS + turns("1h"))
+        with monkeypatch.context() as stuck:
+            stuck.setattr("router.threads.parking.PATIENCE_S", 0.05)
+            stuck.setattr(MessageThread, "_do_tasks", stand_still)
+            result = router.reload()
+        assert (result.ok, "is stuck" in result.text) == (False, True)
+        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        assert [route.name for route in router.program.table.routes] == ["ph_info", "rock_measure_result"]
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)
+        go_on.set()
+        assert router.reload().text == "route manual_drive added"
+        site.send(numbered(2), DRIVE)
+        assert [site.basestation.recv(1000) for _ in range(2)] == [numbered(2), DRIVE]
+
+
+@pytest.mark.parametrize("late", ["router.app.accounts.Books.settle", "router.app.BooksCollector"])
+def test_what_fails_when_the_table_runs_already_is_not_told_as_if_nothing_had_changed(
+    site: Site, monkeypatch: pytest.MonkeyPatch, late: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise LookupError("a bug")
+
+    with capture_logs() as logged, site.router(PH) as router:
+        site.write(PH + turns("1h"))
+        monkeypatch.setattr(late, fail)
+        assert router.reload() == (True, ANY, "route manual_drive added")
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+    told = [entry["event"] for entry in logged if entry["log_level"] == "critical"]
+    assert [event.split(";")[-1] for event in told] == [" please report it"]
+
+
+def test_files_that_go_while_they_are_read_change_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def vanished(*_: object) -> None:
+        raise FileNotFoundError(2, "No such file or directory", "components")
+
+    with site.router(PH) as router:
+        monkeypatch.setattr("router.app.reloading.check_table", vanished)
+        result = router.reload()
+        assert (result.ok, "components" in result.text) == (False, True)
+        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)
+
+
+def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with site.router(PH) as router:
+        pass
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as hearing:
+        hearing.bind(str(site.folder / "notify"))
+        hearing.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(site.folder / "notify"))
+        assert router.reload().text == "the router is not running"
+        with pytest.raises(BlockingIOError):
+            hearing.recv(1000)
+
+
+def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:
+    accounts = Accounts(Books())
+    abandoned = accounts.books.continued()
+    slot = abandoned.slot("datagrams_padded", "another")
+    accounts.make_room(abandoned)
+    accounts.gateways[slot] += 1
+    then = accounts.books.continued()
+    assert then.slot("datagrams_received", "rover") == slot
+    accounts.make_room(then)
+    accounts.settle(then)
+    assert accounts.total("datagrams_received") == 0
+
+
+def test_a_gateway_in_a_zenoh_network_goes_on_unless_its_config_changes(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    settings = f"{{key: rovers/one, listen: [tcp/127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}], config: zenoh.json5}}"
+    gateways = f"gateways:\n  %s: {{transport: {{zenoh: {settings}}}}}\n"
+    config = site.folder / "zenoh.json5"
+    config.write_text("{queries_default_timeout: 1000}")
+    with site.router(PH + gateways % "earth") as router:
+        assert config in watched_files(router.program.table)
+        site.write(PH + "# a line more\n" + gateways % "earth")
+        assert router.reload().text == "nothing changed"
+        config.write_text("{queries_default_timeout: 2000}")
+        assert router.reload().text == "gateway earth changed"
+        config.write_text("{queries_default_timeout: soon}")
+        assert router.reload().text == "the table has 1 error"
+        config.write_text("{queries_default_timeout: 2000}")
+        site.write(PH + gateways % "mars")
+        assert router.reload().text == "gateway earth removed, gateway mars added"
+        wait_until(lambda: client_count(router) == 1, "its turn")
+        conflicts = [value for name, _, value in router.samples() if name == "router_gateway_key_conflicts_total"]
+        assert set(conflicts) == {0}
+
+
+def test_a_reload_agrees_with_validate_about_stray_protos_and_a_lock_elsewhere(site: Site) -> None:
+    protos, lock = site.folder / "protos", site.folder / "wire.lock.json"
+    shutil.copytree(PROTOS, protos)
+    (protos / "envelope.lock.json").rename(lock)
+    own = f"envelope: {{protos: protos, message: PBEnvelope, oneof: payload, lock: {lock.name}}}"
+
+    def write(routes: str) -> None:
+        path = site.write(routes)
+        path.write_text(re.sub("envelope:.*", own, path.read_text()))
+        let_rest(path)
+
+    with site.router(PH) as router:
+        write(PH)
+        assert router.reload().ok
+        assert lock in watched_files(router.program.table)
+        (protos / "stray.proto").write_text("<<<<<<< HEAD\n")
+        assert router.reload().ok
+        text = lock.read_text()
+        lock.write_text(text.replace("float ph_value", "double ph_value"))
+        assert router.reload().text == "the table has 1 error"
+        lock.write_text(text)
+        assert router.reload().ok
+        (protos / "stray.proto").unlink()
+        lock.unlink()
+        assert router.reload().text == "the table has 1 error"
+        site.send(numbered(1))
+        assert site.basestation.recv(1000) == numbered(1)

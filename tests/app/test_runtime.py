@@ -1,0 +1,293 @@
+"""A whole router in this process: real tables, real sockets, and ROS subscribers in processes of their own."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from structlog.testing import capture_logs
+
+from router.app import Router
+from router.compiler import check_table
+from router.compiler.program import Program
+from router.errors import StartError
+from router.net.reader import Receive
+from router.net.receiver import ReceiveThread
+from router.net.udp import Listener
+from router.recording.recorder import Recorder, RecordError
+from tests.acceptance.site import wait_until
+from tests.recording.recorder_rig import read
+from tests.tables import PROTOS
+
+ROOT = Path(__file__).parent.parent
+BOARD = "127.0.0.30"
+PH = bytes.fromhex("0a11 0d713dda40 1560e52040 1d33334541 2001".replace(" ", ""))  # 6.82, 2.51, 12.3, operating
+NAN_PH = bytes.fromhex("0a05 0d0000c07f".replace(" ", ""))
+
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+  rover: {{address: "127.0.0.1:{listen}"}}
+endpoints:
+  sensor_board: {{address: 127.0.0.30:8, kind: board}}
+  basestation: {{address: "127.0.0.1:{destination}", kind: basestation}}
+routes:
+  ph_info:
+    source: sensor_board
+    destinations: [basestation]
+"""
+TURNS = """\
+  manual_drive:
+    source: sensor_board
+    destinations: [basestation]
+    deadman:
+      {timeout: 20ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 10ms, hands_over_to: [ph_info]}
+"""
+DRIVE = bytes.fromhex("c201021005")  # turn 5
+BRAKE = bytes.fromhex("ca01020801")
+TOPIC = """\
+    topics:
+      - {topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}
+"""
+
+
+@dataclass
+class Site:
+    """What is around a router: a folder for its table, a board that sends and a basestation that receives."""
+
+    folder: Path
+    board: socket.socket
+    basestation: socket.socket
+    listen: int
+
+    def program(self, more: str = "") -> Program:
+        path = self.folder / "table.yaml"
+        ports = {"listen": self.listen, "destination": self.basestation.getsockname()[1]}
+        path.write_text(TABLE.format(protos=PROTOS, **ports) + more)
+        checked = check_table(path)
+        assert checked.program, "\n".join(map(str, checked.diagnostics))
+        return checked.program
+
+    def send(self, *datagrams: bytes) -> None:
+        for datagram in datagrams:
+            self.board.sendto(datagram, ("127.0.0.1", self.listen))
+
+
+def udp(host: str) -> socket.socket:
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.bind((host, 0))
+    opened.settimeout(10)
+    return opened
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    with udp("127.0.0.1") as unused:
+        listen = unused.getsockname()[1]
+    with udp(BOARD) as board, udp("127.0.0.1") as basestation:
+        yield Site(tmp_path, board, basestation, listen)
+
+
+def test_a_datagram_is_forwarded_unchanged(site: Site) -> None:
+    with Router(site.program()):
+        site.send(PH)
+        assert site.basestation.recv(1000) == PH
+
+
+def test_a_message_reaches_the_topic_and_every_step_is_counted(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    from tests.ros.ros_subscriber import Subscriber
+
+    program = site.program(TOPIC)
+    with Router(program) as router, closing(Subscriber("ph", "comms/msg/SensorBoardPHInfo")) as subscriber:
+        assert subscriber.line() == "matched"
+        while not router.totals()["messages_published"]:  # the router learns of the subscriber when it does
+            site.send(PH)
+            assert site.basestation.recv(1000) == PH
+        cdr = bytes.fromhex(subscriber.line())
+    assert struct.unpack_from("<fffBB", cdr, 4) == pytest.approx((6.82, 2.514, 12.325, 1, 0), abs=0.001)
+    accepted, filtered = router.total("messages_received"), router.total("messages_filtered")
+    published = router.total("messages_published")
+    assert router.totals() == {
+        "datagrams_received": accepted,
+        "datagrams_rejected": 0,
+        "messages_received": accepted,
+        "datagrams_sent": accepted,
+        "messages_published": published,
+        "messages_dropped": 0,
+        "kernel_drops": 0,
+    }
+    assert published >= 1
+    assert published + filtered == accepted
+
+
+def test_what_has_arrived_is_routed_before_the_router_stops(site: Site) -> None:
+    with Router(site.program()) as router:
+        site.send(*[PH] * 100)
+    assert router.totals()["datagrams_sent"] == 100
+    assert [site.basestation.recv(1000) for _ in range(100)] == [PH] * 100
+
+
+def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> None:
+    with capture_logs() as logged, Router(site.program(TURNS)) as router:
+        assert site.basestation.recv(1000) == BRAKE  # since the router starts
+        site.send(DRIVE)
+        assert site.basestation.recv(1000) == DRIVE
+        assert site.basestation.recv(1000) == BRAKE
+        site.send(PH)
+        while (received := site.basestation.recv(1000)) != PH:
+            assert received == BRAKE
+        time.sleep(0.1)  # ten repeats, had it gone on
+        site.send(PH)
+        assert site.basestation.recv(1000) == PH
+        assert (router.total("deadman_active"), router.total("deadman_trips")) == (0, 1)
+    told = [entry["event"] for entry in logged if entry.get("route") == "manual_drive"]
+    assert told == [
+        "the deadman has sent its payload, since the router starts",
+        "commands stopped coming: the deadman sends in their place",
+        "commands come again: the deadman is released",
+    ]
+
+
+def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[bytes] = []
+    close = Recorder.close
+
+    def close_late(recorder: Recorder) -> None:
+        said.extend(site.basestation.recv(1000) for _ in range(102))
+        close(recorder)
+
+    monkeypatch.setattr(Recorder, "close", close_late)
+    with Router(site.program(TURNS.replace("20ms", "1h") + "record: {directory: recordings}\n")):
+        site.send(*[DRIVE] * 100)
+    assert said == [BRAKE, *[DRIVE] * 100, BRAKE]
+    [recording] = (site.folder / "recordings").iterdir()
+    assert [each.data for each in read(recording)] == [DRIVE] * 100
+
+
+def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, saved = threading.Event(), SimpleQueue[str]()
+
+    def save(_: Recorder, reason: str) -> None:
+        saved.put(reason)
+        assert go_on.wait(10)
+        raise RecordError("the disk is full")
+
+    monkeypatch.setattr(Recorder, "save", save)
+    with capture_logs() as logged, Router(site.program("record: {directory: recordings, last: 60s}\n")) as router:
+        router.save_recording("first")
+        assert saved.get(timeout=10) == "first"
+        for reason in ("second", "third"):  # which the second one saves, as it has not begun
+            router.save_recording(reason)
+        go_on.set()
+        assert saved.get(timeout=10) == "second"
+        wait_until(lambda: [entry.get("problem") for entry in logged].count("the disk is full") == 2)
+    assert saved.empty()
+
+
+def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    router = Router(site.program())
+    seen: list[bytes] = []
+    serve = ReceiveThread.serve
+
+    def serve_late(thread: ReceiveThread, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
+        if listeners:
+            router.mirror.attach(lambda batch: seen.extend(data for _, _, _, data in batch))
+        serve(thread, listeners, receive)
+
+    monkeypatch.setattr(ReceiveThread, "serve", serve_late)
+    with router:
+        site.send(PH)
+        assert site.basestation.recv(1000) == PH
+    assert seen == [PH]
+
+
+def test_metrics_are_served_while_it_runs(site: Site) -> None:
+    with udp("127.0.0.1") as unused:
+        address = f"127.0.0.1:{unused.getsockname()[1]}"
+    with Router(site.program(f'metrics: {{address: "{address}"}}\n')) as router:
+        site.send(PH, b"\x00\x01")
+        assert site.basestation.recv(1000) == PH
+        while router.totals()["datagrams_received"] < 2:
+            pass
+        text = urllib.request.urlopen(f"http://{address}/metrics", timeout=10).read().decode()
+    samples = {
+        (sample.name, *sorted(sample.labels.values())): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+    assert samples["router_datagrams_received_total", "rover"] == 2
+    assert samples["router_datagrams_sent_total", "basestation", "ph_info"] == 1
+    assert samples["router_messages_dropped_total", "basestation", "ph_info", "send_error"] == 0
+    [build] = [labels for name, *labels in samples if name == "router_build_info"]
+    assert router.program.table.sha256 in build
+    assert router.program.protos_sha256 in build
+
+
+def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -> None:
+    failing = """\
+    topics:
+      - topic: ph
+        type: comms/msg/SensorState
+        qos: {durability: transient_local}
+        fields:
+          state: clamp(round(ph_value), 0, 255)
+"""
+    program = site.program(failing)
+    with capture_logs() as logged, Router(program) as router:
+        site.send(NAN_PH, NAN_PH, NAN_PH)
+    lines = [entry for entry in logged if entry["event"] == "message dropped"]
+    assert [(line["reason"], line.get("more")) for line in lines] == [("non_finite", None), ("non_finite", 2)]
+    frames = []
+    traceback = lines[0]["exc_info"].__traceback__
+    while traceback:
+        frames.append((Path(traceback.tb_frame.f_code.co_filename).name, traceback.tb_lineno))
+        traceback = traceback.tb_next
+    assert ("table.yaml", 17) in frames
+    assert router.totals()["datagrams_sent"] == router.totals()["messages_dropped"] == 3
+
+
+def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) -> None:
+    with capture_logs() as logged, Router(site.program()):
+        pass
+    started, stopping, stopped = logged
+    assert started["event"] == "router started"
+    assert started["listening"] == {"rover": f"127.0.0.1:{site.listen}"}
+    assert (started["routes"], started["destinations"]) == (1, 1)
+    assert (started["published"], started["subscribed"]) == (0, 0)
+    assert stopping["event"] == "router stopping"
+    assert (stopped["event"], stopped["datagrams_received"]) == ("router stopped", 0)
+
+
+def test_what_cannot_be_opened_is_told_with_its_line_and_leaves_nothing_open(site: Site) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        program = site.program(f'metrics: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}\n')
+        with pytest.raises(StartError, match=r"table.yaml:12:\d+: metrics cannot be served"), Router(program):
+            pass
+    with Router(program):  # the listener's port is free again
+        pass
+
+
+def test_a_table_without_topics_runs_without_ros(site: Site) -> None:
+    path = site.program().table.path
+    script = (
+        "import sys; from pathlib import Path\n"
+        "from router.compiler import check_table; from router.app import Router\n"
+        f"with Router(check_table(Path({str(path)!r})).program): sys.exit('rclpy' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)

@@ -1,0 +1,247 @@
+"""Starts of `router run` as a process, where something is wrong around it or signals come before it routes."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from router.ros.environment import SHM, obstacles, uses_shared_memory
+from tests.ports import free_port
+from tests.tables import PROTOS, ROUTES
+
+ROOT = Path(__file__).parent.parent
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+  rover: {{address: "127.0.0.1:{listen}"}}
+record: {{last: 10s, directory: {folder}}}
+endpoints:
+  basestation: {{address: "127.0.0.1:{destination}", kind: basestation}}
+routes:
+  ph_info:
+    source: any
+    destinations: [basestation]
+"""
+TOPIC = "    topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, fields: auto}]\n"
+
+HALTING = """\
+import sys
+
+
+class Halting:
+    '''Says that `router.cli` is about to be imported, and waits for a line.'''
+
+    def find_spec(self, name, path=None, target=None):
+        if name == "router.cli":
+            print("importing", flush=True)
+            sys.stdin.readline()
+
+
+sys.meta_path.insert(0, Halting())
+"""
+
+MODULE = ["-m", "router"]
+SCRIPT = ["-c", "import sys; from router import main; sys.exit(main())"]
+"""What the console script does."""
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    path = tmp_path / "table.yaml"
+    ports = {"listen": free_port(), "destination": free_port()}
+    path.write_text(TABLE.format(protos=PROTOS, folder=tmp_path / "recordings", **ports))
+    return path
+
+
+def start(how: Sequence[str], *arguments: str | Path, path: str = "", **options: object) -> subprocess.Popen[str]:
+    paths = filter(None, (path, str(ROOT), os.environ.get("PYTHONPATH")))
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    return subprocess.Popen(  # type: ignore[call-overload, no-any-return]
+        [sys.executable, *how, *arguments], text=True, env=environment, **pipes, **options
+    )
+
+
+def halted(how: Sequence[str], tmp_path: Path, *arguments: str | Path) -> subprocess.Popen[str]:
+    """Before it imports anything that takes long. It goes on after a line."""
+    folder = tmp_path / "halting"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(HALTING)
+    process = start(how, *arguments, path=str(folder))
+    assert process.stdout
+    assert process.stdout.readline() == "importing\n"
+    return process
+
+
+def ended(*arguments: str | Path, **options: object) -> tuple[int, list[str]]:
+    """Exit code and what it said, without warnings about the table."""
+    process = start(MODULE, *arguments, **options)  # type: ignore[arg-type]
+    try:
+        _, said = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    return process.returncode, [line for line in said.splitlines() if line.startswith("router ")]
+
+
+@pytest.mark.parametrize("how", [MODULE, SCRIPT], ids=["module", "script"])
+def test_signals_that_come_before_it_routes_are_served_when_it_does(
+    table: Path, tmp_path: Path, how: Sequence[str]
+) -> None:
+    process = halted(how, tmp_path, "run", table)
+    process.send_signal(signal.SIGHUP)
+    process.send_signal(signal.SIGUSR1)
+    assert process.stdin
+    assert process.stderr
+    process.stdin.close()
+    wanted = {"router started", "table reloaded", "saved the last datagrams"}
+    for line in process.stderr:
+        if line.startswith("{"):
+            wanted.discard(json.loads(line)["event"])
+        if not wanted:
+            break
+    process.stdin = None
+    process.terminate()
+    process.communicate(timeout=20)
+    assert (process.returncode, wanted) == (0, set())
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGUSR1])
+def test_other_verbs_end_by_them(table: Path, tmp_path: Path, number: signal.Signals) -> None:
+    process = halted(MODULE, tmp_path, "validate", table)
+    process.send_signal(number)
+    process.communicate(timeout=20)
+    assert process.returncode == -number
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, 130)])
+def test_a_signal_that_ends_it_needs_no_router_that_routes(
+    table: Path, tmp_path: Path, number: signal.Signals, code: int
+) -> None:
+    process = halted(MODULE, tmp_path, "run", table)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=20)
+    assert (process.returncode, said) == (code, "")
+
+
+@pytest.mark.parametrize("arguments", [("run", "table.yaml"), ("validate", "/table.yaml")])
+def test_a_working_directory_that_was_deleted_is_told(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+
+    def delete() -> None:
+        gone.rmdir()
+
+    code, said = ended(*arguments, cwd=gone, preexec_fn=delete)
+    assert code == 78
+    assert said == [f"router {arguments[0]}: the working directory was deleted; change to one that exists"]
+
+
+def may_map(mebibytes: int) -> Callable[[], None]:
+    return lambda: resource.setrlimit(resource.RLIMIT_AS, (mebibytes << 20, mebibytes << 20))
+
+
+@pytest.mark.parametrize("mebibytes", [40, 60, 80])
+def test_too_little_address_space_is_told(table: Path, mebibytes: int) -> None:
+    """It ends in the imports, while the table is compiled, or with the first thread."""
+    code, said = ended("run", table, preexec_fn=may_map(mebibytes))
+    assert code == 78
+    assert len(said) == 1
+    assert said[0].startswith(f"router run: this process may map {mebibytes} MiB of memory (ulimit -v), which is not")
+
+
+def test_too_little_address_space_for_ros_is_told_before_ros_is_loaded(table: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    table.write_text(table.read_text() + TOPIC)
+    code, said = ended("run", table, preexec_fn=may_map(300))
+    assert code == 78
+    assert said[0].startswith("router run: this process may map 300 MiB of memory (ulimit -v), and ROS 2 needs 1024; ")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("ROS_DOMAIN_ID", "233", "ROS_DOMAIN_ID is '233'; set it to a number from 0 to 232"),
+        ("ROS_DOMAIN_ID", "-5", "ROS_DOMAIN_ID is '-5'; set it to a number from 0 to 232"),
+        (
+            "RMW_IMPLEMENTATION",
+            "rmw_dust",
+            "RMW_IMPLEMENTATION is 'rmw_dust', which is not installed here; unset it, or set it to one",
+        ),
+    ],
+)
+def test_an_environment_that_ros_does_not_take_is_told(
+    table: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, told: str
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    table.write_text(table.read_text() + TOPIC)
+    monkeypatch.setenv(name, value)
+    code, [said] = ended("run", table)
+    assert (code, said.startswith(f"router run: {told}")) == (78, True)
+
+
+@pytest.mark.parametrize("name", ["run", "doctor"])
+def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        pytest.skip("only root can have a /dev/shm of its own, by unshare")
+    table.write_text(table.read_text() + TOPIC)
+    full = f"mount -t tmpfs -o size=64k tmpfs {SHM} && head -c 64k /dev/zero > {SHM}/full"
+    command = [
+        "unshare",
+        "-m",
+        "sh",
+        "-c",
+        f'{full} && exec "$@"',
+        "sh",
+        sys.executable,
+        "-m",
+        "router",
+        name,
+        str(table),
+    ]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert answer.returncode == {"run": 78, "doctor": 1}[name]
+    assert f"{SHM} has 0 KiB free, and ROS 2 needs" in answer.stdout + answer.stderr
+
+
+def test_what_a_domain_may_be_and_which_transports_share_memory(tmp_path: Path) -> None:
+    for domain in ("", "0", "7", "232"):
+        assert list(obstacles({"ROS_DOMAIN_ID": domain})) == []
+    for domain in ("233", "1e2", "4294967296", " 5", "five"):
+        [(what, _)] = obstacles({"ROS_DOMAIN_ID": domain})
+        assert what == f"ROS_DOMAIN_ID is '{domain}'"
+    transports = "FASTDDS_BUILTIN_TRANSPORTS"
+    assert all(uses_shared_memory({transports: each}) for each in ("", "DEFAULT", "SHM", "LARGE_DATA?max_msg_size=1MB"))
+    assert not any(uses_shared_memory({transports: each}) for each in ("UDPv4", "UDPv6", "TCPv4", "NONE"))
+    assert not uses_shared_memory({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
+    assert list(obstacles({}, tmp_path / "none")) == []
+
+
+def test_an_endpoint_that_the_rovers_table_gets_is_an_error_in_that_for_one_machine(tmp_path: Path) -> None:
+    """Its real address was inherited there, and datagrams left the machine."""
+    shutil.copytree(ROUTES, tmp_path / "routes")
+    rover, sim = tmp_path / "routes" / "rover.yaml", tmp_path / "routes" / "sim.yaml"
+    text = rover.read_text(encoding="utf-8").replace("protos: ../protos", f"protos: {PROTOS}")
+    rover.write_text(text.replace("\nendpoints:\n", "\nendpoints:\n  camera: {address: 192.168.0.60:8, kind: tool}\n"))
+    line = rover.read_text().splitlines().index("  camera: {address: 192.168.0.60:8, kind: tool}") + 1
+    found = f"{rover}:{line}:21: error[outside-networks]: 'address' of endpoints.camera is 192.168.0.60:8, outside"
+    for verb in (f"validate {sim}", f"run {sim}", f"send ph_info --table {sim} --to camera"):
+        process = start(MODULE, *verb.split())
+        try:
+            told = "".join(process.communicate(timeout=60))
+        finally:
+            process.kill()
+        assert found in told, verb
+        assert process.returncode == 78, verb
+    sim.write_text(sim.read_text().replace("\nendpoints:\n", "\nendpoints:\n  camera: {address: 127.0.0.60:25008}\n"))
+    assert ended("validate", sim)[0] == 0

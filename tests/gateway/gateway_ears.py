@@ -1,0 +1,122 @@
+"""Ears that write down what they hear, and what the tests of the gateway's transports share."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import ExitStack, asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from router.gateway.transport.base import Client, Frame, Transport
+from router.gateway.transport.stream import StreamTransport
+
+PATIENCE_SECONDS = 20.0
+
+
+def data(payload: bytes, topic: str = "/imu", type_name: str = "T") -> Frame:
+    return Frame(payload, topic, type_name, is_schema=False, born=0)
+
+
+@dataclass
+class Ears:
+    """What is heard of clients that come and go, in order, and what they say."""
+
+    clients: list[Client] = field(default_factory=list)
+    gone: list[Client] = field(default_factory=list)
+    eased: list[Client] = field(default_factory=list)
+    said: list[bytes] = field(default_factory=list)
+    said_by: list[Client] = field(default_factory=list)
+    arrivals: list[int] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
+    failures: list[tuple[Client | None, Exception, int]] = field(default_factory=list)
+    shown: list[Frame] = field(default_factory=list)
+    contentions: int = 0
+    on_drained: Callable[[Client], None] | None = None
+
+    def joined(self, client: Client) -> None:
+        self.clients.append(client)
+
+    def left(self, client: Client) -> None:
+        self.clients.remove(client)
+        self.gone.append(client)
+
+    def drained(self, client: Client) -> None:
+        self.eased.append(client)
+        if self.on_drained is not None:
+            self.on_drained(client)
+
+    def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
+        assert type(data) is bytes
+        assert arrived_ns > 1_600_000_000_000_000_000
+        self.said.append(data)
+        self.said_by.append(client)
+        self.arrivals.append(arrived_ns)
+
+    def refused(self, reason: str) -> None:
+        self.refusals.append(reason)
+
+    def failed(self, client: Client | None, error: Exception, lost: int) -> None:
+        self.failures.append((client, error, lost))
+
+    def contended(self) -> None:
+        self.contentions += 1
+
+    def snapshot(self) -> Sequence[Frame]:
+        return self.shown
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Waits until it holds."""
+    deadline = asyncio.get_running_loop().time() + PATIENCE_SECONDS
+    while not condition():
+        assert asyncio.get_running_loop().time() < deadline, "waited in vain"
+        await asyncio.sleep(0.002)
+
+
+@asynccontextmanager
+async def opened(transport: Transport) -> AsyncIterator[None]:
+    """Open inside. Afterwards no task, thread or socket is left of it."""
+    tasks, threads, sockets = asyncio.all_tasks(), _threads(), _sockets()
+    await transport.open()
+    try:
+        yield
+    finally:
+        await transport.close()
+    assert not transport.is_ready
+    await until(lambda: asyncio.all_tasks() <= tasks)
+    await until(lambda: _threads() <= threads)
+    await until(lambda: _sockets() <= sockets)
+
+
+def _threads() -> set[threading.Thread]:
+    """But for those in which asyncio runs what the tests themselves wait for."""
+    return {thread for thread in threading.enumerate() if not thread.name.startswith("asyncio")}
+
+
+def _sockets() -> int:
+    """How many this process has open. Zenoh keeps descriptors of other kinds for its threads."""
+    count = 0
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):  # the one of this listing
+            count += str(descriptor.readlink()).startswith("socket:")
+    return count
+
+
+def resident_kib() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+async def close_while_clients_come(transport: StreamTransport, turns: int) -> None:
+    """Closes it when the loop has had so many turns since they connected. Fails if that does not end."""
+    await transport.open()
+    assert transport.address
+    with ExitStack() as connected:
+        for _ in range(20):
+            connected.enter_context(socket.create_connection(transport.address))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)

@@ -1,0 +1,203 @@
+"""What is found after the loop was away counts as arrived when it was last there."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import zenoh
+
+from router.clock import monotonic_ns, wall_ns
+from router.errors import SourceSpan
+from router.gateway.transport import arrival as gateway_arrival
+from router.gateway.transport.arrival import AWAY_NS, CATCH_UP_NS, LoopClock, stamp
+from router.gateway.transport.base import Transport
+from router.gateway.transport.stream import StreamTransport
+from router.gateway.transport.tcp import TcpTransport
+from router.gateway.transport.websocket import WebsocketTransport
+from router.gateway.transport.zenoh import ZenohTransport
+from router.table.model import Address, Located, ZenohSettings
+from tests.gateway.gateway_ears import Ears, opened, until
+from tests.ports import free_port
+
+ANY = Address("127.0.0.1", 0)
+GREETING = (
+    b"GET / HTTP/1.1\r\nHost: rover\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+MASKED = b"\x82\x84" + bytes(4) + b"stop"
+"""One websocket message."""
+
+
+def away() -> None:
+    """Keeps the loop for longer than it may be kept."""
+    time.sleep(2 * AWAY_NS / 1e9)
+
+
+class Now:
+    """A clock that goes as it is told."""
+
+    def __init__(self) -> None:
+        self.ns = 1_000_000_000
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+@contextmanager
+def started(now: Now) -> Iterator[LoopClock]:
+    """Its own ticks come as real time goes by, which it does not here."""
+    clock = LoopClock(now)
+    assert clock.away_since() is None
+    clock.start()
+    yield clock
+    clock.stop()
+    now.ns += 10 * AWAY_NS
+    assert clock.away_since() is None
+
+
+def test_a_loop_that_is_there_finds_what_has_just_come() -> None:
+    async def story() -> None:
+        now = Now()
+        with started(now) as clock:
+            for _ in range(10):
+                now.ns += AWAY_NS
+                assert clock.away_since() is None
+                clock.tick()
+
+    asyncio.run(story())
+
+
+def test_what_is_found_after_it_was_away_may_be_as_old_as_that_and_for_a_while_after() -> None:
+    async def story() -> None:
+        now = Now()
+        with started(now) as clock:
+            left = now.ns
+            now.ns += AWAY_NS + 1
+            assert clock.away_since() == left
+            clock.tick()
+            back = now.ns
+            for _ in range(CATCH_UP_NS // AWAY_NS):
+                assert clock.away_since() == left
+                now.ns += AWAY_NS
+                clock.tick()
+            now.ns = max(now.ns, back + CATCH_UP_NS)
+            assert clock.away_since() is None
+
+    asyncio.run(story())
+
+
+def test_a_stamp_is_of_the_wall_clock() -> None:
+    before = wall_ns()
+    assert before <= stamp(None) <= wall_ns()
+    assert before - 5_000_000_000 <= stamp(monotonic_ns() - 5_000_000_000) <= wall_ns() - 5_000_000_000
+
+
+def tcp(ears: Ears) -> TcpTransport:
+    return TcpTransport(ANY, ears, prefixed=False, max_clients=10, most=1000)
+
+
+def websocket(ears: Ears) -> WebsocketTransport:
+    return WebsocketTransport(ANY, ears, text=False, max_clients=10, most=1000, page=b"")
+
+
+def dial(transport: Transport) -> socket.socket:
+    assert transport.address is not None
+    return socket.create_connection(transport.address)
+
+
+@pytest.mark.parametrize(
+    ("make", "greeting", "one"), [(tcp, b"", b"stop\n"), (websocket, GREETING, MASKED)], ids=["tcp", "websocket"]
+)
+class TestStreams:
+    def test_all_that_waited_while_the_loop_was_away_is_as_old_as_that(
+        self, monkeypatch: pytest.MonkeyPatch, make: type[StreamTransport], greeting: bytes, one: bytes
+    ) -> None:
+        """More than is read in one turn."""
+        monkeypatch.setattr(gateway_arrival, "CATCH_UP_NS", 0)
+        count = 40_000 // len(one)
+
+        async def story() -> None:
+            ears = Ears()
+            transport = make(ears)  # type: ignore[call-arg,arg-type]
+            async with opened(transport):
+                with dial(transport) as peer:
+                    peer.sendall(greeting)
+                    await until(lambda: ears.clients)
+                    peer.sendall(one * count)
+                    left = wall_ns()
+                    away()
+                    await until(lambda: len(ears.said) == count)
+                    assert max(ears.arrivals) <= left
+
+        asyncio.run(story())
+
+    def test_so_is_what_a_client_said_that_came_meanwhile(
+        self, make: type[StreamTransport], greeting: bytes, one: bytes
+    ) -> None:
+        async def story() -> None:
+            ears = Ears()
+            transport = make(ears)  # type: ignore[call-arg,arg-type]
+            async with opened(transport):
+                with dial(transport) as peer:
+                    peer.sendall(greeting + one)
+                    connected = wall_ns()
+                    away()
+                    await until(lambda: ears.said)
+                    assert ears.arrivals[0] <= connected + 20_000_000  # the kernel's measure is that coarse
+
+        asyncio.run(story())
+
+    def test_what_comes_while_the_loop_is_there_has_just_come(
+        self, monkeypatch: pytest.MonkeyPatch, make: type[StreamTransport], greeting: bytes, one: bytes
+    ) -> None:
+        monkeypatch.setattr(gateway_arrival, "AWAY_NS", 10**12)
+
+        async def story() -> None:
+            ears = Ears()
+            transport = make(ears)  # type: ignore[call-arg,arg-type]
+            async with opened(transport):
+                with dial(transport) as peer:
+                    peer.sendall(greeting)
+                    await until(lambda: ears.clients)
+                    sent = wall_ns()
+                    peer.sendall(one)
+                    await until(lambda: ears.said)
+                    assert sent <= ears.arrivals[0] <= wall_ns()
+
+        asyncio.run(story())
+
+
+def test_what_zenoh_hears_while_the_loop_is_away_is_as_old_as_that() -> None:
+    where = f"tcp/127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
+    key = Located("rovers/loki_1", SourceSpan("routes/rover.yaml"))
+    config = zenoh.Config()
+    config.insert_json5("connect/endpoints", json.dumps([where]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+
+    async def story() -> None:
+        ears = Ears()
+        async with opened(ZenohTransport(ZenohSettings(key, "peer", (), (where,)), ears)):
+            with zenoh.open(config) as far:
+
+                def put() -> None:
+                    far.put(f"{key.value}/inbound/cmd_vel", b"stop")
+
+                await until(lambda: put() or ears.said)  # type: ignore[func-returns-value]
+                await asyncio.sleep(0.3)
+                ears.arrivals.clear()
+                left = wall_ns()
+                late = threading.Timer(2 * AWAY_NS / 1e9, put)
+                late.start()
+                time.sleep(6 * AWAY_NS / 1e9)
+                await until(lambda: ears.arrivals)
+                assert ears.arrivals[-1] <= left
+                late.join()
+
+    asyncio.run(story())

@@ -1,0 +1,381 @@
+"""A gateway's TCP clients on the loopback interface: fast, slow, stopped, hostile."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from structlog.testing import capture_logs
+
+from router.errors import StartError
+from router.gateway.transport import outflow as gateway_outflow
+from router.gateway.transport import stream as gateway_stream
+from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client
+from router.gateway.transport.splitting import Lines, Packets, Splitter, TooLongError
+from router.gateway.transport.tcp import TAKEN_PER_TURN, TcpTransport
+from router.table.model import Address
+from tests.gateway.gateway_ears import Ears, close_while_clients_come, data, opened, resident_kib, until
+
+ANY = Address("127.0.0.1", 0)
+MOST = 1000
+
+
+def prefixed(*packets: bytes) -> bytes:
+    return b"".join(struct.pack("<I", len(packet)) + packet for packet in packets)
+
+
+def lines(ears: Ears, max_clients: int = 10) -> TcpTransport:
+    return TcpTransport(ANY, ears, prefixed=False, max_clients=max_clients, most=MOST)
+
+
+def packets(ears: Ears, most: int = MOST) -> TcpTransport:
+    return TcpTransport(ANY, ears, prefixed=True, max_clients=10, most=most)
+
+
+async def connect(transport: TcpTransport) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    assert transport.address is not None
+    return await asyncio.open_connection(*transport.address)
+
+
+def connect_lazily(transport: TcpTransport) -> socket.socket:
+    """A client that reads nothing, with a small buffer."""
+    peer = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    peer.settimeout(10)
+    assert transport.address is not None
+    peer.connect(transport.address)
+    return peer
+
+
+def test_packets_go_both_ways_each_preceded_by_its_length() -> None:
+    async def story() -> None:
+        ears = Ears()
+        transport = packets(ears)
+        async with opened(transport):
+            reader, writer = await connect(transport)
+            writer.write(prefixed(b"one", b"", b"x" * MOST))
+            await until(lambda: len(ears.said) == 3)
+            assert ears.said == [b"one", b"", b"x" * MOST]
+            [client] = ears.clients
+            assert client.label == "{}:{}".format(*writer.get_extra_info("sockname"))
+            client.write([data(b"two"), data(b"")])
+            assert await reader.readexactly(11) == prefixed(b"two", b"")
+            writer.close()
+            await until(lambda: ears.gone == [client])
+
+    asyncio.run(story())
+
+
+def test_lines_go_both_ways_and_several_clients_get_the_same() -> None:
+    async def story() -> None:
+        ears = Ears()
+        transport = lines(ears)
+        async with opened(transport):
+            ends = [await connect(transport) for _ in range(3)]
+            await until(lambda: len(ears.clients) == 3)
+            transport.write_all(ears.clients, [data(b"one"), data(b"two")])
+            for reader, _ in ends:
+                assert await reader.readexactly(8) == b"one\ntwo\n"
+            ends[1][1].write(b'{"op":1}\r\n{"op":2}\n{"op"')
+            await until(lambda: len(ears.said) == 2)
+            assert ears.said == [b'{"op":1}', b'{"op":2}']
+            assert ears.said_by[0] in ears.clients
+            for _, writer in ends:
+                writer.close()
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("is_prefixed", [True, False])
+def test_a_large_message_arrives_whole_between_small_ones_while_others_are_served(is_prefixed: bool) -> None:
+    large = b"x" * 7_000_000
+    messages = [b"before", large, b"after", large[:70_000], b"end"]
+
+    async def story() -> None:
+        ears = Ears()
+        transport = TcpTransport(ANY, ears, prefixed=is_prefixed, max_clients=10, most=MOST)
+        async with opened(transport):
+            reader, writer = await connect(transport)
+            await until(lambda: ears.clients)
+            ears.clients[0].write([data(message) for message in messages])
+            assert ears.clients[0].backlog() > 6_000_000
+            expected = prefixed(*messages) if is_prefixed else b"".join(message + b"\n" for message in messages)
+            other_reader, other_writer = await connect(transport)
+            await until(lambda: len(ears.clients) == 2)
+            transport.write_all(ears.clients, [data(b"both")])
+            assert await other_reader.readuntil(b"both")
+            assert await reader.readexactly(len(expected)) == expected
+            await until(lambda: ears.eased == [ears.clients[0]])
+            writer.close()
+            other_writer.close()
+
+    asyncio.run(story())
+
+
+def test_a_client_that_stands_still_holds_up_nobody_and_costs_no_memory_of_its_own() -> None:
+    """A hundred of them, each with 7 MB to get: the pieces are shared."""
+
+    async def story() -> None:
+        ears = Ears()
+        transport = TcpTransport(ANY, ears, prefixed=True, max_clients=101, most=MOST)
+        async with opened(transport):
+            still = [connect_lazily(transport) for _ in range(100)]
+            await until(lambda: len(ears.clients) == 100)
+            reader, writer = await connect(transport)
+            await until(lambda: len(ears.clients) == 101)
+            before = resident_kib()
+            transport.write_all(ears.clients, [data(b"x" * 7_000_000)])
+            await reader.readexactly(7_000_004)
+            assert all(client.backlog() > 6_000_000 for client in ears.clients[:100])
+            assert resident_kib() - before < 100_000
+            transport.write_all(ears.clients[100:], [data(b"next")])
+            assert await reader.readexactly(8) == prefixed(b"next")
+            assert ears.eased == [ears.clients[100]]
+            writer.close()
+            for peer in still:
+                peer.close()
+
+    asyncio.run(story())
+
+
+def test_a_slow_client_is_written_to_while_it_takes_and_told_when_it_has_drained() -> None:
+    """As a service does it: nothing over HIGH_WATER, and on from `drained`."""
+    message = b"x" * 9996
+    wanted = 600
+
+    async def story() -> None:
+        ears = Ears()
+        transport = packets(ears)
+        sent = 0
+
+        def send(client: Client) -> None:
+            nonlocal sent
+            while sent < wanted and client.backlog() < HIGH_WATER:
+                client.write([data(message)])
+                sent += 1
+
+        def go_on(client: Client) -> None:
+            assert client.backlog() < LOW_WATER
+            send(client)
+
+        ears.on_drained = go_on
+        async with opened(transport):
+            peer = connect_lazily(transport)
+            await until(lambda: ears.clients)
+            send(ears.clients[0])
+            assert sent < wanted
+            assert HIGH_WATER <= ears.clients[0].backlog() < HIGH_WATER + 10_000
+
+            def read() -> bytes:
+                return b"".join(iter(lambda: peer.recv(3000), b""))
+
+            reading = asyncio.create_task(asyncio.to_thread(read))
+            await until(lambda: sent == wanted and not ears.clients[0].backlog())
+            await transport.close()
+            assert await reading == prefixed(*[message] * wanted)
+            assert len(ears.eased) > 2
+            peer.close()
+
+    asyncio.run(story())
+
+
+def test_a_stopped_process_is_closed_and_told_when_it_took_nothing_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_stream, "LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(gateway_outflow, "STALLED_SECONDS", 0.3)
+    monkeypatch.setattr(gateway_stream, "STALLED_SECONDS", 0.3)
+    monkeypatch.setattr(gateway_outflow, "SILENCE_SECONDS", 60.0)
+    program = (
+        "import socket, sys; s = socket.create_connection(('127.0.0.1', int(sys.argv[1])))\nwhile s.recv(1000): pass"
+    )
+
+    async def story() -> None:
+        ears = Ears()
+        transport = lines(ears)
+        with capture_logs() as logs:
+            async with opened(transport):
+                assert transport.address is not None
+                with subprocess.Popen([sys.executable, "-c", program, str(transport.address.port)]) as process:
+                    await until(lambda: ears.clients)
+                    [client] = ears.clients
+                    process.send_signal(signal.SIGSTOP)
+                    client.write([data(b"x" * 10_000_000)])
+                    await until(lambda: ears.gone == [client])
+                    process.send_signal(signal.SIGCONT)
+        assert ["send stalled" in log["event"] for log in logs if log["log_level"] == "warning"] == [True]
+
+    asyncio.run(story())
+
+
+def test_a_client_that_is_killed_leaves() -> None:
+    async def story() -> None:
+        ears = Ears()
+        transport = lines(ears)
+        async with opened(transport):
+            peer = connect_lazily(transport)
+            await until(lambda: ears.clients)
+            [client] = ears.clients
+            client.write([data(b"x" * 1_000_000)])
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            peer.close()
+            await until(lambda: ears.gone == [client])
+            client.write([data(b"too late")])
+            assert ears.eased == []
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize(
+    ("is_prefixed", "hostile"),
+    [
+        (True, struct.pack("<I", MOST + 1)),
+        (True, b"GET / HTTP/1.1\r\n\r\n"),
+        (False, b"x" * (MOST + 1)),
+        (False, b"x" * (MOST + 1) + b"\n"),
+    ],
+)
+def test_what_is_too_long_is_refused_and_its_sender_closed(is_prefixed: bool, hostile: bytes) -> None:
+    async def story() -> None:
+        ears = Ears()
+        transport = packets(ears) if is_prefixed else lines(ears)
+        with capture_logs() as logs:
+            async with opened(transport):
+                _, writer = await connect(transport)
+                writer.write((prefixed(b"good") if is_prefixed else b"good\n") + hostile)
+                await until(lambda: ears.gone)
+                assert (ears.said, ears.refusals) == ([b"good"], ["too_large"])
+                writer.close()
+        assert [log["event"] for log in logs if log["log_level"] == "warning"] == ["a client was closed"]
+
+    asyncio.run(story())
+
+
+def test_one_that_sends_without_end_does_not_keep_others_waiting() -> None:
+    async def story() -> None:
+        ears = Ears()
+        transport = lines(ears)
+        async with opened(transport):
+            _, flood = await connect(transport)
+            _, other = await connect(transport)
+            await until(lambda: len(ears.clients) == 2)
+            flood.write(b"\n" * 20 * TAKEN_PER_TURN)
+            other.write(b"me too\n")
+            await until(lambda: b"me too" in ears.said)
+            await until(lambda: len(ears.said) == 20 * TAKEN_PER_TURN + 1)
+            flood.close()
+            other.close()
+
+    asyncio.run(story())
+
+
+def test_a_client_beyond_the_most_is_closed_at_once_and_told() -> None:
+    async def story() -> None:
+        ears = Ears()
+        transport = lines(ears, max_clients=2)
+        with capture_logs() as logs:
+            async with opened(transport):
+                ends = [await connect(transport) for _ in range(2)]
+                await until(lambda: len(ears.clients) == 2)
+                reader, writer = await connect(transport)
+                with suppress(ConnectionResetError):
+                    assert await reader.read() == b""
+                ends[0][1].close()
+                await until(lambda: ears.gone)
+                ends.append(await connect(transport))
+                await until(lambda: len(ears.clients) == 2)
+                for _, end in [*ends, (reader, writer)]:
+                    end.close()
+        [warning] = [log for log in logs if log["log_level"] == "warning"]
+        assert "too many" in warning["event"]
+        assert len(ears.gone) == 3
+
+    asyncio.run(story())
+
+
+def test_a_port_that_is_taken_is_refused_with_who_has_it_and_free_again_at_once_after_closing() -> None:
+    async def story() -> None:
+        ears = Ears()
+        first = lines(ears)
+        async with opened(first):
+            assert first.address is not None
+            second = TcpTransport(first.address, Ears(), prefixed=False, max_clients=1, most=MOST)
+            with pytest.raises(StartError, match=r"127\.0\.0\.1:\d+ cannot be used: .*\(pid \d+\) has the port"):
+                await second.open()
+            await second.close()
+            reader, writer = await connect(first)
+            await until(lambda: ears.clients)
+            await first.close()
+            assert await reader.read() == b""
+            writer.close()
+        async with opened(second):
+            pass
+
+    asyncio.run(story())
+
+
+MESSAGES = st.lists(st.binary(max_size=20).map(lambda message: message.replace(b"\n", b" ").rstrip(b"\r")), max_size=10)
+
+
+@given(MESSAGES, st.lists(st.integers(1, 30), min_size=1), st.booleans())
+def test_it_does_not_matter_how_the_network_cuts_what_is_sent(
+    messages: list[bytes], cuts: list[int], is_prefixed: bool
+) -> None:
+    sent = prefixed(*messages) if is_prefixed else b"".join(message + b"\n" for message in messages)
+    splitter: Splitter = Packets(20) if is_prefixed else Lines(20)
+    taken: list[bytes] = []
+    at = 0
+    while at < len(sent):
+        cut = cuts[len(taken) % len(cuts)]
+        splitter.feed(memoryview(sent[at : at + cut]))
+        at += cut
+        while (one := splitter.take()) is not None:
+            taken.append(one)
+    assert taken == messages
+
+
+@pytest.mark.parametrize("splitter", [Packets(10), Lines(10)])
+def test_a_splitter_keeps_no_more_than_it_may(splitter: Splitter) -> None:
+    splitter.feed(memoryview(b"x" * 11))
+    with pytest.raises(TooLongError, match="10"):
+        splitter.take()
+
+
+def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
+    async def story() -> None:
+        ears = Ears()
+        faults: list[Exception] = []
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
+        transport = lines(ears)
+
+        def stumble(client: Client, data: bytes, arrived_ns: int) -> None:
+            json.loads(data)
+
+        ears.received = stumble  # type: ignore[method-assign]
+        async with opened(transport):
+            _, writer = await connect(transport)
+            _, other = await connect(transport)
+            await until(lambda: len(ears.clients) == 2)
+            writer.write(b"{\n")
+            await until(lambda: faults)
+            await until(lambda: len(ears.gone) == 1)
+            other.write(b"{}\n")
+            await asyncio.sleep(0.05)
+            assert len(ears.clients) == 1
+            writer.close()
+            other.close()
+        assert [type(fault) for fault in faults] == [json.JSONDecodeError]
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
+    asyncio.run(close_while_clients_come(packets(Ears()), turns))

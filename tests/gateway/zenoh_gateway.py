@@ -1,0 +1,105 @@
+"""A Zenoh gateway in a process of its own: `Gateway` starts it, and this file run as a script is it.
+
+It opens at the first line of its standard input, and prints its state as a line of JSON whenever that changes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
+
+from structlog.testing import capture_logs
+
+from router.errors import SourceSpan
+from router.gateway.transport.zenoh import ZenohTransport
+from router.table.model import Located, ZenohConfig, ZenohSettings
+from tests.gateway.gateway_ears import Ears
+
+HERE = SourceSpan("routes/rover.yaml")
+
+
+class Gateway:
+    """As a client that connects to the locator `where`, or in another mode. Close it."""
+
+    def __init__(self, key: str, where: str, config: dict[str, Any] | None = None, mode: str = "client") -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, __file__, key, where, json.dumps(config or {}), mode],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.states: list[dict[str, Any]] = []
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.process.stdout
+        for line in self.process.stdout:
+            self.states.append(json.loads(line))
+
+    def open(self) -> None:
+        assert self.process.stdin
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+
+    @property
+    def is_up(self) -> bool:
+        """It can be told to open."""
+        return bool(self.states)
+
+    @property
+    def is_ready(self) -> bool:
+        return bool(self.states and self.states[-1]["ready"])
+
+    @property
+    def waits(self) -> bool:
+        """For another one that has the key."""
+        return bool(self.states and not self.states[-1]["ready"] and self.states[-1]["others"])
+
+    @property
+    def others(self) -> list[str]:
+        """What the log says at error of who has the key."""
+        others: list[str] = self.states[-1]["others"]
+        return others
+
+    @property
+    def contentions(self) -> int:
+        return int(self.states[-1]["contentions"])
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    close = kill
+
+
+async def main(key: str, where: str, config: str, mode: str) -> None:
+    """A peer whose mode is "listening" listens at `where`."""
+    ears = Ears()
+    settings = ZenohSettings(Located(key, HERE), mode, (where,), (), ZenohConfig(HERE, config))
+    if mode == "listening":
+        settings = replace(settings, mode="peer", connect=(), listen=(where,))
+    transport = ZenohTransport(settings, ears)
+    print(json.dumps({"ready": False, "others": [], "contentions": 0}), flush=True)
+    await asyncio.to_thread(sys.stdin.readline)
+    with capture_logs() as logs:
+        await transport.open()
+        told = None
+        while True:
+            others = [log["other"] for log in logs if log["log_level"] == "error"]
+            state = {"ready": transport.is_ready, "others": others, "contentions": ears.contentions}
+            if state != told:
+                told = state
+                print(json.dumps(state), flush=True)
+            await asyncio.sleep(0.005)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))

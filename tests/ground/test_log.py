@@ -1,0 +1,122 @@
+"""The log's summaries: first at once, then counted."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from typing import Any
+
+import pytest
+import structlog
+
+from router import log
+from router.log import SUMMARY_INTERVAL_NS, FloodLog
+
+
+class Lines:
+    """Stands where a logger's method is called, and a clock that stands still until told otherwise."""
+
+    def __init__(self) -> None:
+        self.now = 0
+        self.written: list[tuple[str, dict[str, Any]]] = []
+        self.floods = FloodLog(clock_ns=lambda: self.now)
+
+    def emit(self, event: str, **values: Any) -> None:
+        self.written.append((event, values))
+
+    def note(self, key: str, error: Exception | None = None) -> None:
+        self.floods.note(key, self.emit, key, error, route="imu_info")
+
+
+@pytest.fixture
+def lines() -> Lines:
+    return Lines()
+
+
+def test_the_first_event_is_written_at_once_with_its_error(lines: Lines) -> None:
+    error = ValueError("no")
+    lines.note("drop", error)
+    assert lines.written == [("drop", {"exc_info": error, "route": "imu_info"})]
+
+
+def test_a_flood_becomes_one_line_per_interval_with_a_count(lines: Lines) -> None:
+    for _ in range(1000):
+        lines.note("drop")
+    lines.now = SUMMARY_INTERVAL_NS
+    lines.note("drop")
+    lines.note("drop")
+    assert lines.written[1:] == [("drop", {"more": 1000, "in_seconds": 10.0, "route": "imu_info"})]
+
+
+def test_the_line_with_the_count_tells_of_the_last_event(lines: Lines) -> None:
+    for part in range(3):
+        lines.floods.note("drop", lines.emit, "drop", part=part)
+    lines.floods.flush(final=True)
+    assert [values["part"] for _, values in lines.written] == [0, 2]
+
+
+def test_kinds_are_told_apart(lines: Lines) -> None:
+    lines.note("drop")
+    lines.note("reject")
+    assert [event for event, _ in lines.written] == ["drop", "reject"]
+
+
+def test_flush_tells_the_end_of_a_flood_when_it_is_due(lines: Lines) -> None:
+    lines.note("drop")
+    lines.note("drop")
+    lines.floods.flush()
+    assert len(lines.written) == 1
+    lines.now = SUMMARY_INTERVAL_NS
+    lines.floods.flush()
+    lines.floods.flush()
+    assert [values.get("more") for _, values in lines.written] == [None, 1]
+
+
+def test_the_final_flush_waits_for_nothing(lines: Lines) -> None:
+    lines.note("drop")
+    lines.note("drop")
+    lines.floods.flush(final=True)
+    assert lines.written[1][1]["more"] == 1
+
+
+def test_the_number_of_kinds_is_bounded(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log, "MOST_KEYS", 2)
+    for kind in "abcde":
+        lines.note(kind)
+    lines.floods.flush(final=True)
+    assert [event for event, _ in lines.written] == ["a", "b"] + 2 * ["events of many further kinds"]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_on_a_terminal_a_line_is_for_reading(coloured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    log.configure_log(coloured=coloured)
+    try:
+        structlog.get_logger().warning("datagram rejected", reason="empty", detail="from here")
+    finally:
+        structlog.reset_defaults()
+    line = terminal.getvalue()
+    assert ("\x1b[" in line) is coloured
+    if not coloured:
+        assert line.split()[1:] == ["[warning", "]", "datagram", "rejected", "reason=empty", "detail='from", "here'"]
+
+
+def test_a_reader_that_stands_still_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    with os.fdopen(reading), os.fdopen(writing, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        log.configure_log()
+        try:
+            for _ in range(2000):  # several times what a pipe holds
+                structlog.get_logger().warning("datagram rejected", reason="empty", detail="from here" * 20)
+        finally:
+            structlog.reset_defaults()
+        written = os.read(reading, 1 << 20)
+    assert 0 < written.count(b"\n") < 2000
+    assert written.endswith(b"}\n")

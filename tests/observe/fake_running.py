@@ -1,0 +1,66 @@
+"""A router that runs nothing: a real program, books that a test writes, and datagrams that it has seen come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+
+from prometheus_client.metrics_core import Metric as Family
+
+from router.compiler import check_table
+from router.compiler.program import Program
+from router.engine import MAX_DATAGRAM
+from router.observe.metrics import BooksCollector
+from router.observe.running import ReloadResult
+from router.recording.mirror import Mirror
+from tests.tables import ROUTES
+
+RELOADED = ReloadResult(True, (), "nothing has changed")
+
+
+@cache
+def sim_program() -> Program:
+    """Of routes/sim.yaml."""
+    program = check_table(ROUTES / "sim.yaml").program
+    assert program is not None
+    return program
+
+
+class FakeRunning:
+    """`failures` is what consumers of the mirror raised, `collected` how often the counters were read."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.is_ready = True
+        self.is_stuck = False
+        self.reloads = RELOADED
+        self.failures: list[Exception] = []
+        self.collected = 0
+        self.mirror = Mirror(MAX_DATAGRAM, lambda: None, self.failures.append)
+        self.counts = program.books.fresh_counts()
+        self._turns = 0
+
+    def count(self, metric: str, *labels: str, to: int) -> None:
+        """Times are in ns, as in the books."""
+        self.counts[self.program.books.slot(metric, *labels)] = to
+
+    def receive(self, data: bytes, peer: tuple[str, int], listener: str = "rover") -> None:
+        self.mirror.tee(listener, lambda *_: None)(data, peer)
+
+    def collect(self) -> Iterator[Family]:
+        self.collected += 1
+        asked = {
+            metric: lambda: ()
+            for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
+        }
+        return BooksCollector(self.program.books, [self.counts], asked, {"version": "1"}).collect()
+
+    def samples(self) -> Iterator[tuple[str, dict[str, str], float]]:
+        return ((sample.name, sample.labels, sample.value) for family in self.collect() for sample in family.samples)
+
+    def progress(self) -> int:
+        self._turns += not self.is_stuck
+        return self._turns
+
+    def reload(self) -> ReloadResult:
+        return self.reloads

@@ -1,0 +1,260 @@
+"""What Foxglove gets: a real server and a client that speaks its protocol, on a router that only shows datagrams."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import cast
+
+import pytest
+from structlog.testing import capture_logs
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from router.compiler import check_table
+from router.compiler.program import Program
+from router.errors import SourceSpan, StartError
+from router.observe import foxglove
+from router.observe.foxglove import FoxgloveServer
+from router.observe.running import Running
+from router.recording.mirror import Consumer, Seen
+from router.table.model import Address, Located
+from tests.observe.foxglove_client import PATIENCE, FoxgloveClient
+from tests.tables import PROTOS, ROUTES
+
+SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
+LOOPBACK = Located(Address("127.0.0.1", 0), SPAN)
+PEER = ("192.168.0.30", 8)
+
+
+class Showing:
+    """A router in so far as it shows what it receives. `attached` has who is shown it."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.mirror = self
+        self.attached: list[Consumer] = []
+        self._changed = threading.Condition()
+
+    def attach(self, consumer: Consumer) -> Callable[[], None]:
+        with self._changed:
+            self.attached.append(consumer)
+            self._changed.notify_all()
+
+        def detach() -> None:
+            with self._changed:
+                self.attached.remove(consumer)
+                self._changed.notify_all()
+
+        return detach
+
+    def wait_for(self, consumers: int) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.attached) == consumers, PATIENCE)
+
+    def show(self, *datagrams: bytes, at: int = 1, listener: str = "rover") -> None:
+        batch: Sequence[Seen] = [Seen(at + number, listener, PEER, data) for number, data in enumerate(datagrams)]
+        for consumer in list(self.attached):
+            consumer(batch)
+
+
+def compiled(table: Path) -> Program:
+    checked = check_table(table)
+    assert checked.program is not None, [*map(str, checked.diagnostics)]
+    return checked.program
+
+
+@pytest.fixture(scope="module")
+def program() -> Program:
+    return compiled(ROUTES / "rover.yaml")
+
+
+@pytest.fixture
+def router(program: Program) -> Showing:
+    return Showing(program)
+
+
+@pytest.fixture
+def server(router: Showing) -> Iterator[FoxgloveServer]:
+    with closing(FoxgloveServer(LOOPBACK, cast("Running", router))) as opened:
+        yield opened
+
+
+@pytest.fixture
+def client(server: FoxgloveServer) -> Iterator[FoxgloveClient]:
+    with FoxgloveClient(server.address.port) as opened:
+        yield opened
+
+
+def envelope(program: Program, case: str, **fields: object) -> bytes:
+    payload = program.envelope.cases[case].message_class(**fields)
+    return program.envelope.message_class(**{case: payload}).SerializeToString()
+
+
+def test_there_is_a_channel_for_each_payload_case(program: Program, client: FoxgloveClient) -> None:
+    assert client.channels.keys() == program.envelope.cases.keys()
+    assert client.info["name"] == "rover_router"
+    assert client.info["capabilities"] == []  # a client can look, and nothing else
+
+
+def test_payloads_come_with_their_arrival_and_are_read_by_the_schema_alone(
+    program: Program, router: Showing, client: FoxgloveClient
+) -> None:
+    client.subscribe("imu_info")
+    router.wait_for(1)
+    router.show(envelope(program, "imu_info", accel_x=1.5, state=2), at=1_800_000_000_123_456_789)
+    told = client.receive()
+    assert (told.topic, told.log_time) == ("imu_info", 1_800_000_000_123_456_789)
+    assert told.message.accel_x == 1.5  # type: ignore[attr-defined]
+    assert told.data == program.envelope.cases["imu_info"].message_class(accel_x=1.5, state=2).SerializeToString()
+    assert told.message.DESCRIPTOR.full_name == client.channels["imu_info"]["schemaName"]
+
+
+def test_every_schema_is_whole(program: Program, router: Showing, client: FoxgloveClient) -> None:
+    """Those of messages in other files are there as well."""
+    client.subscribe(*program.envelope.cases)
+    router.wait_for(1)
+    for case in program.envelope.cases:
+        router.show(envelope(program, case))
+        assert client.receive().topic == case
+
+
+def test_router_is_watched_only_while_somebody_has_subscribed(router: Showing, server: FoxgloveServer) -> None:
+    with FoxgloveClient(server.address.port) as first, FoxgloveClient(server.address.port) as second:
+        assert router.attached == []
+        first.subscribe("imu_info", "gps_info")
+        second.subscribe("imu_info")
+        router.wait_for(1)
+        first.unsubscribe("imu_info", "gps_info")
+        router.show(envelope(router.program, "imu_info"))
+        assert second.receive().topic == "imu_info"
+        second.unsubscribe("imu_info")
+        router.wait_for(0)
+        first.subscribe("gps_info")
+        router.wait_for(1)
+    router.wait_for(0)  # a client that leaves has not unsubscribed
+
+
+def test_only_what_was_subscribed_to_is_sent(program: Program, router: Showing, client: FoxgloveClient) -> None:
+    client.subscribe("gps_info")
+    router.wait_for(1)
+    router.show(envelope(program, "imu_info"), envelope(program, "gps_info", latitude=1.0))
+    assert client.receive().topic == "gps_info"
+
+
+def test_trimmed_and_padded_datagrams_are_shown_and_what_is_no_payload_is_not(
+    program: Program, router: Showing, client: FoxgloveClient
+) -> None:
+    client.subscribe("manual_brake")
+    router.wait_for(1)
+    empty, brake = envelope(program, "manual_brake"), envelope(program, "manual_brake", brake=True)
+    router.show(empty.rstrip(b"\0"), b"\xff" * 9, b"", brake * 9000, brake + bytes(5), at=100)
+    assert [client.receive().log_time for _ in range(2)] == [100, 104]
+
+
+def test_listener_that_repairs_nothing_shows_nothing_that_it_rejects(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text(f"version: 1\nextends: {ROUTES}/rover.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
+    router = Showing(compiled(table))
+    brake = envelope(router.program, "manual_brake", brake=True)
+    with (
+        closing(FoxgloveServer(LOOPBACK, cast("Running", router))) as server,
+        FoxgloveClient(server.address.port) as client,
+    ):
+        client.subscribe("manual_brake")
+        router.wait_for(1)
+        router.show(brake + bytes(5), brake, at=100)
+        assert client.receive().log_time == 101
+
+
+def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
+    tmp_path: Path, program: Program, router: Showing, client: FoxgloveClient
+) -> None:
+    """The same protos elsewhere, in which one message has a field more."""
+    protos = tmp_path / "protos"
+    shutil.copytree(PROTOS, protos)
+    [file] = [path for path in protos.rglob("*.proto") if "message BasestationManualBrake" in path.read_text()]
+    file.write_text(
+        file.read_text().replace(
+            "message BasestationManualBrake {", "message BasestationManualBrake {\n  uint32 force = 77;", 1
+        )
+    )
+    table = tmp_path / "table.yaml"
+    table.write_text(f"version: 1\nextends: {ROUTES}/rover.yaml\nenvelope: {{protos: {protos}}}\n")
+    before = dict(client.channels)
+    client.subscribe("imu_info")
+    router.wait_for(1)
+    changed = router.program = compiled(table)
+    client.await_change()
+    while client.channels.keys() != before.keys():
+        client.await_change()
+    assert client.channels["imu_info"] == before["imu_info"]
+    assert client.channels["manual_brake"] != before["manual_brake"]
+    client.subscribe("manual_brake")
+    told = {}
+    while "manual_brake" not in told:  # nobody says when the subscription has come
+        router.show(envelope(changed, "imu_info"), envelope(changed, "manual_brake", force=7))
+        next_one = client.receive()
+        told[next_one.topic] = next_one.message
+    assert "imu_info" in told  # subscribed to before
+    assert told["manual_brake"].force == 7  # type: ignore[attr-defined]
+
+
+def test_a_fault_is_told_once_and_does_not_end_the_view(
+    program: Program, router: Showing, client: FoxgloveClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults = threading.Semaphore(0)
+
+    def fail(consumer: Consumer) -> Callable[[], None]:
+        faults.release()
+        raise MemoryError
+
+    monkeypatch.setattr(foxglove, "LOOK_SECONDS", 0.01)
+    with capture_logs() as logs:
+        with monkeypatch.context() as faulty:
+            faulty.setattr(router, "attach", fail)
+            client.subscribe("imu_info")
+            assert all(faults.acquire(timeout=PATIENCE) for _ in range(3))
+        router.wait_for(1)
+        router.show(envelope(program, "imu_info"))
+        assert client.receive().topic == "imu_info"
+    assert [each["log_level"] for each in logs] == ["critical"]
+
+
+def test_router_that_is_started_again_gets_its_port_back(router: Showing) -> None:
+    address = LOOPBACK
+    for _ in range(3):
+        with closing(FoxgloveServer(address, cast("Running", router))) as server:
+            address = Located(server.address, SPAN)
+            with FoxgloveClient(server.address.port) as client:
+                client.subscribe("imu_info")
+                router.wait_for(1)
+                server.close()  # while the client is there
+        router.wait_for(0)
+
+
+def test_port_that_somebody_has_is_said_with_its_holder() -> None:
+    router = Showing(compiled(ROUTES / "rover.yaml"))
+    with socket.create_server(("127.0.0.1", 0)) as holder:
+        address = Located(Address("127.0.0.1", holder.getsockname()[1]), SPAN)
+        with pytest.raises(StartError, match=rf"rover.yaml:8:20: .*{address.value}: .*\(pid \d+\) has the port"):
+            FoxgloveServer(address, cast("Running", router))
+
+
+def test_address_that_this_computer_does_not_have_is_refused(router: Showing) -> None:
+    address = Located(Address("203.0.113.1", 1), SPAN)
+    with pytest.raises(StartError, match="no network interface of this computer has that address"):
+        FoxgloveServer(address, cast("Running", router))
+
+
+def test_who_speaks_another_protocol_is_turned_away_without_a_word_in_the_log(
+    server: FoxgloveServer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(InvalidStatus):
+        connect(f"ws://127.0.0.1:{server.address.port}")
+    server.close()
+    assert "handshake" not in capfd.readouterr().err

@@ -1,0 +1,513 @@
+"""What a running router answers over HTTP, to whom, and what it does when it is told to."""
+
+from __future__ import annotations
+
+import errno
+import gzip
+import http.client
+import json
+import select
+import socket
+import struct
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager, suppress
+from email.message import Message
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import router.observe.http
+import router.observe.http_answers
+import router.observe.http_connection
+import router.observe.http_places
+import router.observe.status
+from router.errors import Code, Diagnostic, RouterError, SourceSpan
+from router.log import logger
+from router.observe.http import HttpServer
+from router.observe.http_answers import text
+from router.observe.http_callers import refusal
+from router.observe.http_connection import MOST_ANSWERING
+from router.observe.http_places import MOST_FROM_OTHERS, MOST_PER_HOST, MOST_TAPS
+from router.observe.running import ReloadResult
+from router.observe.tap_stream import MAGIC
+from router.table.model import Address, RouteTable
+from router.tools.route_map import Measures, RouteMap, route_map
+from tests.acceptance.site import wait_until
+from tests.observe.fake_running import FakeRunning, sim_program
+
+SPAN = SourceSpan("routes/sim.yaml", 8, 20, 34)
+LOOPBACK = Address("127.0.0.1", 0)
+
+
+@pytest.fixture
+def running() -> FakeRunning:
+    return FakeRunning(sim_program())
+
+
+@pytest.fixture
+def saved() -> list[Path | RouterError]:
+    """What the next order to save comes to."""
+    return [Path("recordings/last.mcap")]
+
+
+@pytest.fixture
+def server(running: FakeRunning, saved: list[Path | RouterError]) -> Iterator[HttpServer]:
+    def save(reason: str) -> Path:
+        assert reason == "http"
+        if isinstance(saved[0], RouterError):
+            raise saved[0]
+        return saved[0]
+
+    with closing(HttpServer(LOOPBACK, SPAN, running, save)) as opened:
+        yield opened
+
+
+class Answer:
+    def __init__(self, response: http.client.HTTPResponse) -> None:
+        self.status = response.status
+        self.headers = response.headers
+        self.text = response.read().decode()
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.text)
+
+
+def ask(server: HttpServer, path: str, method: str = "GET", headers: Mapping[str, str] | None = None) -> Answer:
+    with closing(http.client.HTTPConnection(*server.address, timeout=10)) as connection:
+        connection.request(method, path, headers=dict(headers or {}))
+        return Answer(connection.getresponse())
+
+
+def test_health_is_that_the_receive_thread_gets_further(
+    server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(router.observe.http_answers, "STUCK_SECONDS", 0.2)
+    assert ask(server, "/healthz").status == 200
+    running.is_stuck = True
+    stuck = ask(server, "/healthz")
+    assert (stuck.status, stuck.text) == (503, "the receive thread is stuck, for 0.2 s at least\n")
+
+
+def test_ready_is_that_everything_is_open(server: HttpServer, running: FakeRunning) -> None:
+    assert ask(server, "/ready").status == 200
+    running.is_ready = False
+    assert ask(server, "/ready").status == 503
+    assert ask(server, "/healthz").status == 200
+
+
+def test_the_page_may_load_nothing_from_elsewhere(server: HttpServer) -> None:
+    page = ask(server, "/")
+    assert page.headers["Content-Type"] == "text/html; charset=utf-8"
+    policy = page.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "connect-src 'self'" in policy
+    assert "unsafe" not in policy
+    addresses = [word for word in page.text.split() if "://" in word]
+    assert [address for address in addresses if "www.w3.org/2000/svg" not in address] == []
+
+
+def test_what_is_long_is_compressed_for_who_takes_it(server: HttpServer) -> None:
+    assert ask(server, "/metrics").headers["Content-Encoding"] is None
+    assert ask_raw(server, "/metrics", {"Accept-Encoding": "gzip"})[:2] == b"\x1f\x8b"
+
+
+def ask_raw(server: HttpServer, path: str, headers: Mapping[str, str]) -> bytes:
+    with closing(http.client.HTTPConnection(*server.address, timeout=10)) as connection:
+        connection.request("GET", path, headers=dict(headers))
+        return connection.getresponse().read()
+
+
+@pytest.mark.parametrize("path", ["/metrics", "/ready", "/", "/status.json", "/nothing"])
+def test_a_head_without_a_body_tells_how_long_it_would_be(server: HttpServer, path: str) -> None:
+    head = ask(server, path, "HEAD")
+    assert head.text == ""
+    assert int(head.headers["Content-Length"]) > 0
+
+
+def test_the_head_of_a_tap_ends(server: HttpServer) -> None:
+    head = ask(server, "/tap", "HEAD")
+    assert (head.status, head.text) == (200, "")
+
+
+def test_a_connection_serves_one_question_after_the_other(server: HttpServer) -> None:
+    with closing(http.client.HTTPConnection(*server.address, timeout=10)) as connection:
+        for path in ("/status.json", "/nothing", "/ready"):
+            connection.request("GET", path)
+            connection.getresponse().read()
+            assert connection.sock is not None
+
+
+def test_what_there_is_not_is_said(server: HttpServer) -> None:
+    assert ask(server, "/nothing").status == 404
+    assert ask(server, "/-/nothing", "POST").status == 404
+    assert ask(server, "/-/reload").status == 405
+    assert ask(server, "/map.json?width=huge").status == 400
+    assert ask(server, "/map.json?" + "width=wide&" * 1000).status == 400
+
+
+def test_an_order_to_reload_says_what_came_of_it(server: HttpServer, running: FakeRunning) -> None:
+    answer = ask(server, "/-/reload", "POST")
+    assert (answer.status, answer.json) == (200, {"ok": True, "text": "nothing has changed", "findings": []})
+    finding = Diagnostic(SPAN, Code.UNKNOWN_FIELD, "there is no 'x'", "did you mean 'y'?")
+    running.reloads = ReloadResult(False, (finding,), "nothing was changed: 1 error")
+    answer = ask(server, "/-/reload", "POST")
+    assert answer.status == 422
+    assert answer.json["findings"] == ["routes/sim.yaml:8:20: error[unknown-field]: there is no 'x'; did you mean 'y'?"]
+
+
+def test_an_order_to_save_gives_the_file(server: HttpServer, saved: list[Path | RouterError]) -> None:
+    assert ask(server, "/record/save", "POST").json == {"ok": True, "file": "recordings/last.mcap"}
+    saved[0] = RouterError("the disk is full")
+    answer = ask(server, "/record/save", "POST")
+    assert (answer.status, answer.json) == (409, {"ok": False, "text": "the disk is full"})
+
+
+def test_what_is_not_kept_cannot_be_saved(running: FakeRunning) -> None:
+    with closing(HttpServer(LOOPBACK, SPAN, running, None)) as server:
+        answer = ask(server, "/record/save", "POST")
+    assert answer.status == 404
+    assert "record: {last: 60s}" in answer.json["text"]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "http://127.0.0.1:9108"},
+        {"Origin": ""},
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Host": "rover.example.org"},
+        {"Host": "rover.example.org:9108"},
+        {"Host": "127.0.0.1.example.org"},
+    ],
+)
+@pytest.mark.parametrize(("method", "path"), [("POST", "/-/reload"), ("POST", "/record/save"), ("GET", "/tap")])
+def test_a_page_in_a_browser_can_neither_order_nor_tap(
+    server: HttpServer, method: str, path: str, headers: Mapping[str, str]
+) -> None:
+    assert ask(server, path, method, headers).status == 403
+
+
+@pytest.mark.parametrize(
+    ("peer", "own", "is_refused"),
+    [
+        ("127.0.0.1", "127.0.0.1", False),
+        ("127.0.7.1", "127.0.0.1", False),
+        ("192.168.0.5", "192.168.0.5", False),
+        ("192.168.0.6", "192.168.0.5", True),
+    ],
+)
+def test_only_the_own_computer_can_order(peer: str, own: str, is_refused: bool) -> None:
+    headers = Message()
+    headers["Host"] = f"{own}:9108"
+    assert (refusal(peer, own, headers) is not None) == is_refused
+
+
+def test_who_names_two_hosts_can_order_nothing() -> None:
+    headers = Message()
+    headers["Host"], headers["host"] = "127.0.0.1:9108", "rover.example.org"
+    assert refusal("127.0.0.1", "127.0.0.1", headers) is not None
+
+
+def opened(server: HttpServer, stack: ExitStack, count: int, host: str = "127.0.0.1") -> list[socket.socket]:
+    """Connections that ask nothing, in the order in which the server took them."""
+    return [
+        stack.enter_context(socket.create_connection(server.address, 10, source_address=(host, 0)))
+        for _ in range(count)
+    ]
+
+
+def is_ended(connection: socket.socket) -> bool:
+    """Whether the server has ended it; nothing is read."""
+    poller = select.poll()
+    poller.register(connection, select.POLLRDHUP)
+    return bool(poller.poll(0))
+
+
+@pytest.fixture
+def others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who comes from 127.0.1.0/24 is on another computer."""
+    monkeypatch.setattr(router.observe.http, "is_own_computer", lambda peer, _: not peer.startswith("127.0.1."))
+
+
+def test_who_has_all_places_of_a_host_makes_room_for_one_more(server: HttpServer) -> None:
+    with ExitStack() as stack:
+        silent = opened(server, stack, MOST_PER_HOST)
+        for _ in range(3):
+            assert answers(server)
+        wait_until(lambda: is_ended(silent[0]), "the end of the one that waited longest")
+        assert not is_ended(silent[-1])
+
+
+def test_who_has_an_answer_goes_before_who_has_not_asked_yet(server: HttpServer) -> None:
+    with ExitStack() as stack:
+        silent = opened(server, stack, MOST_PER_HOST - 1)
+        answered = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+        answered.request("GET", "/ready")
+        assert answered.getresponse().read() == b"ready\n"
+        for _ in range(3):
+            assert answers(server)
+        assert not any(map(is_ended, silent))
+        assert answered.sock is not None
+        wait_until(lambda: is_ended(answered.sock), "the end of the one that has its answer")
+
+
+def test_all_addresses_of_the_own_computer_are_one_host(server: HttpServer) -> None:
+    with ExitStack() as stack:
+        silent = [opened(server, stack, 1, f"127.0.0.{number}")[0] for number in range(1, MOST_PER_HOST + 2)]
+        wait_until(lambda: is_ended(silent[0]), "the end of the one that waited longest")
+        assert not any(map(is_ended, silent[1:]))
+
+
+@pytest.mark.usefixtures("others")
+def test_other_computers_share_places_that_are_not_the_own_ones(server: HttpServer) -> None:
+    with ExitStack() as stack:
+        tap = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+        tap.request("GET", "/tap")
+        own = opened(server, stack, MOST_PER_HOST - 1)
+        first = opened(server, stack, MOST_PER_HOST + 1, "127.0.1.1")
+        wait_until(lambda: is_ended(first[0]), "the end of the one that waited longest of its host")
+        more = [each for number in range(2, 50) for each in opened(server, stack, 1, f"127.0.1.{number}")]
+        taken = [*first, *more]
+        wait_until(lambda: sum(map(is_ended, taken)) == len(taken) - MOST_FROM_OTHERS, "the end of what is too much")
+        assert not any(map(is_ended, taken[-MOST_FROM_OTHERS:]))
+        assert not any(map(is_ended, own))
+        assert tap.getresponse().status == 200
+
+
+def test_who_asks_byte_by_byte_makes_room_for_others(server: HttpServer) -> None:
+    with ExitStack() as stack:
+        for each in opened(server, stack, MOST_PER_HOST):
+            each.sendall(b"GET /ready HTTP/1.1\r\nHost: 127")
+        for _ in range(3):
+            assert answers(server)
+
+
+def test_an_order_that_takes_long_keeps_its_place(
+    server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, done = threading.Event(), threading.Event()
+
+    def reload() -> ReloadResult:
+        begun.set()
+        done.wait(10)
+        return running.reloads
+
+    monkeypatch.setattr(running, "reload", reload)
+    with ExitStack() as stack:
+        connection = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+        connection.request("POST", "/-/reload")
+        assert begun.wait(10)
+        opened(server, stack, 2 * MOST_PER_HOST)
+        assert answers(server)
+        done.set()
+        assert connection.getresponse().status == 200
+
+
+def test_a_tap_whose_reader_takes_what_comes_keeps_its_place(server: HttpServer, running: FakeRunning) -> None:
+    with ExitStack() as stack:
+        connection = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+        connection.request("GET", "/tap")
+        response = connection.getresponse()
+        assert response.read(len(MAGIC)) == MAGIC
+        opened(server, stack, 2 * MOST_PER_HOST)
+        assert answers(server)
+        running.receive(b"junk", ("127.0.0.99", 1))
+        while b"junk" not in (piece := response.read1()):
+            assert piece
+
+
+def test_of_taps_there_are_a_few_only_and_one_that_is_not_read_goes(
+    server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ExitStack() as stack:
+        for _ in range(MOST_TAPS):
+            tap = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+            tap.request("GET", "/tap")
+            assert tap.getresponse().status == 200
+        refused = ask(server, "/tap")
+        assert (refused.status, refused.text) == (503, "there are 6 taps already: end one\n")
+        monkeypatch.setattr(router.observe.http_places, "STALLED_SECONDS", 0)
+        another = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
+
+        def is_let_in() -> bool:
+            for _ in range(50):
+                running.receive(bytes(60_000), ("127.0.0.99", 1))
+            another.request("GET", "/tap")
+            response = another.getresponse()
+            return response.status == 200 or not response.read()
+
+        wait_until(is_let_in, "a place of a tap that nobody reads")
+
+
+@pytest.mark.parametrize("taken", [0, 500])
+def test_an_answer_that_is_not_taken_as_a_whole_ends_its_connection(
+    server: HttpServer, monkeypatch: pytest.MonkeyPatch, taken: int
+) -> None:
+    """Also where its reader takes a little now and then."""
+    monkeypatch.setattr(router.observe.http_connection, "ANSWER_SECONDS", 0.3)
+    monkeypatch.setattr(router.observe.http_connection, "MOST_IN_KERNEL", 4096)
+    with socket.socket() as caller:
+        caller.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        caller.connect(server.address)
+        caller.sendall(b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 20)
+
+        def has_ended() -> bool:
+            with suppress(ConnectionError):
+                caller.recv(taken)
+            return is_ended(caller)
+
+        wait_until(has_ended, "the end of a connection whose answers nobody takes")
+    assert answers(server)
+
+
+@pytest.mark.parametrize(("idle", "piece"), [(0.3, b"x"), (3600, bytes(10_000))])
+def test_a_request_that_does_not_come_to_its_end_ends_its_connection(
+    server: HttpServer, monkeypatch: pytest.MonkeyPatch, idle: float, piece: bytes
+) -> None:
+    """It may take too long, or be too long."""
+    monkeypatch.setattr(router.observe.http_connection, "IDLE_SECONDS", idle)
+    with socket.create_connection(server.address, 10) as caller:
+
+        def has_ended() -> bool:
+            with suppress(ConnectionError):
+                caller.send(piece)
+            return is_ended(caller)
+
+        wait_until(has_ended, "the end of a request without end")
+
+
+def test_a_few_threads_answer_at_a_time(server: HttpServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, one_more, let_go = list[object](), threading.Event(), threading.Event()
+
+    def get(self: object, *_: object) -> router.observe.http_answers.Answer:
+        now.append(self)
+        if len(now) > MOST_ANSWERING:
+            one_more.set()
+        let_go.wait(10)
+        now.pop()
+        return text(HTTPStatus.OK, "got")
+
+    monkeypatch.setattr(router.observe.http_answers.Answers, "get", get)
+    with ExitStack() as stack:
+        callers = opened(server, stack, MOST_PER_HOST)
+        for caller in callers:
+            caller.sendall(b"GET /ready HTTP/1.0\r\n\r\n")
+        wait_until(lambda: len(now) >= MOST_ANSWERING, "four that answer")
+        is_one_more = one_more.wait(0.3)
+        let_go.set()
+        for caller in callers:
+            while caller.recv(65536):
+                pass
+    assert not is_one_more
+
+
+ACCEPTED = ["", "text/plain; version=0.0.4", "*/*", "application/json", "text/plain; version=x"]
+OPEN_METRICS = [f"application/openmetrics-text; version={version}" for version in ("1.0.0", "1.0.1", "2.0.0", "x")]
+
+
+def test_metrics_are_collected_once_for_all_that_ask_within_half_a_second(
+    server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(router.observe.http_answers, "KEPT_SECONDS", 3600)
+    for accepted, total in ((ACCEPTED, 1), (OPEN_METRICS, 2)):
+        answers = [ask(server, "/metrics", headers={"Accept": each}) for each in accepted]
+        assert {answer.status for answer in answers} == {200}
+        assert len({answer.text for answer in answers}) == len({*answers[0].headers.get_all("X-Collected-At", [])}) == 1
+        for each in accepted:
+            zipped = ask_raw(server, "/metrics", {"Accept": each, "Accept-Encoding": "gzip"})
+            assert gzip.decompress(zipped).decode() == answers[0].text
+            ask(server, "/metrics", "HEAD", {"Accept": each})
+        assert running.collected == total
+    monkeypatch.setattr(router.observe.http_answers, "KEPT_SECONDS", 0)
+    ask(server, "/metrics")
+    assert running.collected == 3
+
+
+def test_what_the_page_asks_for_is_made_once_for_all_that_look(
+    server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = list[Measures]()
+
+    def drawing(table: RouteTable, measures: Measures) -> RouteMap:
+        drawn.append(measures)
+        return route_map(table, measures)
+
+    monkeypatch.setattr(router.observe.status, "route_map", drawing)
+    monkeypatch.setattr(router.observe.http_answers, "KEPT_SECONDS", 3600)
+    assert len({ask(server, "/status.json").text for _ in range(5)}) == 1
+    assert running.collected == 1
+    for width in ("wide", "narrow"):
+        assert len({ask(server, f"/map.json?width={width}").text for _ in range(5)}) == 1
+    assert len(drawn) == 2
+
+
+def answers(server: HttpServer) -> bool:
+    try:
+        return ask(server, "/ready").status == 200
+    except (OSError, http.client.HTTPException):
+        return False
+
+
+@contextmanager
+def ended_by_the_other_side() -> Iterator[None]:
+    """Inside, a server that ends a connection before it has read everything may reset it, at any step."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ECONNRESET, errno.ENOTCONN):
+            raise
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        b"",
+        b"GET\r\n\r\n",
+        b"\x16\x03\x01" + bytes(100),
+        b"GET / HTTP/1.1\r\nA: " + b"x" * 99999,
+        b"GET / HTTP/1.1\r\nA: " + b"x" * 65000 + b"\r\nB: " + b"x" * 65000 + b"\r\n\r\n",
+        b"GET /metrics HTTP/1.1\r\nAccept: application/openmetrics-text;version=x\r\n\r\n",
+        b"GET http://[::1 HTTP/1.1\r\n\r\n",
+        b"GET /tap?case=%ff%00&&==;&from=[ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n",
+    ],
+)
+def test_nonsense_ends_its_own_connection_only(
+    server: HttpServer, nonsense: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(logger, "critical", lambda event, **_: told.append(event))
+    with socket.create_connection(server.address, 10) as caller, ended_by_the_other_side():
+        caller.sendall(nonsense)
+        caller.shutdown(socket.SHUT_WR)
+        while caller.recv(65536):
+            pass
+    assert ask(server, "/ready").status == 200
+    assert not told
+
+
+def test_closing_minds_nobody_who_has_gone(running: FakeRunning) -> None:
+    """His reset tells the kernel, but the thread that waits for his next question learns of it late."""
+    for _ in range(20):
+        server = HttpServer(LOOPBACK, SPAN, running, None)
+        callers = [socket.create_connection(server.address, 10) for _ in range(5)]
+        for caller in callers:
+            caller.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            caller.sendall(b"GET /tap HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            caller.close()
+        server.close()
+    wait_until(lambda: not running.mirror._consumers, "the end of the taps")
+
+
+def test_closing_ends_what_is_open(running: FakeRunning) -> None:
+    server = HttpServer(LOOPBACK, SPAN, running, None)
+    with closing(http.client.HTTPConnection(*server.address, timeout=10)) as connection:
+        connection.request("GET", "/tap")
+        response = connection.getresponse()
+        server.close()
+        response.read()
+    running.mirror.close()
+    assert running.failures == []

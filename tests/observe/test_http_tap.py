@@ -1,0 +1,124 @@
+"""A tap on what a router receives: what it shows, and that its reader's slowness is the reader's alone."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+from router.observe import http_tap
+from router.observe.http_tap import Tap, TapRequestError, wanted
+from router.observe.tap_stream import MAGIC, Lost, StreamReader
+from router.recording.mirror import Seen
+from tests.acceptance.site import wait_until
+from tests.observe.fake_running import FakeRunning, sim_program
+
+PROGRAM = sim_program()
+BOARD, STATION, STRANGER = ("127.0.0.30", 25008), ("127.0.0.10", 29000), ("127.0.0.99", 1)
+
+
+def datagram(case: str) -> bytes:
+    """With an empty payload."""
+    return PROGRAM.envelope.message_class(**{case: {}}).SerializeToString()
+
+
+IMU, GPS = datagram("imu_info"), datagram("gps_info")
+
+
+@pytest.fixture
+def running() -> Iterator[FakeRunning]:
+    opened = FakeRunning(PROGRAM)
+    yield opened
+    opened.mirror.close()
+    assert opened.failures == []
+
+
+def read(stream: Iterator[bytes], count: int) -> list[Seen | Lost]:
+    """So many from the stream, or more if they came together."""
+    reader, found = StreamReader(), list[Seen | Lost]()
+    while len(found) < count:
+        found += reader.take(next(stream))
+    return found
+
+
+def test_all_that_is_received_is_shown_as_it_came(running: FakeRunning) -> None:
+    with closing(Tap(running.mirror, None)) as tap:
+        for data in (IMU, b"junk", b""):
+            running.receive(data, BOARD)
+        shown = read(tap.stream(), 3)
+    assert [(each.listener, each.peer, each.data) for each in shown if isinstance(each, Seen)] == [
+        ("rover", BOARD, IMU),
+        ("rover", BOARD, b"junk"),
+        ("rover", BOARD, b""),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("cases", "sources", "shown"),
+    [
+        ((), (), ["board imu", "board gps", "station imu", "stranger imu", "board junk"]),
+        (("gps_info",), (), ["board gps", "board junk"]),
+        (("gps_info", "imu_info"), ("basestation",), ["station imu"]),
+        ((), ("sensor_board",), ["board imu", "board gps", "board junk"]),
+        ((), ("127.0.0.99", "basestation"), ["station imu", "stranger imu"]),
+    ],
+)
+def test_a_tap_shows_some_cases_or_senders_only(
+    cases: tuple[str, ...], sources: tuple[str, ...], shown: list[str]
+) -> None:
+    seen = {
+        "board imu": Seen(0, "rover", BOARD, IMU),
+        "board gps": Seen(0, "rover", BOARD, GPS),
+        "station imu": Seen(0, "rover", STATION, IMU),
+        "stranger imu": Seen(0, "rover", STRANGER, IMU),
+        "board junk": Seen(0, "rover", BOARD, b"\xff\xff\xff"),
+    }
+    wants = wanted(PROGRAM, cases, sources)
+    assert [name for name, each in seen.items() if wants is None or wants(each)] == shown
+
+
+def test_a_name_that_there_is_not_is_refused() -> None:
+    with pytest.raises(TapRequestError, match="no payload case 'imu_inf'; did you mean 'imu_info'"):
+        wanted(PROGRAM, ["imu_inf"], [])
+    with pytest.raises(TapRequestError, match="no endpoint 'sensor_bord'; did you mean 'sensor_board'"):
+        wanted(PROGRAM, [], ["sensor_bord"])
+
+
+def test_a_reader_who_is_too_slow_is_told_how_many_he_missed(
+    running: FakeRunning, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http_tap, "MOST_WAITING", 1000)
+    with closing(Tap(running.mirror, None)) as tap:
+        stream = tap.stream()
+        next(stream)
+        for _ in range(50):
+            running.receive(bytes(300), BOARD)
+        wait_until(lambda: not running.mirror._waiting)
+        running.receive(IMU, BOARD)
+        reader, seen, lost = StreamReader(), 0, 0
+        list(reader.take(MAGIC))
+        while seen + lost < 51:
+            for each in reader.take(next(stream)):
+                seen, lost = (seen, lost + each.number) if isinstance(each, Lost) else (seen + 1, lost)
+    assert lost >= 47
+    assert seen + lost == 51
+
+
+def test_a_quiet_tap_says_that_it_is_there(running: FakeRunning, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_tap, "ALIVE_SECONDS", 0.01)
+    with closing(Tap(running.mirror, None)) as tap:
+        stream = tap.stream()
+        pieces = [next(stream) for _ in range(3)]
+    assert list(StreamReader().take(b"".join(pieces))) == []
+    assert all(pieces)
+
+
+def test_a_closed_tap_ends_its_stream(running: FakeRunning) -> None:
+    tap = Tap(running.mirror, None)
+    reading = threading.Thread(target=lambda: list(tap.stream()))
+    reading.start()
+    tap.close()
+    reading.join(10)
+    assert not reading.is_alive()

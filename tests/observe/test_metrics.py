@@ -1,0 +1,141 @@
+"""What Prometheus sees, scraped over HTTP."""
+
+from __future__ import annotations
+
+import socket
+import urllib.request
+from bisect import bisect_left
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import cast
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from router.compiler.books import HISTOGRAM_BOUNDS_NS, METRICS, Books
+from router.errors import SourceSpan, StartError
+from router.observe.http import HttpServer
+from router.observe.metrics import BooksCollector
+from router.observe.running import Running
+from router.table.model import Address
+
+SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
+LOOPBACK = Address("127.0.0.1", 0)
+LABELS = {
+    "listener": "rover",
+    "reason": "stale",
+    "result": "ok",
+    "payload_case": "imu_info",
+    "route": "imu_info",
+    "source": "sensor_board",
+    "destination": "basestation",
+    "topic": "imu_data",
+    "target": "imu_data",
+    "endpoint": "sensor_board",
+    "policy": "reliability",
+    "state": "served",
+    "client": "0",
+}
+BUILD = {"version": "1", "table_sha256": "aa", "protos_sha256": "bb"}
+
+
+@dataclass
+class Scraped:
+    """Books with one series per metric, two threads' counts, and what a scrape shows of them."""
+
+    slots: dict[str, int]
+    threads: list[list[int]]
+    drops: int
+    address: Address
+
+    def values(self) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+        text = urllib.request.urlopen(f"http://{self.address}/metrics", timeout=10).read().decode()
+        return {
+            (sample.name, frozenset(sample.labels.items())): sample.value
+            for family in text_string_to_metric_families(text)
+            for sample in family.samples
+        }
+
+    def value(self, name: str, **labels: str) -> float:
+        metric = next(metric for metric in METRICS if name.startswith(f"router_{metric.name}"))
+        labels |= {label: LABELS[label] for label in metric.labels}
+        return self.values()[name, frozenset(labels.items())]
+
+
+@pytest.fixture
+def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
+    monkeypatch.setattr("router.observe.http_answers.KEPT_SECONDS", 0)
+    books = Books()
+    slots = {metric.name: books.slot(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS}
+    threads = [books.fresh_counts(), books.fresh_counts()]
+    result = Scraped(slots, threads, 0, LOOPBACK)
+    collector = BooksCollector(books, threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD)
+    with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), None)) as server:
+        result.address = server.address
+        yield result
+
+
+def test_every_metric_of_the_books_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
+    values = scraped.values()
+    for metric in METRICS:
+        labels = frozenset((label, LABELS[label]) for label in metric.labels)
+        suffix = {"counter": "_total", "time": "", "number": "", "histogram": "_count"}[metric.kind]
+        assert values[f"router_{metric.name}{suffix}", labels] == 0, metric.name
+
+
+def test_build_info_says_what_runs(scraped: Scraped) -> None:
+    assert scraped.values()["router_build_info", frozenset(BUILD.items())] == 1
+
+
+def test_a_counter_is_the_sum_over_threads(scraped: Scraped) -> None:
+    for counts, value in zip(scraped.threads, (3, 4), strict=True):
+        counts[scraped.slots["datagrams_sent"]] = value
+    assert scraped.value("router_datagrams_sent_total") == 7
+
+
+def test_a_gauge_is_the_latest_of_all_threads_in_seconds(scraped: Scraped) -> None:
+    for counts, value in zip(scraped.threads, (1_500_000_000, 2_500_000_000), strict=True):
+        counts[scraped.slots["endpoint_last_seen_timestamp_seconds"]] = value
+    assert scraped.value("router_endpoint_last_seen_timestamp_seconds") == 2.5
+
+
+def test_a_number_is_exported_as_the_thread_that_knows_it_left_it(scraped: Scraped) -> None:
+    scraped.threads[1][scraped.slots["qos_incompatible"]] = 2
+    assert scraped.value("router_qos_incompatible") == 2
+    scraped.threads[0][scraped.slots["deadman_active"]] = 1
+    assert scraped.value("router_deadman_active") == 1
+    scraped.threads[0][scraped.slots["deadman_active"]] = 0
+    assert scraped.value("router_deadman_active") == 0
+
+
+def test_what_is_in_no_slot_is_asked_for_at_each_scrape(scraped: Scraped) -> None:
+    scraped.drops = 12
+    assert scraped.value("router_kernel_drops_total") == 12
+    scraped.drops = 13
+    assert scraped.value("router_kernel_drops_total") == 13
+
+
+def test_histogram_buckets_are_cumulative_and_in_seconds(scraped: Scraped) -> None:
+    first = scraped.slots["route_seconds"]
+    for counts, elapsed_ns in ((scraped.threads[0], 9_000), (scraped.threads[1], 9_000), (scraped.threads[0], 10**9)):
+        counts[first + bisect_left(HISTOGRAM_BOUNDS_NS, elapsed_ns)] += 1
+        counts[first + len(HISTOGRAM_BOUNDS_NS) + 1] += elapsed_ns
+    assert scraped.value("router_route_seconds_bucket", le="1e-05") == 2
+    assert scraped.value("router_route_seconds_bucket", le="0.05") == 2
+    assert scraped.value("router_route_seconds_bucket", le="+Inf") == 3
+    assert scraped.value("router_route_seconds_count") == 3
+    assert scraped.value("router_route_seconds_sum") == pytest.approx(1.000018)
+
+
+def test_the_process_is_described_and_python_is_not(scraped: Scraped) -> None:
+    names = {name for name, _ in scraped.values()}
+    assert "process_cpu_seconds_total" in names
+    assert not {name for name in names if name.startswith("python_")}
+
+
+def test_an_address_in_use_is_refused_with_who_has_it() -> None:
+    with socket.create_server(LOOPBACK) as other:
+        taken = Address(*other.getsockname())
+        with pytest.raises(StartError, match=rf"rover.yaml:8:20: metrics cannot be served at {taken}: .*\(pid \d+\)"):
+            HttpServer(taken, SPAN, cast("Running", BooksCollector(Books(), [[]], {}, BUILD)), None)

@@ -1,0 +1,137 @@
+"""What the status page is told: the numbers of the books, the map of the table, and last values while it looks."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
+
+import pytest
+
+from router.compiler.books import METRICS
+from router.observe import last_values
+from router.observe.http_answers import PAGE
+from router.observe.status import Status
+from router.observe.status_numbers import TAKERS
+from tests.acceptance.site import wait_until
+from tests.observe.fake_running import FakeRunning, sim_program
+
+PROGRAM = sim_program()
+BOARD, STRANGER = ("127.0.0.30", 25008), ("127.0.0.99", 1)
+
+
+@pytest.fixture
+def running() -> Iterator[FakeRunning]:
+    opened = FakeRunning(PROGRAM)
+    yield opened
+    opened.mirror.close()
+    assert opened.failures == []
+
+
+@pytest.fixture
+def shown(running: FakeRunning) -> Iterator[Status]:
+    with closing(Status(running)) as opened:
+        yield opened
+
+
+def value(shown: Status, case: str) -> Any:
+    """As soon as there is one."""
+    wait_until(lambda: case in shown.numbers()["values"])
+    return shown.numbers()["values"][case]
+
+
+def imu(**fields: Any) -> bytes:
+    return PROGRAM.envelope.message_class(imu_info=fields).SerializeToString()
+
+
+@pytest.mark.parametrize(
+    "shared",
+    [r"^const \$ = [^\n]*$", r"^function make\(.*?^}$", r"^function setText\(.*?^}$"],
+    ids=["$", "make", "setText"],
+)
+def test_what_both_pages_have_is_the_same_in_both(shared: str) -> None:
+    """Each page is one file, so that it needs nothing else; what they share must not drift apart."""
+    pages = [file.read_text(encoding="utf-8") for file in (PAGE, PAGE.parents[1] / "gateway" / "page.html")]
+    [status_page], [gateway_page] = (re.findall(shared, page, re.DOTALL | re.MULTILINE) for page in pages)
+    assert status_page == gateway_page
+
+
+def test_what_is_counted_is_found_by_route_and_target(running: FakeRunning, shown: Status) -> None:
+    running.count("messages_received", "imu_info", "sensor_board", to=9)
+    running.count("datagrams_sent", "imu_info", "basestation", to=7)
+    running.count("messages_dropped", "imu_info", "basestation", "send_error", to=2)
+    running.count("messages_filtered", "imu_info", "imu_data", to=9)
+    running.count("route_last_message_timestamp_seconds", "imu_info", to=1_500_000_000)
+    route = shown.numbers()["routes"]["imu_info"]
+    assert route["sources"] == {"sensor_board": 9}
+    assert route["targets"]["basestation"] == {"delivered": 7, "dropped": {"send_error": 2}}
+    assert route["targets"]["imu_data"] == {"delivered": 0, "dropped": {}, "filtered": 9}
+    assert route["last"] == 1.5
+    assert route["buckets"][-1] == ["+Inf", 0]
+
+
+def test_endpoints_tell_when_they_were_heard_and_when_that_is_too_long_ago(running: FakeRunning, shown: Status) -> None:
+    running.count("endpoint_last_seen_timestamp_seconds", "sensor_board", to=2_000_000_000)
+    assert shown.numbers()["endpoints"]["sensor_board"] == {"seen": 2.0, "stale_after": 5.0}
+
+
+def test_every_series_that_the_page_knows_exists() -> None:
+    """A renamed metric would be a number that never moves."""
+    known = {metric.name for metric in METRICS}
+    for name in TAKERS:
+        assert name.removesuffix("_total").removesuffix("_bucket") in known, name
+
+
+def test_all_of_it_is_json(shown: Status) -> None:
+    json.dumps(shown.numbers(), allow_nan=False)
+    json.dumps(shown.map("narrow"), allow_nan=False)
+
+
+@pytest.mark.parametrize("width", ["narrow", "wide"])
+def test_every_line_of_the_map_has_its_numbers(shown: Status, width: str) -> None:
+    drawn, said = shown.map(width), shown.numbers()
+    columns = {node["key"]: node["column"] for node in drawn["nodes"]}
+    assert drawn["map"] == said["map"]
+    for link in drawn["links"]:
+        side = "sources" if columns[link["end"]] == 1 else "targets"
+        assert link["label"] in said["routes"][link["route"]][side], link
+
+
+def test_a_last_value_comes_from_what_is_received_while_somebody_looks(running: FakeRunning, shown: Status) -> None:
+    running.receive(imu(accel_x=1.0), BOARD)
+    assert shown.numbers()["values"] == {}  # nobody was looking
+    running.receive(imu(accel_x=1.5), BOARD)
+    found = value(shown, "imu_info")
+    assert (found["source"], found["fields"]["accel_x"], found["fields"]["accel_y"]) == ("sensor_board", 1.5, 0.0)
+
+
+def test_a_strangers_value_is_shown_with_where_it_is_from(running: FakeRunning, shown: Status) -> None:
+    shown.numbers()
+    running.receive(b"junk", STRANGER)
+    running.receive(imu(), STRANGER)
+    assert value(shown, "imu_info")["source"] == "127.0.0.99:1"
+
+
+def test_a_trimmed_value_is_read_as_the_router_reads_it(running: FakeRunning, shown: Status) -> None:
+    shown.numbers()
+    running.receive(imu(accel_x=2.0).rstrip(b"\0"), BOARD)
+    assert value(shown, "imu_info")["fields"]["accel_x"] == 2.0
+
+
+def test_long_values_are_cut() -> None:
+    kept = last_values.shortened({"a": list(range(100)), "b": "x" * 1000, "c": {"d": [{"e": 1}]}})
+    assert kept["a"][-1] == "and 76 more"
+    assert kept["b"].endswith("… (1000 characters)")
+    assert kept["c"] == {"d": [{"e": 1}]}
+
+
+def test_the_mirror_is_left_alone_when_nobody_looks_any_more(
+    running: FakeRunning, shown: Status, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(last_values, "LOOKED_AT_SECONDS", 0.1)
+    shown.numbers()
+    wait_until(lambda: not running.mirror._consumers, "the end of the look")
+    shown.numbers()
+    assert running.mirror._consumers

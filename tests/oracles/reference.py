@@ -1,0 +1,173 @@
+"""The oracle: a plain, slow answer to what a table makes of one message, for tests and for `router test`.
+
+Of the compiler it shares the functions and the type model, and must not know expressions, scalars, conversion,
+mapping, cdr, payload or source: what both agree on is right for two reasons. Expects a table that the compiler
+has accepted. `reference_cdr` and `reference_protobuf` make messages of what comes out here.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from typing import Any, Union
+
+from router.errors import MappingError
+from router.table.model import Expression, FieldMap
+from router.types.model import Bool, Bytes, Enum, Float, Int, List, MessageType, String, Type
+from tests.oracles.reference_expressions import NS, Context, EnumNumber, Nanoseconds, View, evaluate
+
+Value = Union[bool, int, float, str, bytes, "list[Value]", "dict[str, Value]"]
+"""What fills a field; a message is a dictionary of its fields, in their order."""
+
+
+def fill(fields: FieldMap | None, target: MessageType, context: Context) -> dict[str, Value]:
+    """The ROS message that `fields` makes of a message, with all its fields.
+
+    Raises MappingError where a field has no value.
+    """
+    return _completed(target, fill_given(fields, target, context))
+
+
+def _completed(message: MessageType, values: Mapping[str, Value]) -> dict[str, Value]:
+    """With the fields that nobody fills: ROS messages have them all."""
+    return {
+        field.name: _complete(field.type, values[field.name])
+        if field.name in values
+        else initial(field.type, field.default)
+        for field in message.fields
+    }
+
+
+def _complete(declared: Type, value: Any) -> Any:
+    match declared:
+        case MessageType():
+            return _completed(declared, value)
+        case List():
+            return [_complete(declared.element, element) for element in value]
+        case String(wide=False) if "\0" in value:
+            raise MappingError("a ROS string cannot hold a NUL")
+        case _:
+            return value
+
+
+def fill_given(fields: FieldMap | None, target: MessageType, context: Context) -> dict[str, Value]:
+    """The same without the fields that nothing fills."""
+    tree: dict[str, Any] = {}
+    for entry in fields.entries if fields else ():
+        holder = reduce(lambda inner, name: inner.setdefault(name, {}), entry.path[:-1], tree)
+        holder[entry.path[-1]] = entry.value
+    return _filled(target, tree, context.view if fields and fields.auto else None, context)
+
+
+def _filled(target: MessageType, tree: Mapping[str, Any], auto: View | None, context: Context) -> dict[str, Value]:
+    made: dict[str, Value] = {}
+    for field in target.fields:
+        given = tree.get(field.name)
+        same_named = auto.read(field.name) if auto and auto.type.field(field.name) else None
+        if isinstance(given, Expression):
+            made[field.name] = converted(evaluate(given, context, field.type), field.type)
+        elif given is not None:
+            assert isinstance(field.type, MessageType)
+            made[field.name] = _filled(field.type, given, same_named if isinstance(same_named, View) else None, context)
+        elif same_named is not None:
+            made[field.name] = converted(same_named, field.type)
+    return made
+
+
+def initial(declared: Type, default: object = None) -> Value:
+    """What a field of a ROS message holds that nobody fills: its declared default, else zero."""
+    match declared:
+        case MessageType():
+            return {field.name: initial(field.type, field.default) for field in declared.fields}
+        case List() if isinstance(default, Sequence):
+            return [initial(declared.element, value) for value in default]
+        case List():
+            return [initial(declared.element) for _ in range(declared.length or 0)]
+        case _ if default is not None:
+            return default  # type: ignore[return-value]
+        case Bool():
+            return False
+        case Float():
+            return 0.0
+        case String():
+            return ""
+        case _:
+            return 0
+
+
+def converted(value: Any, target: Type) -> Value:  # noqa: C901, PLR0912 - a case a type
+    """The value as a field of the target's type holds it. Raises MappingError when it does not fit."""
+    match target:
+        case MessageType():
+            return _to_message(value, target)
+        case List():
+            elements = [converted(element, target.element) for element in value]
+            if len(elements) not in range(target.length or 0, _most_elements(target) + 1):
+                raise MappingError(f"{len(elements)} elements do not fit {target}")
+            return elements
+        case _ if isinstance(value, View):
+            return converted(value.read(value.type.fields[0].name), target)
+        case Bool():
+            return bool(value)
+        case Int():
+            if isinstance(value, EnumNumber):
+                return max(target.low, min(target.high, int(value)))
+            if not target.low <= value <= target.high:
+                raise MappingError(f"{value} does not fit {target}")
+            return int(value)
+        case Float():
+            return _to_float(value, target)
+        case String():
+            return _to_text(value, target)
+        case Enum():
+            return _to_enum(value, target)
+        case Bytes():
+            if target.bound is not None and len(value) > target.bound:
+                raise MappingError(f"{len(value)} bytes do not fit {target}")
+            return bytes(value)
+
+
+def _most_elements(target: List) -> int:
+    most = target.length if target.length is not None else target.bound
+    return most if most is not None else 0xFFFF_FFFF
+
+
+def _to_message(value: Any, target: MessageType) -> dict[str, Value]:
+    if isinstance(value, Nanoseconds) and target.name in ("builtin_interfaces/msg/Time", "google.protobuf.Timestamp"):
+        sec, nanosec = target.fields
+        return {sec.name: converted(value // NS, sec.type), nanosec.name: converted(value % NS, nanosec.type)}
+    if not isinstance(value, View):
+        (only,) = target.fields
+        return {only.name: converted(value, only.type)}
+    return {
+        field.name: converted(value.read(field.name), field.type)
+        for field in target.fields
+        if value.type.field(field.name)
+    }
+
+
+def _to_float(value: float, target: Float) -> float:
+    try:
+        struct.pack("<f" if target.bits == 32 else "<d", value)
+    except (OverflowError, struct.error) as error:
+        raise MappingError(f"{value} does not fit {target}: {error}") from error
+    return float(value)
+
+
+def _to_text(value: str, target: String) -> str:
+    size = len(value.encode("utf-16-le")) // 2 if target.wide else len(value.encode())
+    if target.bound is not None and size > target.bound:
+        raise MappingError(f"a text of {size} does not fit {target}")
+    return value
+
+
+def _to_enum(value: int | str, target: Enum) -> int:
+    """A number as it is, a name as what it stands for."""
+    numbers = dict(target.values)
+    if isinstance(value, str) and value not in numbers:
+        raise MappingError(f"{target} has no value '{value}'")
+    number = numbers[value] if isinstance(value, str) else int(value)
+    if not -(1 << 31) <= number < 1 << 31:
+        raise MappingError(f"{number} does not fit {target}")
+    return number

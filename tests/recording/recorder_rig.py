@@ -1,0 +1,135 @@
+"""What tests of recordings share: datagrams of the rover, and a router that is nothing but a mirror."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+from router.errors import SourceSpan
+from router.observe.running import Running
+from router.recording.channels import Channels
+from router.recording.chunk import Chunk
+from router.recording.encoding import Encoder
+from router.recording.file import RecordingFile
+from router.recording.mirror import Seen
+from router.recording.mirrored import Known
+from router.recording.reader_mcap import Recorded, Recording
+from router.table.model import Address, Endpoint, EndpointKind, Framing, Located, RecordSettings, RouteTable
+from router.tools.wire import Wire, wire_of_protos
+from tests.tables import PROTOS
+
+SPAN = SourceSpan("table.yaml", 3)
+START = 1_790_000_000_000_000_000
+SENSOR_BOARD = ("10.0.0.3", 5000)
+STRANGER = ("10.9.9.9", 40000)
+MILLISECOND = 1_000_000
+
+
+@cache
+def wire() -> Wire:
+    return wire_of_protos(PROTOS)
+
+
+def imu(accel_x: float = 1.5) -> bytes:
+    case = wire().case("imu_info")
+    return wire().encode(case, case.message_class(accel_x=accel_x, accel_z=9.81))
+
+
+def endpoints() -> dict[str, Endpoint]:
+    address = Located(Address(*SENSOR_BOARD), SPAN)
+    return {
+        "sensor_board": Endpoint("sensor_board", SPAN, address, EndpointKind.BOARD, None, trim_trailing_zeros=False)
+    }
+
+
+def table(**changed: Any) -> RouteTable:
+    """All of it that a recording knows."""
+    listener = SimpleNamespace(name="rover", framing=Framing.ZERO_TRIMMED)
+    told = {"path": Path("routes/rover.yaml"), "endpoints": endpoints(), "listeners": {"rover": listener}, **changed}
+    return cast("RouteTable", SimpleNamespace(**told))
+
+
+def known() -> Known:
+    return Known(wire().envelope, table())
+
+
+def encoder(channels: Channels) -> Encoder:
+    made = Encoder(channels)
+    made.know(known())
+    return made
+
+
+def seen(*datagrams: bytes, at: int = START, peer: tuple[str, int] = SENSOR_BOARD) -> list[Seen]:
+    """One each millisecond."""
+    return [Seen(at + number * MILLISECOND, "rover", peer, data) for number, data in enumerate(datagrams)]
+
+
+def recorded(path: Path, *batches: Sequence[Seen], finish: bool = True) -> Path:
+    """A file with a chunk of each batch, on a clock that nobody sets."""
+    channels = Channels()
+    made = encoder(channels)
+    with_chunks = []
+    for batch in batches:
+        made.add(batch, batch[-1].at, batch[-1].at - START)
+        with_chunks.append(taken(made))
+    return write(path, channels, *with_chunks, finish=finish)
+
+
+def taken(made: Encoder) -> Chunk:
+    chunk = made.take()
+    assert chunk is not None
+    return chunk
+
+
+def write(path: Path, channels: Channels, *chunks: Chunk, finish: bool = True) -> Path:
+    file = RecordingFile(path, channels, {"reason": "test"})
+    for chunk in chunks:
+        file.write(chunk)
+    if finish:
+        file.close()
+    else:
+        os.close(file._descriptor)
+    return path
+
+
+def read(path: Path) -> list[Recorded]:
+    with closing(Recording(path)) as recording:
+        return list(recording.datagrams())
+
+
+def again(found: Recorded) -> Seen:
+    """What was recorded, as it was seen."""
+    return Seen(found.at, found.listener, found.peer, found.data)
+
+
+class FakeMirror:
+    """Shows what the test says, at once."""
+
+    def __init__(self) -> None:
+        self.show: Callable[[Sequence[Seen]], None] = print
+
+    def attach(self, consumer: Callable[[Sequence[Seen]], None]) -> Callable[[], None]:
+        self.show = consumer
+        return lambda: None
+
+
+def running(mirror: FakeMirror) -> Running:
+    program = SimpleNamespace(table=table(), envelope=wire().envelope, protos_sha256="0" * 64)
+    return cast("Running", SimpleNamespace(mirror=mirror, program=program))
+
+
+def settings(directory: Path, **changed: Any) -> RecordSettings:
+    told: dict[str, Any] = {
+        "continuous": True,
+        "last": None,
+        "max_size": 256 << 20,
+        "max_age": 600 * 10**9,
+        "keep": 4 << 30,
+        **changed,
+    }
+    return RecordSettings(SPAN, directory, **told)

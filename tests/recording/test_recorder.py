@@ -1,0 +1,383 @@
+"""The recorder: when it writes what to which file, and what it does when the disk does not take it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from threading import Thread
+from time import monotonic, sleep, time_ns
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from structlog.testing import capture_logs
+
+from router.errors import StartError
+from router.recording import continuous as recorder_continuous
+from router.recording import queue as recorder_intake
+from router.recording import recorder as recorder_module
+from router.recording import saving as recorder_saving
+from router.recording.encoding import Encoder
+from router.recording.file import RecordingFile
+from router.recording.mirror import Seen
+from router.recording.reader_mcap import Recording
+from router.recording.recorder import Recorder, RecordError
+from router.recording.saving import Saving
+from tests.recording.recorder_rig import FakeMirror, again, imu, read, running, seen, settings, table, wire
+
+PATIENCE = 20.0
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "PERIOD", 10_000_000)
+    monkeypatch.setattr(recorder_intake, "PERIOD", 10_000_000)
+
+
+@contextmanager
+def recorder(directory: Path, **changed: Any) -> Iterator[tuple[Recorder, FakeMirror]]:
+    mirror = FakeMirror()
+    with closing(Recorder(running(mirror), settings(directory, **changed))) as made:
+        yield made, mirror
+
+
+def counted(made: Recorder) -> dict[str, float]:
+    return {" ".join((name, *labels)): value for name, asked in made.asked().items() for labels, value in asked()}
+
+
+def show(made: Recorder, mirror: FakeMirror, batch: list[Seen]) -> None:
+    """Shows it, and waits until it was written."""
+    before = counted(made)["recorded_datagrams"] + counted(made)["record_dropped write_error"]
+    mirror.show(batch)
+    deadline = monotonic() + PATIENCE
+    while counted(made)["recorded_datagrams"] + counted(made)["record_dropped write_error"] < before + len(batch):
+        assert monotonic() < deadline, "it was never written"
+        sleep(0.01)
+
+
+def files(directory: Path) -> list[Path]:
+    return sorted(directory.iterdir())
+
+
+def now(*datagrams: bytes) -> list[Seen]:
+    return seen(*datagrams, at=time_ns())
+
+
+def test_all_that_was_seen_is_in_the_file_when_it_is_closed(tmp_path: Path) -> None:
+    batches = [now(imu(1), b"bad"), now(imu(2), imu(3))]
+    with recorder(tmp_path / "new" / "recordings") as (made, mirror):
+        for batch in batches:
+            mirror.show(batch)
+    [path] = files(tmp_path / "new" / "recordings")
+    recording = Recording(path)
+    assert [again(each) for each in recording.datagrams()] == [each for batch in batches for each in batch]
+    assert recording.is_whole
+    assert recording.about == {"reason": "continuous", "table": "rover.yaml", "protos_sha256": "0" * 64}
+    assert counted(made) == {
+        "recorded_datagrams": 4,
+        "recorded_bytes": sum(len(each.data) for batch in batches for each in batch),
+        "record_dropped overflow": 0,
+        "record_dropped write_error": 0,
+    }
+
+
+def test_what_was_seen_is_on_disk_soon_and_can_be_read_while_it_goes_on(tmp_path: Path) -> None:
+    with recorder(tmp_path) as (made, mirror):
+        show(made, mirror, batch := now(imu()))
+        assert [again(each) for each in read(files(tmp_path)[0])] == batch
+
+
+def test_nothing_seen_makes_no_file(tmp_path: Path) -> None:
+    with recorder(tmp_path):
+        pass
+    assert files(tmp_path) == []
+
+
+def test_a_file_that_would_become_too_large_is_followed_by_another(tmp_path: Path) -> None:
+    noise = [now(os.urandom(10_000)) for _ in range(5)]
+    with recorder(tmp_path, max_size=25_000) as (made, mirror):
+        for batch in noise:
+            show(made, mirror, batch)
+    assert [len(read(path)) for path in files(tmp_path)] == [2, 2, 1]
+    assert all(path.stat().st_size <= 25_000 for path in files(tmp_path))
+
+
+def test_a_file_is_closed_when_it_is_old_enough_though_nothing_comes(tmp_path: Path) -> None:
+    with recorder(tmp_path, max_age=1) as (made, mirror):
+        show(made, mirror, now(imu()))
+        deadline = monotonic() + PATIENCE
+        while not _is_whole(files(tmp_path)[0]):
+            assert monotonic() < deadline, "it was never closed"
+            sleep(0.01)
+        show(made, mirror, now(imu()))
+    assert [len(read(path)) for path in files(tmp_path)] == [1, 1]
+
+
+def _is_whole(path: Path) -> bool:
+    recording = Recording(path)
+    list(recording.datagrams())
+    return recording.is_whole
+
+
+def test_the_oldest_recordings_go_and_files_of_others_stay(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(bytes(100_000))
+    (tmp_path / "rover_holiday.mcap").write_bytes(bytes(100_000))
+    (tmp_path / "other_20200101T000000.000000Z.mcap").write_bytes(bytes(100_000))
+    old = tmp_path / "rover_20200101T000000.000000Z_deadman-drive_motor.mcap"
+    old.write_bytes(bytes(10_000))
+    with recorder(tmp_path, max_size=25_000, keep=60_000) as (made, mirror):
+        for _ in range(8):
+            show(made, mirror, now(os.urandom(10_000)))
+    ours = [path for path in files(tmp_path) if path.stat().st_size < 100_000]
+    assert len(files(tmp_path)) - len(ours) == 3
+    assert old not in ours
+    assert sum(path.stat().st_size for path in ours) <= 60_000
+    assert [len(read(path)) for path in ours] == [2, 2]
+
+
+def test_the_last_datagrams_are_saved_when_somebody_asks(tmp_path: Path) -> None:
+    with recorder(tmp_path, continuous=False, last=60 * 10**9) as (made, mirror):
+        mirror.show(first := now(imu(1), b"bad"))
+        path = made.save("http")
+        assert path.name.endswith("_http.mcap")
+        assert [again(each) for each in read(path)] == first
+        mirror.show(second := now(imu(2)))
+        again_saved = made.save("signal")
+        assert [again(each) for each in read(again_saved)] == first + second
+        assert Recording(path).about == {}  # until it is read
+    assert len(files(tmp_path)) == 2
+    assert counted(made)["recorded_datagrams"] == 0
+
+
+def test_what_is_older_than_last_is_not_saved(tmp_path: Path) -> None:
+    with recorder(tmp_path, continuous=False, last=1) as (made, mirror):
+        mirror.show(now(imu(1)))
+        made.save("first")  # has it written before the next comes
+        mirror.show(second := now(imu(2)))
+        assert [again(each) for each in read(made.save("second"))] == second
+
+
+def test_of_a_flood_the_memory_keeps_less(tmp_path: Path) -> None:
+    with recorder(tmp_path, continuous=False, last=60 * 10**9, max_size=25_000) as (made, mirror):
+        for _ in range(5):
+            mirror.show(last := now(os.urandom(10_000)))
+            path = made.save("it")
+    assert [again(each) for each in read(path)][-1:] == last
+    assert path.stat().st_size < 25_000 + 1000
+
+
+def test_a_deadman_that_trips_has_it_saved_once_in_the_time_that_is_kept(tmp_path: Path) -> None:
+    with recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
+        mirror.show(now(imu(1)))
+        made.deadman_tripped("drive_motor")
+        deadline = monotonic() + PATIENCE
+        while not files(tmp_path):
+            assert monotonic() < deadline, "it was never saved"
+            sleep(0.01)
+        made.deadman_tripped("drive_motor")
+        made.deadman_tripped("arm_target")
+        made.save("in between")
+        assert len(files(tmp_path)) == 2
+        mirror.show(now(imu(2)))
+    reasons = [path.name.partition("Z_")[2] for path in files(tmp_path)]
+    assert reasons == ["deadman-drive_motor.mcap", "in-between.mcap", "deadman-arm_target.mcap"]  # the last at the end
+    assert len(read(files(tmp_path)[-1])) == 2
+
+
+def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:
+    with recorder(tmp_path) as (made, _):
+        made.deadman_tripped("drive_motor")
+        with pytest.raises(RecordError, match="no `last`"):
+            made.save("http")
+
+
+@pytest.mark.parametrize("last", [None, 10**9])
+def test_a_directory_that_cannot_be_is_an_error_of_the_start(last: int | None, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(StartError, match=r"table.yaml:3:1: cannot record to .*: (Not a directory|File exists)"):
+        Recorder(running(FakeMirror()), settings(tmp_path / "file", last=last))
+
+
+def test_a_disk_that_is_full_loses_counts_and_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_continuous, "_RETRY", 1)
+    real = os.write
+    with recorder(tmp_path) as (made, mirror):
+        show(made, mirror, first := now(imu(1)))
+        monkeypatch.setattr(os, "write", _full)
+        show(made, mirror, now(imu(2), imu(3)))
+        monkeypatch.setattr(os, "write", real)
+        show(made, mirror, third := now(imu(4)))
+    assert counted(made)["record_dropped write_error"] == 2
+    assert [again(each) for path in files(tmp_path) for each in read(path)] == first + third
+
+
+def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_continuous, "_RETRY", 1)
+    with recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(os, "write", _full)
+        show(made, mirror, now(imu(1)))
+        show(made, mirror, now(imu(2)))
+        monkeypatch.undo()
+    assert files(tmp_path) == []
+
+
+def test_what_cannot_be_saved_leaves_no_empty_file_and_can_be_saved_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.write
+
+    def full_after_the_head(descriptor: int, data: bytes) -> int:
+        return real(descriptor, data) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
+
+    with recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
+        mirror.show(batch := now(imu(1), imu(2)))
+        monkeypatch.setattr(os, "write", full_after_the_head)
+        with pytest.raises(RecordError, match="No space left"):
+            made.save("http")
+        assert files(tmp_path) == []
+        monkeypatch.setattr(os, "write", real)
+        assert [again(each) for each in read(made.save("http"))] == batch
+
+
+def test_where_the_directory_is_removed_it_is_made_again(tmp_path: Path) -> None:
+    directory = tmp_path / "recordings"
+    with recorder(directory, last=10**11) as (made, mirror):
+        show(made, mirror, now(imu(1)))
+        shutil.rmtree(directory)
+        show(made, mirror, batch := now(imu(2)))
+        [path] = files(directory)
+        assert [again(each) for each in read(path)] == batch
+        assert len(read(made.save("http"))) == 2
+
+
+def test_what_came_before_a_reload_is_saved_as_it_was_known_then(tmp_path: Path) -> None:
+    mirror = FakeMirror()
+    router = running(mirror)
+    with closing(Recorder(router, settings(tmp_path, continuous=False, last=10**11))) as made:
+        mirror.show(now(imu(1)))
+        changed = SimpleNamespace(table=table(endpoints={}), envelope=wire().envelope, protos_sha256="1" * 64)
+        router.program = changed  # type: ignore[misc, assignment]
+        mirror.show(now(imu(2)))
+        saved = made.save("http")
+    assert [each.endpoint for each in read(saved)] == ["sensor_board", ""]
+
+
+def test_what_comes_after_the_end_is_refused(tmp_path: Path) -> None:
+    with recorder(tmp_path, last=10**9) as (made, _):
+        pass
+    made.deadman_tripped("drive_motor")
+    with pytest.raises(RecordError, match="stopping"):
+        made.save("http")
+
+
+def _full(descriptor: int, data: bytes) -> int:
+    raise OSError(28, "No space left on device")
+
+
+def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(recorder_intake, "MOST_WAITING", 0)
+        mirror.show(now(imu(1), imu(2)))
+        assert counted(made)["record_dropped overflow"] == 2
+        monkeypatch.undo()
+        show(made, mirror, now(imu(3)))
+    assert len(read(files(tmp_path)[0])) == 1
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"), [(Encoder, "_shapes_of"), (Encoder, "take"), (RecordingFile, "write")], ids=str
+)
+def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
+    owner: type, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where memory is short. Nothing of it waits for ever, as if the disk were slow."""
+    with capture_logs() as logs, recorder(tmp_path) as (made, mirror):
+        show(made, mirror, first := now(imu(1)))
+        with monkeypatch.context() as faulty:
+            faulty.setattr(owner, name, _fault)
+            for _ in range(3):
+                show(made, mirror, now(imu(2), imu(3)))
+        assert counted(made)["record_dropped write_error"] == 6
+        show(made, mirror, last := now(imu(4)))
+        assert made._intake is not None
+        assert made._intake._taken_in == made._intake._taken_out
+    assert [each["log_level"] for each in logs if "please report it" in each["event"]] == ["critical"]
+    assert [again(each) for path in files(tmp_path) for each in read(path)] == first + last
+
+
+def test_a_fault_in_saving_is_told_to_who_asked_and_the_next_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with recorder(tmp_path, last=10**11) as (made, mirror):
+        mirror.show(batch := now(imu(1)))
+        with monkeypatch.context() as faulty:
+            faulty.setattr(Saving, "_write", _fault)
+            with pytest.raises(RecordError, match="fault in the router itself: MemoryError"):
+                made.save("http")
+            made.deadman_tripped("drive_motor")
+        assert [again(each) for each in read(made.save("http"))] == batch
+
+
+def _fault(*_: object) -> None:
+    raise MemoryError
+
+
+def test_what_comes_while_saving_takes_its_time_is_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with recorder(tmp_path, last=10**11) as (made, mirror):
+        show(made, mirror, now(imu(1)))
+        show(made, mirror, now(imu(2)))
+        written: list[float] = []
+
+        def rest(_: float) -> None:
+            """Called by the recorder's thread, once for each batch that it saves."""
+            written.append(counted(made)["recorded_datagrams"])
+            mirror.show(now(imu(3)))
+            sleep(0.02)
+
+        monkeypatch.setattr(recorder_saving, "sleep", rest)
+        made.save("http")
+    assert written == [2, 3]
+
+
+def test_what_is_saved_at_the_end_is_saved_without_rests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rests: list[float] = []
+    monkeypatch.setattr(recorder_saving, "sleep", rests.append)
+    with recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
+        mirror.show(now(imu(1)))
+        made.deadman_tripped("drive_motor")
+        while not files(tmp_path):  # the trip's, perhaps unfinished
+            sleep(0.01)
+        made.save("first")  # one thread saves: it has finished that one before
+        rests.clear()
+        made.deadman_tripped("drive_motor")  # too soon: kept for the end
+    assert rests == []
+    assert len(files(tmp_path)) == 3
+
+
+def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
+    answers: list[object] = []
+
+    def ask(made: Recorder) -> None:
+        try:
+            while True:
+                answers.append(made.save("http"))
+        except RecordError as error:
+            answers.append(str(error))
+
+    with recorder(tmp_path, continuous=False, last=10**9) as (made, mirror):
+        mirror.show(now(imu(1)))
+        asking = [Thread(target=ask, args=(made,)) for _ in range(4)]
+        for thread in asking:
+            thread.start()
+        while not answers:
+            sleep(0.001)
+    for thread in asking:
+        thread.join(PATIENCE)
+    assert [answer for answer in answers if not isinstance(answer, Path)] == ["the router is stopping"] * 4

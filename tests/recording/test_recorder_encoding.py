@@ -1,0 +1,129 @@
+"""What goes into a recording comes out of it, whatever it is."""
+
+from __future__ import annotations
+
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.engine import MAX_DATAGRAM
+from router.recording.channels import MOST, Channels, varint
+from router.recording.mirror import Seen
+from tests.recording.recorder_rig import (
+    MILLISECOND,
+    SENSOR_BOARD,
+    START,
+    STRANGER,
+    again,
+    encoder,
+    imu,
+    read,
+    recorded,
+    seen,
+    taken,
+    wire,
+    write,
+)
+
+PEERS = st.sampled_from([SENSOR_BOARD, STRANGER, ("0.0.0.0", 0), ("255.255.255.255", 65535)])
+
+
+@st.composite
+def datagrams(draw: st.DrawFn) -> bytes:
+    """What boards send, what is left of it, and what nobody sends."""
+    kind = draw(st.sampled_from(["bytes", "payload", "cut", "changed", "padded", "long length"]))
+    if kind == "bytes":
+        return draw(st.binary(max_size=300))
+    case = draw(st.sampled_from(list(wire().envelope.cases.values())))
+    if kind == "long length":
+        return bytes([case.number << 3 & 0x7F | 2, 0x80, 0]) if case.number < 16 else b"\x82\x01\x80\x00"
+    exact = wire().encode(case, case.message_class())
+    if kind == "payload":
+        return exact
+    whole = draw(st.sampled_from([exact, imu(draw(st.floats(width=32, allow_nan=False)))]))
+    if kind == "cut":
+        return whole[: draw(st.integers(0, len(whole)))]
+    if kind == "padded":
+        return whole + bytes(draw(st.integers(1, 40)))
+    position = draw(st.integers(0, len(whole) - 1))
+    return whole[:position] + bytes([draw(st.integers(0, 255))]) + whole[position + 1 :]
+
+
+@given(st.lists(st.lists(st.builds(lambda data, peer: (data, peer), datagrams(), PEERS), min_size=1), min_size=1))
+def test_every_datagram_is_read_as_it_was_seen(batches: list[list[tuple[bytes, tuple[str, int]]]]) -> None:
+    at = iter(range(START, START + 10**12, MILLISECOND))
+    shown = [[Seen(next(at), "rover", peer, data) for data, peer in batch] for batch in batches]
+    with tempfile.TemporaryDirectory() as folder:
+        found = read(recorded(Path(folder) / "it.mcap", *shown))
+    assert [again(each) for each in found] == [each for batch in shown for each in batch]
+    assert all(each.steady == each.at for each in found)
+    assert {each.endpoint for each in found if each.peer == SENSOR_BOARD} <= {"sensor_board"}
+    assert {each.endpoint for each in found if each.peer == STRANGER} <= {""}
+
+
+@pytest.mark.parametrize("size", [0, 1, 100, 127, 128, 129, 16383, MAX_DATAGRAM - 8, MAX_DATAGRAM, MAX_DATAGRAM + 1])
+def test_datagrams_of_all_lengths_come_back(size: int, tmp_path: Path) -> None:
+    case = wire().case("imu_info")
+    payload = case.message_class.FromString(varint(2047 << 3 | 2) + varint(size) + bytes(size))
+    exact = wire().encode(case, payload)
+    assert [each.data for each in read(recorded(tmp_path / "it.mcap", seen(exact)))] == [exact]
+
+
+def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: Path) -> None:
+    """Of a listener that repairs nothing; zeros at the end are repaired by the other."""
+    padded = imu() + bytes(5)
+    batch = [Seen(START, "rover", SENSOR_BOARD, padded), Seen(START, "exact", SENSOR_BOARD, padded)]
+    channels = Channels()
+    made = encoder(channels)
+    made.add(batch, START, 0)
+    chunk = taken(made)
+    by_topic = {channels.channels[number].topic: count for number, count in chunk.messages.items()}
+    assert by_topic == {"raw/datagrams": 2, "imu_info": 1}
+
+
+def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
+    channels = Channels()
+    made = encoder(channels)
+    many = [Seen(START + n, "rover", (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1), imu()) for n in range(MOST + 10)]
+    made.add(many, START, 0)
+    assert taken(made).datagrams == len(many)
+    assert len(channels.channels) == MOST + 2  # the raw datagrams, and their payloads to look at
+
+
+def test_known_senders_keep_their_channels_over_a_reload_when_there_are_too_many() -> None:
+    channels = Channels()
+    case = wire().case("imu_info")
+    numbers = [channels.payload(case, "rover", ("10.0.0.3", port), "sensor_board") for port in range(MOST + 1)]
+    assert numbers[-1] is None
+    assert channels.payload(case, "rover", ("10.0.0.3", 7), "sensor_board") == numbers[7]
+    assert channels.payload(case, "rover", ("10.0.0.3", 7), "renamed") is None
+
+
+def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tmp_path: Path) -> None:
+    """A rover without a battery for its clock: GPS comes up, then somebody sets it back."""
+    channels = Channels()
+    made = encoder(channels)
+    walls = [0, START, START + 20 * MILLISECOND, START // 2, START // 2]
+    for number, wall in enumerate(walls):
+        made.add(seen(imu(), at=wall), wall, number * 20 * MILLISECOND)
+    found = read(write(tmp_path / "it.mcap", channels, taken(made)))
+    assert [each.at for each in found] == walls
+    assert [each.steady for each in found] == [number * 20 * MILLISECOND for number in range(5)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**18), st.integers(0, 10**10)), min_size=2, max_size=20))
+def test_steady_times_never_go_back_and_never_run_ahead(clocks: list[tuple[int, int]]) -> None:
+    channels = Channels()
+    made = encoder(channels)
+    now = 0
+    for wall, passed in clocks:
+        now += passed
+        made.add(seen(imu(), at=wall), wall, now)
+    with tempfile.TemporaryDirectory() as folder:
+        found = read(write(Path(folder) / "it.mcap", channels, taken(made)))
+    assert all(first.steady <= second.steady for first, second in pairwise(found))
+    assert found[-1].steady - found[0].steady <= now - clocks[0][1] + 2 * MILLISECOND

@@ -1,0 +1,72 @@
+"""What is in a datagram, beside routing: the same as in routing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from router.compiler import check_table
+from router.engine import MAX_DATAGRAM
+from router.recording.mirrored import Known, first_field
+from router.types.protobuf import PayloadCase
+from tests.observe.fake_running import sim_program
+from tests.tables import ROUTES
+
+PROGRAM = sim_program()
+KNOWN = Known(PROGRAM.envelope, PROGRAM.table)
+BRAKE = PROGRAM.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
+
+
+def case_in(data: bytes, known: Known = KNOWN, listener: str = "rover") -> str | None:
+    found = known.payload(listener, data)
+    return found[0].name if found is not None else None
+
+
+@pytest.mark.parametrize("case", PROGRAM.envelope.cases.values(), ids=lambda case: case.name)
+def test_the_first_field_of_a_datagram_is_its_case(case: PayloadCase) -> None:
+    data = PROGRAM.envelope.message_class(**{case.name: {}}).SerializeToString()
+    assert first_field(data) == case.number
+    assert KNOWN.payload("rover", data) == (case, case.message_class())
+
+
+@pytest.mark.parametrize("data", [b"", b"\x80", b"\xff\xff\xff"])
+def test_what_begins_with_no_short_tag_has_no_first_field_and_no_payload(data: bytes) -> None:
+    assert first_field(data) == 0
+    assert case_in(data) is None
+
+
+def test_what_is_longer_than_the_router_takes_has_no_payload() -> None:
+    whole = BRAKE * (MAX_DATAGRAM // len(BRAKE))
+    assert case_in(whole) == "manual_brake"
+    assert case_in(whole + bytes(MAX_DATAGRAM + 1 - len(whole))) is None
+
+
+def test_zeros_are_repaired_where_the_listener_does_that(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text(f"version: 1\nextends: {ROUTES}/sim.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
+    program = check_table(table).program
+    assert program is not None
+    exact = Known(program.envelope, program.table)
+    padded = BRAKE + bytes(5)
+    assert [case_in(padded), case_in(padded, exact), case_in(BRAKE, exact)] == ["manual_brake", None, "manual_brake"]
+    assert case_in(padded, listener="another") is None
+
+
+def test_senders_are_called_what_the_table_calls_them() -> None:
+    peers = [("127.0.0.30", 25008), ("127.0.0.10", 1), ("10.9.9.9", 1)]
+    assert [KNOWN.sender("rover", peer) for peer in peers] == ["sensor_board", "basestation", ""]
+
+
+def test_a_sender_is_called_what_the_listener_takes_it_for(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text(
+        f"version: 1\nextends: {ROUTES}/sim.yaml\n"
+        "listen: {radio: {address: 127.0.0.6:25000, interface: lo}}\n"
+        "endpoints: {basestation: {listener: radio}}\n"
+    )
+    program = check_table(table).program
+    assert program is not None
+    known, station = Known(program.envelope, program.table), ("127.0.0.10", 29000)
+    assert [known.sender(listener, station) for listener in ("rover", "radio", "gone")] == ["", "basestation", ""]
+    assert known.sender("rover", ("127.0.0.30", 25008)) == "sensor_board"

@@ -1,0 +1,672 @@
+"""The language of table tests: what is given, what is expected, and what is said when a table does something else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from textwrap import dedent, indent
+
+import pytest
+
+from router.compiler.definitions import Definitions
+from router.errors import Code, Diagnostic, TableError
+from router.rehearsal.comparing import Failure
+from router.rehearsal.coverage import Coverage
+from router.rehearsal.model import TableTestFile
+from router.rehearsal.reading import read_test_file
+from router.rehearsal.shown import offset
+from router.rehearsal.tests import find_test_files, prove
+from tests.engine.rig import HEAD, HEAD_OF_LISTENERS
+from tests.tables import PROTOS
+
+DEFINITIONS = Definitions()
+IMU = """
+imu_info:
+  source: sensor_board
+  destinations: [basestation, {endpoint: recorder, when: accel_x > 1}]
+  topics:
+    - {topic: imu_data, type: comms/msg/ImuSensorInformation, fields: auto}
+    - topic: imu/data_raw
+      type: sensor_msgs/msg/Imu
+      fields:
+        header: {stamp: received_at, frame_id: "'imu_link'"}
+        angular_velocity: {x: radians(gyro_x), y: 1 / accel_y}
+"""
+DRIVE = """
+drive_motor:
+  source: ros
+  topics: [{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}]
+  fields: auto
+  destinations: [driving_board]
+  ttl: 200ms
+  deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], repeat: 100ms}
+"""
+FRAMES = """
+detected_object:
+  source: basestation
+  collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
+  topics: [{topic: seen, type: comms/msg/DetectedObjectArray, fields: {frame_id: frame_id, detections: items}}]
+"""
+
+
+def written(folder: Path, routes: str, tests: str, head: str = HEAD) -> TableTestFile:
+    """`tests` are those of a test file, beside a table with these routes."""
+    table = head.replace("PROTOS", str(PROTOS)) + indent(dedent(routes), "  ")
+    (folder / "table.yaml").write_text(table)
+    path = folder / "table.test.yaml"
+    path.write_text("tests:\n" + indent(dedent(tests), "  "))
+    return read_test_file(path, DEFINITIONS)
+
+
+def failures(folder: Path, routes: str, tests: str, head: str = HEAD) -> list[Failure]:
+    results = prove(written(folder, routes, tests, head))
+    assert not any(result.findings for result in results)
+    return [failure for result in results for failure in result.failures]
+
+
+def messages(folder: Path, routes: str, tests: str, head: str = HEAD) -> list[str]:
+    return [failure.message for failure in failures(folder, routes, tests, head)]
+
+
+def findings(folder: Path, routes: str, tests: str) -> list[Diagnostic]:
+    with pytest.raises(TableError) as caught:
+        written(folder, routes, tests)
+    return list(caught.value.diagnostics)
+
+
+def given(fields: str, rest: str = "") -> str:
+    return f"{{case: imu_info, from: sensor_board, listener: trimmed, fields: {fields}{rest}}}"
+
+
+RAW = "{header: {stamp: 0 ms, frame_id: 'imu_link'}, angular_velocity: {y: 1.0}}"
+QUIET = "{imu_data: any, imu/data_raw: any}"
+
+
+# what passes
+
+
+def test_everything_that_happens_is_expected(tmp_path: Path) -> None:
+    assert not failures(
+        tmp_path,
+        IMU,
+        f"""
+        raw:
+          given: {given("{accel_x: 1.5, accel_y: 0.5, gyro_x: 90}")}
+          expect:
+            route: imu_info
+            sent: [basestation, recorder]
+            published:
+              imu_data: unchanged
+              imu/data_raw:
+                header: {{stamp: received_at, frame_id: imu_link}}
+                angular_velocity: {{x: ~1.571, y: 2}}
+        withheld:
+          given: {given("{accel_x: 0.5, accel_y: 1}")}
+          expect: {{sent: basestation, filtered: recorder, published: {QUIET}}}
+        """,
+    )
+
+
+@pytest.mark.parametrize("written", ["~1.571", "~1.6", "1.57 +- 0.01", "1.5 ± 0.1", "~157.1e-2", "1.5707963267948966"])
+def test_numbers_may_be_rounded_or_have_a_tolerance(tmp_path: Path, written: str) -> None:
+    raw = f"{{header: any, angular_velocity: {{x: {written}, y: 1}}}}"
+    tests = f"""
+        a:
+          given: {given("{accel_y: 1, gyro_x: 90}")}
+          expect: {{sent: basestation, published: {{imu_data: any, imu/data_raw: {raw}}}}}
+        """
+    assert not failures(tmp_path, IMU, tests)
+
+
+@pytest.mark.parametrize("written", ["~1.572", "~1.5", "1.58 +- 0.001", "1.57", "nan"])
+def test_a_number_outside_its_tolerance_fails(tmp_path: Path, written: str) -> None:
+    raw = f"{{header: any, angular_velocity: {{x: {written}, y: 1}}}}"
+    tests = f"""
+        a:
+          given: {given("{accel_y: 1, gyro_x: 90}")}
+          expect: {{sent: basestation, published: {{imu_data: any, imu/data_raw: {raw}}}}}
+        """
+    assert messages(tmp_path, IMU, tests) == [
+        f"imu/data_raw: angular_velocity.x is 1.5707963267948966, not {written}",
+    ]
+
+
+@pytest.mark.parametrize(("expected", "differs"), [("nan", False), ("1.5", True), ("inf", True)])
+def test_nan_is_expected_as_what_it_is(tmp_path: Path, expected: str, differs: bool) -> None:
+    routes = """
+imu_info:
+  source: sensor_board
+  topics: [{topic: field, type: sensor_msgs/msg/FluidPressure, fields: {fluid_pressure: accel_x, variance: nan}}]
+"""
+    tests = f"""
+        a:
+          given: {given("{accel_x: nan}")}
+          expect: {{published: {{field: {{fluid_pressure: nan, variance: {expected}}}}}}}
+        """
+    wrong = [f"field: variance is nan, not {expected}"]
+    assert messages(tmp_path, routes, tests) == (wrong if differs else [])
+
+
+def test_float32_is_the_nearest_to_what_is_written(tmp_path: Path) -> None:
+    tests = f"""
+        a:
+          given: {given("{accel_x: 0.1, accel_y: 1}")}
+          expect: {{sent: {{basestation: {{imu_info: {{accel_x: 0.1, accel_y: 1}}}}}}, published: {QUIET}}}
+        """
+    assert not failures(tmp_path, IMU, tests)
+
+
+def test_bytes_are_given_and_expected_as_hex(tmp_path: Path) -> None:
+    tests = """
+        a:
+          given: {hex: "6a 05 0d 00 00 c0 3f", from: sensor_board, listener: exact}
+          expect:
+            sent: {basestation: {hex: "6a050d0000c03f"}, recorder: {imu_info: {accel_x: 1.5}}}
+            published: {imu_data: any}
+            dropped: {imu/data_raw: mapping_error}
+        """
+    assert not failures(tmp_path, IMU, tests)
+
+
+def test_a_datagram_arrives_where_its_sender_is_believed_unless_said(tmp_path: Path) -> None:
+    drive = "\nmanual_drive: {source: basestation, destinations: [driving_board], deadman: not part of this test}\n"
+    tests = """
+        believed:
+          given: {case: manual_drive, from: basestation}
+          expect: {sent: driving_board}
+        forged:
+          given: {case: manual_drive, from: basestation, listener: trimmed}
+          expect: {rejected: source_mismatch}
+        """
+    assert not failures(tmp_path, drive, tests, HEAD_OF_LISTENERS)
+
+
+def test_old_boards_trim_and_pad(tmp_path: Path) -> None:
+    tests = f"""
+        trimmed:
+          given: {given("{accel_x: 2, accel_y: 1}", ", trim: true")}
+          expect: {{sent: [basestation, recorder], published: {QUIET}}}
+        padded:
+          given: {given("{accel_x: 2, accel_y: 1}", ", pad: 64")}
+          expect: {{sent: [basestation, recorder], published: {QUIET}}}
+        """
+    assert not failures(tmp_path, IMU, tests)
+
+
+def test_ros_message_is_given_and_its_age_counts(tmp_path: Path) -> None:
+    tests = """
+        fresh:
+          given: {topic: drive_motor, message: {distance_to_go: 2.5}, age: 150ms}
+          expect: {sent: {driving_board: {drive_motor: unchanged}}}
+        old:
+          given: {topic: drive_motor, message: {distance_to_go: 2.5}, age: 201ms}
+          expect: {dropped: {driving_board: stale}}
+        unreadable:
+          given: {topic: drive_motor, hex: "00 01 00 00"}
+          expect: {dropped: {driving_board: mapping_error}}
+        """
+    assert not failures(tmp_path, DRIVE, tests)
+
+
+def test_steps_have_their_time(tmp_path: Path) -> None:
+    tests = """
+        deadman:
+          steps:
+            - given: {topic: drive_motor}
+              expect: any
+            - at: 499ms
+              expect: nothing
+            - at: 500ms
+              expect: {sent: {driving_board: {manual_brake: {brake: true}}}}
+            - until: 1s
+              expect: {sent: {driving_board: {manual_brake: {brake: true}, times: 5}}}
+            - stop: true
+              expect: {sent: {driving_board: {manual_brake: {brake: true}}}}
+        """
+    assert not failures(tmp_path, DRIVE, tests)
+
+
+def test_every_test_begins_with_a_router_that_has_just_started(tmp_path: Path) -> None:
+    tests = """
+        armed:
+          given: {topic: drive_motor}
+          expect: {sent: {driving_board: {drive_motor: {}}}}
+        not armed:
+          until: 10s
+          expect: nothing
+        """
+    assert not failures(tmp_path, DRIVE, tests)
+
+
+def test_rates_are_tested_with_what_is_given_many_times(tmp_path: Path) -> None:
+    routes = "imu_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 10 Hz}]}"
+    tests = f"""
+        a:
+          given: {given("{accel_x: 1}", ", times: 100, every: 10ms")}
+          expect:
+            sent: {{basestation: {{times: 11}}}}   # the first one is before the grid of the rate
+            dropped: {{basestation: {{rate_limited: 89}}}}
+        """
+    assert not failures(tmp_path, routes, tests)
+
+
+def test_frames_are_complete_or_dropped_in_time(tmp_path: Path) -> None:
+    part = "{case: detected_object, from: basestation, listener: trimmed, fields: {frame_id: 7, total_count: 2, "
+    tests = f"""
+        whole:
+          steps:
+            - given: {part}index: 1, id: 20}}}}
+              expect: nothing
+            - at: 900ms
+              given: {part}id: 10}}}}
+              expect:
+                published:
+                  seen:
+                    frame_id: 7
+                    detections:
+                      - {{frame_id: 7, total_count: 2, id: 10}}
+                      - {{frame_id: 7, total_count: 2, id: 20, index: 1}}
+        too late:
+          steps:
+            - given: {part}index: 1}}}}
+              expect: nothing
+            - at: 1s
+              expect: {{dropped: {{seen: incomplete}}}}
+        """
+    assert not failures(tmp_path, FRAMES, tests)
+
+
+def test_variables_of_the_table_come_from_the_test_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RATE", "1 Hz")
+    routes = 'imu_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: "${RATE:-100 Hz}"}]}'
+    tests = f"""
+        a:
+          given: {given("{}", ", times: 3, every: 10ms")}
+          expect: {{sent: {{basestation: {{times: 3}}}}}}
+        """
+    assert not failures(tmp_path, routes, tests)
+
+
+PROTO = """
+syntax = "proto3";
+import "google/protobuf/timestamp.proto";
+enum Mode { MODE_OFF = 0; MODE_ON = 1; MODE_HALF = -2; }
+message Point { int32 x = 1; int32 y = 2; }
+message EveryKind {
+  enum State { IDLE = 0; BUSY = 1; }
+  bool flag = 1;
+  sint64 number = 2;
+  float single = 3;
+  double real = 4;
+  string text = 5;
+  bytes blob = 6;
+  Mode mode = 7;
+  State state = 8;
+  Point point = 9;
+  repeated float numbers = 10;
+  repeated Point points = 11;
+  repeated Mode modes = 12;
+  optional int32 maybe = 13;
+  map<string, int32> counts = 14;
+  map<int32, Point> places = 15;
+  oneof either { int32 left = 16; string right = 17; }
+  google.protobuf.Timestamp time = 18;
+}
+message PBEnvelope { oneof payload { EveryKind every_kind = 1; } }
+"""
+EVERY_KIND = """{
+    flag: true, number: -3, single: 0.1, real: 0.1, text: "any", blob: "0a ff", mode: MODE_HALF, state: State.BUSY,
+    point: {x: 1}, point.y: 2, numbers: [1, 2.5, nan], points: [{}, {y: 3}], modes: [MODE_ON, 0], maybe: 0,
+    counts: [{key: a, value: 1}, {key: b, value: 2}], places: [{key: 5, value: {x: 6}}], right: "", time: 250ms}"""
+
+
+def every_kind(folder: Path, expected: str) -> list[str]:
+    (folder / "kinds.proto").write_text(PROTO)
+    head = HEAD.replace("PROTOS", str(folder))
+    tests = f"""
+        a:
+          given: {{case: every_kind, from: left_tool, listener: exact, fields: {" ".join(EVERY_KIND.split())}}}
+          expect: {{sent: {{right_tool: {{every_kind: {" ".join(expected.split())}}}}}}}
+        """
+    return messages(folder, "every_kind: {source: left_tool, destinations: [right_tool]}", tests, head)
+
+
+def test_every_kind_of_field_can_be_given_and_expected(tmp_path: Path) -> None:
+    assert every_kind(tmp_path, EVERY_KIND) == []
+    assert every_kind(tmp_path, "unchanged") == []
+
+
+def test_every_kind_of_field_is_told_where_it_is_not_expected(tmp_path: Path) -> None:
+    assert [
+        said.removeprefix("right_tool: ").replace(", not at its default", "") for said in every_kind(tmp_path, "{}")
+    ] == [
+        "flag is true",
+        "number is -3",
+        "single is 0.1",
+        "real is 0.1",
+        "text is 'any'",
+        "blob is 0aff",
+        "mode is MODE_HALF",
+        "state is BUSY",
+        "point is {x: 1, y: 2}",
+        "numbers is [1, 2.5, nan]",
+        "points is [{}, {y: 3}]",
+        "modes is [MODE_ON, MODE_OFF]",
+        "maybe is 0",
+        "counts is [{key: 'a', value: 1}, {key: 'b', value: 2}]",
+        "places is [{key: 5, value: {x: 6}}]",
+        "right is ''",
+        "time is 250 ms",
+    ]
+
+
+# what fails
+
+
+def test_failure_has_its_place_in_test_and_table(tmp_path: Path) -> None:
+    raw = "{header: any, angular_velocity: {x: 2, y: 1}}"
+    tests = f"""
+        a:
+          given: {given("{accel_y: 1, gyro_x: 90}")}
+          expect: {{sent: basestation, published: {{imu_data: any, imu/data_raw: {raw}}}}}
+        """
+    (failure,) = failures(tmp_path, IMU, tests)
+    assert failure.table is not None
+    for span, shown in ((failure.span, "2"), (failure.table.span, "radians(gyro_x)")):
+        line = Path(span.file).read_text().splitlines()[span.line - 1]
+        assert line[span.column - 1 : span.end_column - 1] == shown
+    assert failure.table.note == "what fills angular_velocity.x"
+
+
+@pytest.mark.parametrize(
+    ("expect", "said"),
+    [
+        (f"{{published: {QUIET}}}", "imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation; it is not expected"),
+        (f"{{sent: [basestation, recorder], published: {QUIET}}}", "nothing for recorder: it was withheld"),
+        (f"{{sent: basestation, filtered: [basestation], published: {QUIET}}}",
+         "withheld from: recorder, not basestation"),
+        (f"{{sent: {{basestation: {{ph_info: {{}}}}}}, published: {QUIET}}}",
+         "imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation, not ph_info"),
+        (f"{{sent: {{basestation: {{times: 2}}}}, published: {QUIET}}}",
+         "1 for basestation, not 2: imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation"),
+        (f"{{sent: {{basestation: {{hex: '00'}}}}, published: {QUIET}}}",
+         "basestation gets the bytes 6a 0a 0d 00 00 00 3f 15 00 00 80 3f, not 00"),
+        (f"{{rejected: malformed, sent: basestation, published: {QUIET}}}", "rejected: nothing, not malformed"),
+        (f"{{dropped: {{imu_data: stale}}, sent: basestation, published: {QUIET}}}",
+         "dropped for imu_data: nothing, not stale"),
+        ("{sent: basestation, published: {imu_data: {accel_x: 0.5}, imu/data_raw: any}}",
+         "imu_data: accel_y is 1, not at its default"),
+        ("{sent: basestation, published: {imu_data: unchanged}}",
+         f"{RAW} is published on imu/data_raw; it is not expected"),
+        (f"{{sent: basestation, published: {{imu_data: unchanged, imu/data_raw: {RAW.replace('0 ms', '5ms')}}}}}",
+         "imu/data_raw: header.stamp is 0 ms, not 5 ms"),
+    ],
+)  # fmt: skip
+def test_what_differs_is_said(tmp_path: Path, expect: str, said: str) -> None:
+    tests = f"a:\n  given: {given('{accel_x: 0.5, accel_y: 1}')}\n  expect: {expect}\n"
+    assert messages(tmp_path, IMU, tests) == [said]
+
+
+def test_what_is_missing_is_explained_by_its_drop(tmp_path: Path) -> None:
+    tests = f"""
+        a:
+          given: {given("{}")}
+          expect: {{sent: basestation, published: {QUIET}}}
+        """
+    assert messages(tmp_path, IMU, tests) == [
+        "nothing for imu/data_raw: it was dropped as mapping_error (float division by zero)",
+    ]
+
+
+def test_rejection_is_told_once_and_not_as_everything_that_is_missing(tmp_path: Path) -> None:
+    tests = """
+        a:
+          given: {case: imu_info, from: "10.9.8.7:6", listener: trimmed}
+          expect: {sent: basestation}
+        """
+    assert messages(tmp_path, IMU, tests) == ["rejected: source_mismatch, not nothing (from 10.9.8.7:6: imu_info)"]
+
+
+def test_what_is_expected_beside_a_rejection_is_looked_at(tmp_path: Path) -> None:
+    tests = """
+        a:
+          given: {case: imu_info, from: "10.9.8.7:6", listener: trimmed}
+          expect: {rejected: source_mismatch, sent: basestation}
+        """
+    assert messages(tmp_path, IMU, tests) == ["nothing for basestation"]
+
+
+def test_a_target_that_another_route_has_is_shown_as_missing_in_the_route_that_took_the_message(tmp_path: Path) -> None:
+    routes = """
+        ph_info: {source: sensor_board, destinations: [recorder]}
+        imu_info: {source: sensor_board, destinations: [basestation]}
+        """
+    (failure,) = failures(tmp_path, routes, f"a: {{given: {given('{}')}, expect: {{sent: [basestation, recorder]}}}}\n")
+    assert failure.message == "nothing for recorder"
+    assert failure.table is not None
+    assert failure.table.note == "the route that took it has no such target"
+    line = Path(failure.table.span.file).read_text().splitlines()[failure.table.span.line - 1]
+    assert line.lstrip().startswith("imu_info:")
+
+
+def test_a_drop_that_is_not_listed_fails_though_the_target_got_others(tmp_path: Path) -> None:
+    routes = "imu_info: {source: sensor_board, destinations: [{endpoint: basestation, max_rate: 10}]}\n"
+    tests = f"a: {{given: {given('{}', ', times: 2')}, expect: {{sent: basestation}}}}\n"
+    assert messages(tmp_path, routes, tests) == ["dropped for basestation: rate_limited, not nothing"]
+
+
+@pytest.mark.parametrize("expect", ["nothing", "any"])
+def test_what_happens_between_two_steps_fails(tmp_path: Path, expect: str) -> None:
+    tests = f"""
+        a:
+          steps:
+            - given: {{topic: drive_motor}}
+              expect: any
+            - at: 650ms
+              expect: {expect}
+        """
+    (failure,) = failures(tmp_path, DRIVE, tests)
+    assert failure.message == (
+        "before this step, at 500 ms manual_brake {brake: true} is sent to driving_board by the deadman of "
+        "drive_motor, and so on, 2 in all; no step expects it"
+    )
+    assert failure.table is not None
+    assert failure.table.note == "sent by this deadman"
+
+
+# what is no test
+
+
+@pytest.mark.parametrize(
+    ("test", "code", "said"),
+    [
+        (
+            "{given: {case: imu, from: sensor_board, listener: exact}, expect: nothing}",
+            Code.UNKNOWN_PAYLOAD_CASE,
+            "payload case 'imu'",
+        ),
+        ("{given: {case: imu_info, from: sensor}, expect: nothing}", Code.UNKNOWN_ENDPOINT, "'sensor'"),
+        ("{given: {case: imu_info, from: sensor_board}, expect: nothing}", Code.MISSING_KEY, "say which listener"),
+        ("{given: {case: imu_info, from: sensor_board, listener: x}, expect: nothing}", Code.BAD_VALUE, "listener 'x'"),
+        ("{given: {topic: imu_data}, expect: nothing}", Code.BAD_VALUE, "no route from the topic 'imu_data'"),
+        (f"{{given: {given('{accel: 1}')}, expect: nothing}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
+        (f"{{given: {given('{accel_x: 1e39}')}, expect: nothing}}", Code.BAD_VALUE, "does not fit float32"),
+        (f"{{given: {given('{accel_x: any}')}, expect: nothing}}", Code.BAD_VALUE, "'any' is not a number"),
+        ("{expect: {sent: nobody}}", Code.UNKNOWN_ENDPOINT, "no endpoint 'nobody'"),
+        ("{expect: {sent: driving_board}}", Code.UNKNOWN_ENDPOINT, "no route to the endpoint 'driving_board'"),
+        ("{expect: {sent: basestation}}", Code.BAD_VALUE, "no datagram was given in this step"),
+        ("{expect: {published: {imu: {}}}}", Code.BAD_VALUE, "no route that publishes on 'imu'"),
+        ("{expect: {published: {imu_data: {accel: 1}}}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
+        ("{expect: {published: {imu_data: unchanged}}}", Code.BAD_VALUE, "no fields were given"),
+        ("{expect: {dropped: {basestation: lost}}}", Code.BAD_VALUE, "no reason 'lost'"),
+        ("{expect: {dropped: {nobody: stale}}}", Code.BAD_VALUE, "no route to 'nobody'"),
+        ("{expect: {route: imu}}", Code.BAD_VALUE, "no route 'imu'"),
+        ("{expect: {rejected: no}}", Code.AMBIGUOUS_SCALAR, "truth value"),
+        ("{expect: {rejected: lost}}", Code.BAD_VALUE, "'rejected' must be one of truncated, empty"),
+        ("{expect: {filtered: nobody}}", Code.BAD_VALUE, "no route to 'nobody'"),
+        ("{expects: nothing}", Code.UNKNOWN_KEY, "no key 'expects'"),
+        ("{given: {hex: '00', from: sensor_board, listener: exact}}", Code.MISSING_KEY, "nothing of what is expected"),
+        ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1 s, before the 2 s"),
+        ("{steps: [{expect: nothing}], expect: nothing}", Code.UNKNOWN_KEY, "'expect' stands beside 'steps'"),
+        (
+            f"{{steps: [{{given: {given('{}', ', times: 3, every: 1s')}, until: 1999 ms, expect: any}}]}}",
+            Code.BAD_VALUE,
+            "1.999 s, before the 2 s",
+        ),
+        ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, before the 1 s"),
+        ("{steps: [{stop: true, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "router is stopped"),
+        (f"{{given: {given('{}')}, expect: {{sent: [basestation, basestation]}}}}", Code.BAD_VALUE, "named twice"),
+        ("{expect: {published: {imu_data: {accel_x: 1 +- inf}}}}", Code.BAD_VALUE, "'inf' is no tolerance"),
+        ("{expect: {published: {imu_data: {accel_x: 1 +- -1}}}}", Code.BAD_VALUE, "'-1' is no tolerance"),
+        ("{expect: {published: {imu_data: {accel_x: nan +- 1}}}}", Code.BAD_VALUE, "'nan' is no number to be near"),
+        ("{expect: {published: {imu_data: {accel_x: ~1e400}}}}", Code.BAD_VALUE, "'1e400' is no number to be near"),
+        ("{expect: sent}", Code.BAD_VALUE, "'expect' must be 'nothing', 'any', or a mapping"),
+    ],
+)
+def test_what_is_wrong_with_a_test_is_a_finding_with_its_place(
+    tmp_path: Path, test: str, code: Code, said: str
+) -> None:
+    (found,) = findings(tmp_path, IMU, f"a: {test}\n")
+    assert found.code is code
+    assert said in found.message
+    assert found.span.file.endswith("table.test.yaml")
+    assert found.span.line == 2
+
+
+def test_padding_that_is_too_small_is_found_when_the_test_runs(tmp_path: Path) -> None:
+    file = written(tmp_path, IMU, f"a: {{given: {given('{accel_x: 1}', ', pad: 2')}, expect: nothing}}\n")
+    (result,) = prove(file)
+    assert not result.passed
+    assert [finding.code for finding in result.findings] == [Code.BAD_VALUE]
+
+
+def test_every_finding_of_a_file_is_told_at_once(tmp_path: Path) -> None:
+    tests = "a: {expect: {sent: nobody}}\nb: {expect: {route: nothing_like_it}}\n"
+    assert len(findings(tmp_path, IMU, tests)) == 2
+
+
+def test_table_is_the_one_that_the_file_is_named_after_or_that_it_names(tmp_path: Path) -> None:
+    written(tmp_path, IMU, "a: {expect: nothing}\n")
+    other = tmp_path / "other.test.yaml"
+    other.write_text("tests: {a: {expect: nothing}}\n")
+    with pytest.raises(TableError, match="not named after a table"):
+        read_test_file(other, DEFINITIONS)
+    other.write_text("table: table.yaml\ntests: {a: {expect: nothing}}\n")
+    assert read_test_file(other, DEFINITIONS).checked.path == tmp_path / "table.yaml"
+
+
+def test_an_empty_file_is_told_what_a_test_file_is(tmp_path: Path) -> None:
+    path = tmp_path / "empty.test.yaml"
+    path.write_text("\n")
+    with pytest.raises(TableError, match="a test file is a mapping with the key 'tests'"):
+        read_test_file(path, DEFINITIONS)
+
+
+def test_table_with_errors_is_told_as_validate_does(tmp_path: Path) -> None:
+    with pytest.raises(TableError, match="unknown-field"):
+        written(tmp_path, IMU.replace("radians(gyro_x)", "gyro"), "a: {expect: nothing}\n")
+
+
+def test_folder_stands_for_its_test_files(tmp_path: Path) -> None:
+    for name in ("b.test.yaml", "a.test.yml", "a.yaml", ".c.test.yaml"):
+        (tmp_path / name).touch()
+    assert [path.name for path in find_test_files([tmp_path, tmp_path / "b.test.yaml"])] == [
+        "a.test.yml",
+        "b.test.yaml",
+    ]
+
+
+# coverage
+
+
+def gaps(folder: Path, routes: str, tests: str) -> list[tuple[str, str]]:
+    """Of what, and the line of the table with it."""
+    file = written(folder, routes, tests)
+    coverage = Coverage.of(file)
+    assert all(result.passed for result in prove(file, coverage=coverage))
+    lines = (folder / "table.yaml").read_text().splitlines()
+    found = []
+    for gap in coverage.gaps():
+        shown = lines[gap.span.line - 1][gap.span.column - 1 : gap.span.end_column - 1]
+        found.append((gap.kind, shown))
+    return found
+
+
+def test_nothing_is_covered_without_a_message(tmp_path: Path) -> None:
+    found = gaps(tmp_path, IMU, "a: {expect: nothing}\n")
+    assert found.count(("route", "imu_info")) == 1
+    assert [kind for kind, _ in found].count("target") == 4
+    expressions = {shown for kind, shown in found if kind == "expression"}
+    assert {"accel_x > 1", "radians(gyro_x)", "1 / accel_y", "received_at"} <= expressions
+
+
+def test_condition_has_to_hold_and_to_withhold(tmp_path: Path) -> None:
+    routes = "imu_info: {source: sensor_board, destinations: [{endpoint: basestation, when: accel_x > 1}]}"
+    holds = f"a: {{given: {given('{accel_x: 2}')}, expect: {{sent: basestation}}}}\n"
+    withholds = f"b: {{given: {given('{}')}, expect: nothing}}\n"
+    assert gaps(tmp_path, routes, holds) == [("expression", "accel_x > 1")]
+    assert gaps(tmp_path, routes, holds + withholds) == []
+
+
+def test_what_gave_nothing_but_zero_is_not_covered(tmp_path: Path) -> None:
+    tests = f"a: {{given: {given('{accel_y: 1}')}, expect: {{sent: basestation, published: PUBLISHED}}}}\n".replace(
+        "PUBLISHED", "{imu_data: unchanged, imu/data_raw: {header: any, angular_velocity: {y: 1}}}"
+    )
+    assert ("expression", "radians(gyro_x)") in gaps(tmp_path, IMU, tests)
+    assert ("expression", "1 / accel_y") not in gaps(tmp_path, IMU, tests)
+
+
+def test_what_nobody_compared_is_not_covered(tmp_path: Path) -> None:
+    tests = f"a: {{given: {given('{accel_y: 1, gyro_x: 1}')}, expect: {{sent: basestation, published: {QUIET}}}}}\n"
+    found = gaps(tmp_path, IMU, tests)
+    assert ("expression", "radians(gyro_x)") in found
+    assert [kind for kind, _ in found].count("target") == 3
+
+
+def test_each_branch_counts(tmp_path: Path) -> None:
+    routes = """
+        imu_info:
+          source: sensor_board
+          topics:
+            - topic: temperature
+              type: sensor_msgs/msg/Temperature
+              fields: {temperature: accel_x if accel_x > 0 else accel_y if accel_y > 0 else 7}
+        """
+    expect = "expect: {published: {temperature: {temperature: 2}}}"
+    tests = f"a: {{given: {given('{accel_x: 2}')}, {expect}}}\n"
+    assert gaps(tmp_path, routes, tests) == [("expression", "accel_y"), ("expression", "7")]
+    tests += f"b: {{given: {given('{accel_y: 2}')}, {expect}}}\n"
+    assert gaps(tmp_path, routes, tests) == [("expression", "7")]
+
+
+def test_deadman_is_a_target(tmp_path: Path) -> None:
+    moves = "{given: {topic: drive_motor, message: {distance_to_go: 1}}, expect: {sent: {driving_board: any}}}"
+    assert ("target", "deadman") in gaps(tmp_path, DRIVE, f"a: {moves}\n")
+    tests = f"""
+        a:
+          steps:
+            - {moves.replace("any", "{drive_motor: unchanged}")}
+            - {{at: 500ms, expect: {{sent: {{driving_board: {{manual_brake: {{brake: true}}}}}}}}}}
+        """
+    assert gaps(tmp_path, DRIVE, tests) == []
+
+
+def test_files_of_one_table_cover_it_together(tmp_path: Path) -> None:
+    routes = 'imu_info: {source: sensor_board, destinations: [{endpoint: basestation, when: "accel_x > ${LIMIT:-1}"}]}'
+    first = written(tmp_path, routes, f"a: {{given: {given('{accel_x: 2}')}, expect: {{sent: basestation}}}}\n")
+    path = tmp_path / "more.test.yaml"
+    nothing = f"b: {{given: {given('{accel_x: 2}')}, expect: nothing}}"
+    path.write_text(f"table: table.yaml\nvariables: {{LIMIT: 3}}\ntests:\n  {nothing}\n")
+    second = read_test_file(path, DEFINITIONS)
+    covered = [Coverage.of(file) for file in (first, second)]
+    for file, coverage in zip((first, second), covered, strict=True):
+        assert all(result.passed for result in prove(file, coverage=coverage))
+        assert not coverage.is_complete
+    covered[0].add(covered[1])
+    assert covered[0].is_complete
+
+
+@pytest.mark.parametrize(
+    ("ns", "text"), [(0, "0 ms"), (300_000_000, "300 ms"), (1_999_000_000, "1.999 s"), (-250_000_000, "-250 ms")]
+)
+def test_times_are_told_as_a_test_writes_them(ns: int, text: str) -> None:
+    assert offset(ns) == text

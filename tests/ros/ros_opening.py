@@ -1,0 +1,44 @@
+"""A ROS edge with topics of strings, for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from rclpy.serialization import serialize_message
+from std_msgs.msg import String
+
+from router.compiler.program import QosPlan, TopicPlan
+from router.errors import SourceSpan
+from router.ros.node_and_publishers import RosEdge
+from router.table.model import NodeSettings
+
+STRING = "std_msgs/msg/String"
+RELIABLE = QosPlan("reliable", "volatile", "keep_last", 10)
+SPAN = SourceSpan("routes/rover.yaml", 40, 16, 24)
+
+
+def cdr(text: str) -> bytes:
+    """A std_msgs/msg/String."""
+    return padded(serialize_message(String(data=text)))
+
+
+def padded(data: bytes) -> bytes:
+    """As DDS hands on what was published: to a multiple of four."""
+    return bytes(data) + bytes(-len(data) % 4)
+
+
+HELLO = cdr("hello, rover")
+
+
+def string_topic(qos: QosPlan = RELIABLE, topic: str = "greeting") -> TopicPlan:
+    return TopicPlan(topic, topic, STRING, qos, {STRING: (("data", "string"),)})
+
+
+def open_ros(
+    *plans: TopicPlan,
+    subscriptions: Sequence[TopicPlan] = (),
+    args: Sequence[str] = (),
+    incompatible: Callable[[str, str, int], None] = lambda *_: None,
+) -> RosEdge:
+    spans = {plan.topic: SPAN for plan in (*plans, *subscriptions)}
+    return RosEdge(NodeSettings("router_test", "/"), plans, subscriptions, spans, args, incompatible)

@@ -1,0 +1,173 @@
+"""What a node sees of topics, and taps on them, with the publishers in processes of their own."""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from router.clock import wall_ns
+from router.errors import StartError
+from router.ros.node_and_publishers import RosEdge
+from router.ros.topics import SeenPublisher, TopicTap
+from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, string_topic
+from tests.ros.ros_publisher import Publisher
+from tests.ros.ros_subscriber import wait_until
+
+INT32 = "std_msgs/msg/Int32"
+FIVE = bytes.fromhex("0001000005000000")
+
+Publish = Callable[..., Publisher]
+
+
+@pytest.fixture
+def publisher() -> Iterator[Publish]:
+    """Opens `Publisher("greeting", type, *options)`."""
+    with ExitStack() as peers:
+        yield lambda *arguments: peers.enter_context(closing(Publisher("greeting", *arguments)))
+
+
+@pytest.fixture
+def ros() -> Iterator[RosEdge]:
+    """Without topics of its own."""
+    with closing(open_ros()) as edge:
+        yield edge
+
+
+def tapped(ros: RosEdge, type_name: str = STRING, topic: str = "/greeting", **qos: Any) -> TopicTap:
+    qos = {"is_reliable": True, "keeps": False, "depth": 1} | qos
+    definition = {type_name: (("data", "string" if type_name == STRING else "int32"),)}
+    return ros.topics.tap(topic, ros.topics.load(type_name, definition), **qos)
+
+
+def test_publishers_are_seen_with_type_and_qos(ros: RosEdge, publisher: Publish) -> None:
+    publisher(STRING)
+    publisher(STRING, "--transient-local")
+    publisher(STRING, "--best-effort")
+    wait_until(lambda: len(ros.topics.publishers("/greeting")) == 3)
+    assert sorted(ros.topics.publishers("/greeting")) == [
+        SeenPublisher(STRING, is_reliable=False, keeps=False, is_ours=False),
+        SeenPublisher(STRING, is_reliable=True, keeps=False, is_ours=False),
+        SeenPublisher(STRING, is_reliable=True, keeps=True, is_ours=False),
+    ]
+    assert "/greeting" in ros.topics.names()
+
+
+def test_publishers_of_several_types_are_all_seen(ros: RosEdge, publisher: Publish) -> None:
+    publisher(STRING)
+    publisher(INT32)
+    wait_until(lambda: len(ros.topics.publishers("/greeting")) == 2)
+    assert {seen.type_name for seen in ros.topics.publishers("/greeting")} == {STRING, INT32}
+
+
+def test_our_own_publishers_are_known_as_ours() -> None:
+    with closing(open_ros(string_topic())) as ros:
+        wait_until(lambda: bool(ros.topics.publishers("/greeting")))
+        assert [seen.is_ours for seen in ros.topics.publishers("/greeting")] == [True]
+
+
+def test_a_publisher_that_leaves_is_not_seen_any_more(ros: RosEdge) -> None:
+    with closing(Publisher("greeting", STRING)):
+        wait_until(lambda: bool(ros.topics.publishers("/greeting")))
+    wait_until(lambda: not ros.topics.publishers("/greeting"))
+
+
+def test_nobody_publishes_on_an_unknown_topic(ros: RosEdge) -> None:
+    assert ros.topics.publishers("/nobody") == []
+
+
+@pytest.mark.parametrize("options", [(), ("--best-effort",)])
+def test_a_tap_counts_what_came_and_gives_the_newest(
+    ros: RosEdge, publisher: Publish, options: tuple[str, ...]
+) -> None:
+    with closing(tapped(ros, is_reliable=not options)) as tap:
+        peer = publisher(STRING, *options)
+        assert peer.line() == "matched"
+        assert tap.take() is None
+        assert tap.arrived() == 0
+        before = wall_ns()
+        peer.publish([cdr(str(number)) for number in range(20)])
+        came = 0
+
+        def all_came() -> bool:
+            nonlocal came
+            came += tap.arrived()
+            return came == 20
+
+        wait_until(all_came)
+        taken = tap.take()
+        assert taken
+        assert taken[0] == cdr("19")
+        assert before < taken[1] <= wall_ns()
+        assert tap.take() is None
+        assert tap.arrived() == 0
+
+
+def test_a_deep_tap_gives_each_in_order_and_is_readable_until_it_counted(ros: RosEdge, publisher: Publish) -> None:
+    texts = [cdr(str(number)) for number in range(50)]
+    with closing(tapped(ros, depth=100)) as tap:
+        peer = publisher(STRING)
+        assert peer.line() == "matched"
+        assert select.select([tap.fd], [], [], 0)[0] == []
+        peer.publish(texts)
+        peer.await_receipt()
+        assert select.select([tap.fd], [], [], 20)[0] == [tap.fd]
+        assert [cdr for cdr, _ in iter(tap.take, None)] == texts
+        assert tap.arrived() == 50
+        assert select.select([tap.fd], [], [], 0)[0] == []
+
+
+def test_what_was_kept_is_given_to_a_late_tap(ros: RosEdge, publisher: Publish) -> None:
+    publisher(STRING, "--transient-local").publish([HELLO])
+    with closing(tapped(ros, keeps=True)) as tap:
+        wait_until(lambda: tap.arrived() == 1)
+        taken = tap.take()
+        assert taken
+        assert taken[0] == HELLO
+
+
+def test_a_topic_can_be_tapped_with_another_type_once_the_first_tap_is_closed(ros: RosEdge, publisher: Publish) -> None:
+    with closing(tapped(ros)), pytest.raises(StartError, match="'/greeting' is std_msgs/msg/String in this router"):
+        tapped(ros, INT32)
+    with closing(tapped(ros, INT32)) as tap:
+        peer = publisher(INT32)
+        assert peer.line() == "matched"
+        peer.publish([FIVE])
+        wait_until(lambda: tap.arrived() == 1)
+        taken = tap.take()
+        assert taken
+        assert taken[0] == FIVE
+
+
+def test_a_closed_tap_leaves_nothing_open(ros: RosEdge) -> None:
+    tap = tapped(ros, topic="/nobody")
+    assert "/nobody" in ros.topics.names()
+    tap.close()
+    wait_until(lambda: "/nobody" not in ros.topics.names())
+    with closing(tapped(ros, topic="/nobody")) as again:
+        assert again.fd == tap.fd  # the kernel gives the lowest that is free
+
+
+@pytest.mark.parametrize(
+    ("type_name", "definition", "complaint"),
+    [
+        ("std_msgs/msg/NoSuch", {}, "std_msgs/msg/NoSuch is not installed"),
+        ("no_such_package/msg/NoSuch", {}, "no_such_package/msg/NoSuch is not installed"),
+        (STRING, {STRING: (("data", "int32"),)}, "String as installed is not what the table was compiled for"),
+    ],
+)
+def test_a_type_that_is_not_installed_like_that_is_refused(
+    ros: RosEdge, type_name: str, definition: dict[str, tuple[tuple[str, str], ...]], complaint: str
+) -> None:
+    with pytest.raises(StartError, match=complaint):
+        ros.topics.load(type_name, definition)
+
+
+def test_a_name_that_is_none_is_refused(ros: RosEdge) -> None:
+    with pytest.raises(StartError, match="topic '/2bad' cannot be subscribed to"):
+        tapped(ros, topic="/2bad")
