@@ -1,4 +1,4 @@
-"""Damaged datagrams by the million into an engine of the rover's table: no exception, books that balance, no growth.
+"""Damaged datagrams by the million into an engine of the rover's table: no exception, counters that balance, no growth.
 
     python -m benchmarks.fuzz_engine --count 10000000 --seed 1
 
@@ -119,7 +119,7 @@ def fuzz(count: int, seed: int) -> Outcome:
     program = check_table(ROUTES / "rover.yaml", {}).program
     if program is None:
         raise SystemExit(f"{ROUTES}/rover.yaml has errors; see `router validate`")
-    counts = program.books.fresh_counts()
+    counts = program.counters.fresh_counts()
     noise = random.Random(seed)
     receive = _receiver(program, counts, noise)
     seeds, everybody = _seeds(program)
@@ -174,7 +174,7 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
             raise PublishError
 
     outlets = plain_outlets(
-        program.books,
+        program.counters,
         {plan.endpoint: send for plan in program.senders},
         {plan.topic: publish for plan in program.publishers},
         _forget,

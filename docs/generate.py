@@ -11,7 +11,8 @@ from pathlib import Path
 from textwrap import fill
 
 from benchmarks.versus.report import page
-from router.compiler.books import (
+from router.compiler.functions import FUNCTIONS
+from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     DROP_REASONS,
     GATEWAY_DROP_REASONS,
@@ -23,7 +24,6 @@ from router.compiler.books import (
     RELOAD_RESULTS,
     TOPIC_STATES,
 )
-from router.compiler.functions import FUNCTIONS
 from router.errors import Code
 
 HERE = Path(__file__).parent
@@ -31,8 +31,8 @@ RESULTS = HERE.parent / "benchmarks" / "results.json"
 WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 _BOOKS = """\
-Every series exists at 0 from the start. The books balance. Per listener, received = rejected + accepted. Per route and
-target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames, the queue of a
+Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route
+and target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames, the queue of a
 budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element is a message. What a
 deadman sends is in its own metrics alone, and its bytes in none."""
 _GATEWAYS = """\
@@ -40,9 +40,9 @@ A [gateway](table.md#gateways) has its name as `listener` and as `route`. What i
 its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
 For what is not published of that, the reasons are those of routes. A deadman of a topic that is let in has gateway and
 topic for its route: `vr_headset:/cmd_vel`. Requests for schemas that are answered are datagrams received, and neither
-rejected nor accepted. [Gateways](gateway.md#metrics) has how these books balance."""
+rejected nor accepted. [Gateways](gateway.md#metrics) has how these counters balance."""
 _OWN = """\
-[Recordings](recording.md) and taps get datagrams beside routing: what they miss is counted here, and in no other books.
+[Recordings](recording.md) and taps get datagrams beside routing: what they miss is counted here only.
 A reload keeps all counters: the series of a route that is gone stays as long as the process, if it counted anything."""
 _LOG = """\
 The log writes the first drop of a kind (route, target, reason) at once, then at most a line in 10 s. That line shows
@@ -62,7 +62,7 @@ def functions_page() -> str:
 
 
 def metrics_page() -> str:
-    """Every metric with its labels, from the books."""
+    """Every metric with its labels, from the counters."""
     bounds = ", ".join(f"{bound / 1000:g}" for bound in HISTOGRAM_BOUNDS_NS)
     lines = ["# Metrics", "", _MADE, "| metric | type | labels | meaning |", "|---|---|---|---|"]
     for metric in METRICS:
@@ -97,7 +97,7 @@ def metrics_page() -> str:
         "",
         fill(_LOG, WIDTH),
         "",
-        fill(f"Upper bounds of `router_route_seconds`, in microseconds: {bounds}.", WIDTH),
+        fill(f"Upper bounds of `router_route_duration_seconds`, in microseconds: {bounds}.", WIDTH),
         "",
     ]
     return "\n".join(lines)

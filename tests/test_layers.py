@@ -1,61 +1,118 @@
-"""Imports go down the list of layers only, and the outside world is touched at the edges alone."""
+"""Which package may import which, and where the outside world is touched."""
 
 from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
-import pytest
-
 ROUTER = Path(__file__).parents[1] / "router"
-LAYERS = ("errors", "assets", "table", "types", "compiler", "engine", "edges", "gateway", "tools", "runtime", "cli")
-"""From the bottom up. `assets`, where our own files lie, knows nothing of the rest, as errors does."""
-MODULES = sorted(ROUTER.rglob("*.py"))
+MODULES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(ROUTER.rglob("*.py"))}
 
-CONFINED = {
-    "rclpy": ("ros/node_and_publishers.py", "edges/ros_"),
-    "socket": ("edges/", "tools/"),
+GROUND = "errors assets clock log threads"
+LANGUAGE = "errors assets table types compiler"
+IMPORTS = {
+    "errors": "",
+    "assets": "",
+    "clock": "",
+    "log": "clock errors",
+    "threads": "clock log",
+    "table": "errors assets",
+    "types": "errors assets",
+    "values": "errors types",
+    "compiler": "errors assets table types",
+    "engine": LANGUAGE,
+    "net": f"{GROUND} {LANGUAGE} engine",
+    "ros": f"{GROUND} {LANGUAGE} engine",
+    "gateway": f"{GROUND} {LANGUAGE} engine net ros",
+    "recording": f"{GROUND} {LANGUAGE} engine net",
+    "observe": f"{GROUND} {LANGUAGE} values engine net recording",
+    "rehearsal": f"{LANGUAGE} values engine recording",
+    "tools": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe rehearsal",
+    "app": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe",
+    "cli": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe rehearsal tools app",
 }
+"""Package -> the packages that it may import. `docs/architecture.md` shows the same."""
+
+PURE = {"errors", "table", "types", "values", "compiler", "engine", "rehearsal"}
+IMPURE_MODULES = {"socket", "threading", "asyncio", "rclpy"}
 
 
-def imported(path: Path) -> Iterator[str]:
-    """Full names of the modules that a module imports, anywhere in it, for types as well."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def imports(tree: ast.Module) -> Iterator[tuple[str, str | None, int]]:
+    """The imports anywhere in a module, also those for types: (module, name or None, line)."""
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            yield from ((alias.name, None, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}:{node.lineno}: imports are absolute"
+            assert node.level == 0, "imports are absolute"
             assert node.module is not None
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names if node.module == "router")
+            yield from ((node.module, alias.name, node.lineno) for alias in node.names)
 
 
-def layer(path: Path) -> str | None:
-    """`router/__init__.py` and `router/__main__.py`, which are no layer, have none."""
+def package(path: Path) -> str | None:
+    """The package of a module, or None for `router/__init__.py` and `router/__main__.py`, which are in none."""
     part = path.relative_to(ROUTER).parts[0].removesuffix(".py")
     return None if part.startswith("__") else part
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROUTER)))
-def test_module_imports_no_layer_above_its_own(path: Path) -> None:
-    own = layer(path)
-    if own is None:
-        return
-    used = {name.split(".")[1] for name in imported(path) if name.startswith("router.")}
-    above = {name for name in used if LAYERS.index(name) > LAYERS.index(own)}
-    assert not above, f"{own} is below {', '.join(sorted(above))}"
+def imported_package(module: str, name: str | None) -> str | None:
+    parts = [*module.split("."), name or ""]
+    return parts[1] if parts[0] == "router" and parts[1] in IMPORTS else None
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROUTER)))
-def test_the_outside_world_is_imported_at_the_edges_alone(path: Path) -> None:
-    relative = path.relative_to(ROUTER).as_posix()
-    roots = {name.partition(".")[0] for name in imported(path)}
-    for module, places in CONFINED.items():
-        if module in roots:
-            assert relative.startswith(places), f"{relative} imports {module}"
+def where(path: Path, line: int) -> str:
+    return f"{path.relative_to(ROUTER.parent)}:{line}"
 
 
-def test_every_module_says_what_it_is_for() -> None:
-    texts = {path: path.read_text(encoding="utf-8") for path in MODULES}
-    assert [path for path, text in texts.items() if text.strip() and not ast.get_docstring(ast.parse(text))] == []
+def test_the_table_has_every_package_and_no_circle() -> None:
+    assert {package(path) for path in MODULES} - {None} == set(IMPORTS)
+    list(TopologicalSorter({name: allowed.split() for name, allowed in IMPORTS.items()}).static_order())
+
+
+def test_packages_import_what_the_table_allows() -> None:
+    wrong = [
+        f"{where(path, line)}: {own} imports {other}"
+        for path, tree in MODULES.items()
+        if (own := package(path)) is not None
+        for module, name, line in imports(tree)
+        if (other := imported_package(module, name)) not in {None, own, *IMPORTS[own].split()}
+    ]
+    assert wrong == []
+
+
+def test_pure_packages_touch_no_socket_thread_loop_or_ros() -> None:
+    wrong = [
+        f"{where(path, line)}: imports {module}"
+        for path, tree in MODULES.items()
+        if package(path) in PURE
+        for module, _, line in imports(tree)
+        if module.partition(".")[0] in IMPURE_MODULES
+    ]
+    assert wrong == []
+
+
+def test_rclpy_is_imported_in_ros_alone() -> None:
+    wrong = [
+        where(path, line)
+        for path, tree in MODULES.items()
+        if package(path) != "ros"
+        for module, _, line in imports(tree)
+        if module.partition(".")[0] == "rclpy"
+    ]
+    assert wrong == []
+
+
+def test_no_module_imports_private_names_of_another_package() -> None:
+    wrong = [
+        f"{where(path, line)}: {module}.{name}"
+        for path, tree in MODULES.items()
+        for module, name, line in imports(tree)
+        if imported_package(module, name) not in {None, package(path)}
+        and any(part.startswith("_") for part in [*module.split("."), name or ""])
+    ]
+    assert wrong == []
+
+
+def test_every_module_has_a_docstring() -> None:
+    assert [str(path) for path, tree in MODULES.items() if tree.body and not ast.get_docstring(tree)] == []

@@ -167,7 +167,7 @@ def published(rover: Program) -> Publish:
         reports: list[object] = []
         topics = [plan.topic for plan in rover.publishers]
         outlets = plain_outlets(
-            rover.books,
+            rover.counters,
             send={sender.endpoint: len for sender in rover.senders},
             publish={topic: partial(sent.__setitem__, topic) for topic in topics},
             report=reports.append,

@@ -26,7 +26,7 @@ from router.compiler.topics import DIAGNOSTICS
 from router.engine import MAX_DATAGRAM
 from router.log import logger
 from router.net.udp import Listener
-from router.observe.metrics import Asked, BooksCollector
+from router.observe.metrics import Asked, CountersCollector
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult
 from router.recording.mirror import Mirror
@@ -61,7 +61,7 @@ class Router:
         self.is_ready = False
         self._first = program
         self._reporter = Reporter()
-        self._accounts = Accounts(program.books)
+        self._accounts = Accounts(program.counters)
         self.mirror = Mirror(MAX_DATAGRAM, self._rewire, self._reporter.failed)
         around = Surroundings(self._accounts, Keepers(self._reporter.failed), self._reporter, self._deadman_changed)
         self._edges = Edges(around, ros_args, self.mirror.tee)
@@ -167,7 +167,7 @@ class Router:
             self._companions.deadman_tripped(route)
 
     def _settled(self) -> None:
-        """Another program runs, and the books are its."""
+        """Another program runs, and the counters are its."""
         self._collector = self._new_collector()
         self._watch()
 
@@ -191,7 +191,7 @@ class Router:
             self._interfaces.close()
 
     def _asked(self) -> dict[str, Asked]:
-        """Series that nobody counts in a slot."""
+        """Series that nobody counts in a index."""
 
         def of_clients(value: Callable[[Subscriber], float]) -> Asked:
             return lambda: gateways.clients(value) if (gateways := self._edges.gateways) else ()
@@ -205,14 +205,14 @@ class Router:
             "gateway_client_dropped": of_clients(lambda client: client.dropped),
         }
 
-    def _new_collector(self) -> BooksCollector:
+    def _new_collector(self) -> CountersCollector:
         program = self.program
         build = {
             "version": _version(),
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
         }
-        return BooksCollector(program.books, self._accounts.threads, self._asked(), build)
+        return CountersCollector(program.counters, self._accounts.threads, self._asked(), build)
 
 
 def _version() -> str:

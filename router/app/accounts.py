@@ -4,39 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 
 Dropped = Callable[[], int]
 
 
 class Accounts:
-    """A list of counts for each thread, or lock, under which is counted; `books` say where what is."""
+    """A list of counts for each thread, or lock, under which is counted; `counters` say where what is."""
 
-    def __init__(self, books: Books) -> None:
-        self.books = books
+    def __init__(self, counters: Counters) -> None:
+        self.counters = counters
         self.drops = KernelDrops()
-        self.threads = [books.fresh_counts() for _ in range(8)]
+        self.threads = [counters.fresh_counts() for _ in range(8)]
         self.receive, self.ros, self.deadman, self.pacing, self.collecting = self.threads[:5]
         self.gateways, self.events, self.own = self.threads[5:]
 
     def total(self, metric: str) -> int:
         """What was counted under a counter's name, over all its labels."""
-        slots = [slot for series, slot in self.books.series() if series.metric == metric]
-        return sum(counts[slot] for counts in self.threads for slot in slots)
+        slots = [index for series, index in self.counters.series() if series.metric == metric]
+        return sum(counts[index] for counts in self.threads for index in slots)
 
-    def make_room(self, books: Books) -> None:
-        """For what books that continue ours count, beside what ours do."""
-        ours = dict(self.books.series())
-        new = [slot for series, slot in books.series() if series not in ours]
+    def make_room(self, counters: Counters) -> None:
+        """For what counters that continue ours count, beside what ours do."""
+        ours = dict(self.counters.series())
+        new = [index for series, index in counters.series() if series not in ours]
         for counts in self.threads:
-            books.grow(counts)
-            for slot in new:  # where a program may have counted that was abandoned
-                counts[slot] = 0
+            counters.grow(counts)
+            for index in new:  # where a program may have counted that was abandoned
+                counts[index] = 0
 
-    def settle(self, books: Books) -> None:
-        """These are the books now; nobody counts by the earlier ones any more."""
-        books.settle(self.threads)
-        self.books = books  # from here on others read them: they do not change any more
+    def settle(self, counters: Counters) -> None:
+        """These are the counters now; nobody counts by the earlier ones any more."""
+        counters.settle(self.threads)
+        self.counters = counters  # from here on others read them: they do not change any more
 
 
 class KernelDrops:

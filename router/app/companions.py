@@ -56,7 +56,7 @@ class Companions:
             self.http_address = server.address
 
     def asked(self) -> Mapping[str, Asked]:
-        """Series that nobody counts in the books."""
+        """Series that nobody counts in the counters."""
 
         def recorded(metric: str) -> Asked:
             return lambda: self._recorder.asked()[metric]() if self._recorder else ()

@@ -107,7 +107,7 @@ class Edges:
                 check_environment(os.environ)  # before a deadman sends for a start that comes to nothing
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
-            self._around.accounts.make_room(program.books)
+            self._around.accounts.make_room(program.counters)
             state = State(self.wiring.state if self.wiring else None)
             if self.wiring is None:
                 begin(program, self._around, sockets, state)
@@ -158,7 +158,7 @@ class Edges:
         with ExitStack() as last_first:
             if earlier is not None:
                 last_first.callback(earlier.forget)
-            last_first.callback(self._around.accounts.settle, change.wiring.program.books)
+            last_first.callback(self._around.accounts.settle, change.wiring.program.counters)
             last_first.callback(change.sockets.left.close)
             if self._ros is not None and change.topics is not None:
                 last_first.callback(self._ros.finish, change.topics)
@@ -208,7 +208,7 @@ class Edges:
             return
         program = self.wiring.program
         for name in who_names(program).get(topic, ()):
-            self._around.accounts.events[program.books.slot("qos_incompatible", name, topic, policy)] = peers
+            self._around.accounts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
 
     def _met(self, topic: str) -> None:
         """Somebody new subscribes to a topic of ours."""

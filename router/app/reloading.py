@@ -89,7 +89,7 @@ class Reloader:
         try:
             checked = self._check(now)
             findings = checked.diagnostics
-            then = checked.program_in(now.books.continued())
+            then = checked.program_in(now.counters.continued())
             if then is None:
                 return "invalid", _refused(findings)
             if refused := unchangeable(now.table, then.table):
@@ -126,13 +126,13 @@ class Reloader:
             logger.critical("a fault in the router itself after a reload; please report it", exc_info=error)
 
     def _count(self, kind: str) -> None:
-        self._accounts.own[self._accounts.books.slot("config_reloads", kind)] += 1
+        self._accounts.own[self._accounts.counters.index("config_reloads", kind)] += 1
 
     def _remember(self, *, is_good: bool) -> None:
-        books, own = self._accounts.books, self._accounts.own
-        own[books.slot("config_last_reload_successful")] = int(is_good)
+        counters, own = self._accounts.counters, self._accounts.own
+        own[counters.index("config_last_reload_successful")] = int(is_good)
         if is_good:
-            own[books.slot("config_last_reload_timestamp_seconds")] = wall_ns()
+            own[counters.index("config_last_reload_timestamp_seconds")] = wall_ns()
 
 
 def _refused(findings: Sequence[Diagnostic]) -> ReloadResult:

@@ -176,7 +176,7 @@ def _deadman(
 ) -> Deadman:
     def deadman() -> Deadman:
         counts = around.accounts.deadman
-        return Deadman(plan, program.books, counts, outlets, around.reporter.report, around.deadman_changed)
+        return Deadman(plan, program.counters, counts, outlets, around.reporter.report, around.deadman_changed)
 
     return state.keep(("deadman", plan, tuple(outlets[name] for name, _ in plan.datagrams)), deadman)
 

@@ -18,11 +18,11 @@ from router.cli.explain_words import at_start, quality
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import positive
 from router.compiler import Checked, check_table
-from router.compiler.books import Books
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.link import compile_handlers
 from router.compiler.mapping import Row
+from router.compiler.metrics import Counters
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import did_you_mean
 from router.table.model import ANY, ROS, Destination, Route, RouteTable, Topic
@@ -84,7 +84,7 @@ def _print_route(route: CheckedRoute, checked: Checked, no_code: bool) -> None:
     assert checked.table is not None  # noqa: S101 - a table without errors is one
     print(*_explained(route, checked), sep="\n")
     if not no_code and not route.route.ignore:
-        for handler in compile_handlers(route, checked.table, Books()):
+        for handler in compile_handlers(route, checked.table, Counters()):
             _print_code(handler.source)
     print()
 

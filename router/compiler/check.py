@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from router.compiler.books import Books
 from router.compiler.checked import CheckedGateway, CheckedRoute
 from router.compiler.definitions import Definitions
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Lookup
 from router.compiler.meetings import clash_findings, topic_findings
+from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
 from router.compiler.program import Program
 from router.compiler.routes import RouteChecker, sorted_findings
@@ -50,13 +50,13 @@ class Checked:
         """Made when first asked for: `validate` needs none, nor what makes it."""
         return self.program_in(None)
 
-    def program_in(self, books: Books | None) -> Program | None:
-        """A program that counts in these books, if they are given: they continue those of another one."""
+    def program_in(self, counters: Counters | None) -> Program | None:
+        """A program that counts in these counters, if they are given: they continue those of another one."""
         from router.compiler.link import link
 
         if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
             return None
-        return link(self.table, self.schema, self.envelope, self.routes, self.gateways, self.own_topics, books)
+        return link(self.table, self.schema, self.envelope, self.routes, self.gateways, self.own_topics, counters)
 
 
 def check_table(

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from router.compiler.books import Books
 from router.compiler.checked import CheckedCollect, CheckedFeed
 from router.compiler.expressions import Typed
+from router.compiler.metrics import Counters
 from router.compiler.program import TargetPlan
 from router.compiler.serving import NamedTarget, ServingSource
 from router.compiler.source import Source, namespace_name
@@ -28,13 +28,13 @@ class HandlerSource:
     `born`, the arrival by the monotonic clock (ns).
     """
 
-    def __init__(self, route: Route, case: PayloadCase, books: Books) -> None:
+    def __init__(self, route: Route, case: PayloadCase, counters: Counters) -> None:
         self.route = route
-        self.books = books
+        self.counters = counters
         self.span = route.span
         self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
-        self._serving = ServingSource(self.out, route, case, books)
+        self._serving = ServingSource(self.out, route, case, counters)
 
     @property
     def plans(self) -> tuple[TargetPlan, ...]:
@@ -80,8 +80,8 @@ class HandlerSource:
 
     def _received(self, feed: CheckedFeed, messages: str) -> str:
         """The line that counts so many."""
-        slot = self.books.slot("messages_received", self.route.name, feed.topic.topic.value)
-        return f"counts[{slot}] += {messages}  # messages_received"
+        index = self.counters.index("messages_received", self.route.name, feed.topic.topic.value)
+        return f"counts[{index}] += {messages}  # messages_received"
 
     @contextmanager
     def _function(self, *message: str) -> Iterator[None]:
@@ -107,7 +107,7 @@ class HandlerSource:
         """What follows is for whole frames: `items`, of which `m` is the first."""
         span = collect.span
         for _, target in topics:
-            self.books.slot("messages_collected", self.route.name, target.name)
+            self.counters.index("messages_collected", self.route.name, target.name)
         self.out.line("# collect", span)
         with self.out.block("try:", span):
             collect.reads.write(self.out, span)

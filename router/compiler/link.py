@@ -1,4 +1,4 @@
-"""Puts checked routes and gateways together: handlers, what must be opened for them, and the books with every series.
+"""Assemble the program: handlers, what must be opened for them, and the counters with every series.
 
 Expects a table without errors: nothing here is checked, and nothing is found.
 """
@@ -7,18 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from router.compiler.books import (
+from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedRoute
+from router.compiler.handlers import HandlerSource
+from router.compiler.link_gateways import link_gateway
+from router.compiler.lookup import layout
+from router.compiler.metrics import (
     QOS_POLICIES,
     RECORD_DROP_REASONS,
     REJECT_REASONS,
     RELOAD_RESULTS,
     UNKNOWN_CASE,
-    Books,
+    Counters,
 )
-from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedRoute
-from router.compiler.handlers import HandlerSource
-from router.compiler.link_gateways import link_gateway
-from router.compiler.lookup import layout
 from router.compiler.namespace import NAMESPACE
 from router.compiler.program import (
     STRANGER,
@@ -43,34 +43,34 @@ def link(
     routes: Sequence[CheckedRoute],
     gateways: Sequence[CheckedGateway] = (),
     own_topics: Sequence[tuple[Topic, MessageType]] = (),
-    books: Books | None = None,
+    counters: Counters | None = None,
 ) -> Program:
     """`own_topics` are published by the router itself, whatever its routes do.
 
-    `books` are to be counted in, where the program takes over from another one (`Books.continued`).
+    `counters` are to be counted in, where the program takes over from another one (`Counters.continued`).
     """
-    books = books or Books()
-    _open_books(books, table, envelope)
-    _open_own_books(books, table)
+    counters = counters or Counters()
+    _open_counters(counters, table, envelope)
+    _open_own_counters(counters, table)
     served = [checked for checked in routes if not checked.route.ignore]
     inbound: dict[int, tuple[Handler, ...]] = {}
     outbound: dict[str, tuple[Handler, ...]] = {}
     for checked in served:
-        for handler in compile_handlers(checked, table, books):
+        for handler in compile_handlers(checked, table, counters):
             if handler.topic is None:
                 number = handler.case.number
                 inbound[number] = (*inbound.get(number, ()), handler)
             else:
                 outbound[handler.topic] = (*outbound.get(handler.topic, ()), handler)
     deadmen = tuple(
-        _deadman(checked.route.name, checked.deadman, table, books) for checked in served if checked.deadman
+        _deadman(checked.route.name, checked.deadman, table, counters) for checked in served if checked.deadman
     )
     destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     return Program(
         table=table,
         envelope=envelope,
-        books=books,
+        counters=counters,
         listeners=tuple(
             ListenerPlan(
                 one.name,
@@ -94,7 +94,7 @@ def link(
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos=schema,
-        gateways=tuple(link_gateway(checked, books) for checked in gateways),
+        gateways=tuple(link_gateway(checked, counters) for checked in gateways),
     )
 
 
@@ -125,54 +125,54 @@ def _topic(topic: Topic, declared: MessageType, label: str) -> TopicPlan:
     return TopicPlan(label, topic.topic.value, declared.name, qos_of(topic), layout(declared))
 
 
-def _open_books(books: Books, table: RouteTable, envelope: Envelope) -> None:
+def _open_counters(counters: Counters, table: RouteTable, envelope: Envelope) -> None:
     for listener in table.listeners:
         for name in ("datagrams_received", "received_bytes", "kernel_drops", "datagrams_padded"):
-            books.slot(name, listener)
+            counters.index(name, listener)
         for reason in REJECT_REASONS:
-            books.slot("datagrams_rejected", listener, reason)
+            counters.index("datagrams_rejected", listener, reason)
     for case in (*envelope.cases, UNKNOWN_CASE):
-        books.slot("unhandled", case)
+        counters.index("unhandled", case)
     for endpoint in table.endpoints:
-        books.slot("endpoint_last_seen_timestamp_seconds", endpoint)
+        counters.index("endpoint_last_seen_timestamp_seconds", endpoint)
 
 
-def _open_own_books(books: Books, table: RouteTable) -> None:
+def _open_own_counters(counters: Counters, table: RouteTable) -> None:
     """Of what the router does beside routing."""
     for name in ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"):
-        books.slot(name)
+        counters.index(name)
     for result in RELOAD_RESULTS:
-        books.slot("config_reloads", result)
+        counters.index("config_reloads", result)
     if table.record is not None:
         for name in ("recorded_datagrams", "recorded_bytes"):
-            books.slot(name)
+            counters.index(name)
         for reason in RECORD_DROP_REASONS:
-            books.slot("record_dropped", reason)
+            counters.index("record_dropped", reason)
 
 
-def compile_handlers(checked: CheckedRoute, table: RouteTable, books: Books) -> Iterator[Handler]:
-    """Generates and compiles the functions of one route, and opens its series in the books.
+def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[Handler]:
+    """Generates and compiles the functions of one route, and opens its series in the counters.
 
     A route from UDP has one, a route from ROS one for each of its topics.
     """
     route, case = checked.route, checked.case
-    books.slot("route_seconds", route.name)
-    books.slot("route_last_message_timestamp_seconds", route.name)
+    counters.index("route_duration_seconds", route.name)
+    counters.index("route_last_message_timestamp_seconds", route.name)
     for topic in route.topics:
         for policy in QOS_POLICIES:
-            books.slot("qos_incompatible", route.name, topic.topic.value, policy)
+            counters.index("qos_incompatible", route.name, topic.topic.value, policy)
     if not route.is_outbound:
-        generator = HandlerSource(route, case, books)
+        generator = HandlerSource(route, case, counters)
         generator.inbound([served.target for served in checked.targets], checked.collect)
         sources: list[str | None] = [source.value for source in route.sources]
         if ANY in sources:
             sources = [*table.endpoints, STRANGER]
         for source in sources:
-            books.slot("messages_received", route.name, source_label(source))
+            counters.index("messages_received", route.name, source_label(source))
         spans = [served.target.span for served in checked.targets if served.topic]
         yield _handler(generator, checked, (spans or [route.span])[0].file, frozenset(sources), None)
     for feed in checked.feeds:
-        generator = HandlerSource(route, case, books)
+        generator = HandlerSource(route, case, counters)
         generator.outbound(feed)
         yield _handler(generator, checked, feed.topic.span.file, frozenset(), feed.topic.topic.value)
 
@@ -197,12 +197,12 @@ def _handler(
     )
 
 
-def _deadman(route: str, deadman: CheckedDeadman, table: RouteTable, books: Books) -> DeadmanPlan:
+def _deadman(route: str, deadman: CheckedDeadman, table: RouteTable, counters: Counters) -> DeadmanPlan:
     for metric in ("deadman_active", "deadman_trips"):
-        books.slot(metric, route)
+        counters.index(metric, route)
     for endpoint in deadman.to:
         for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
-            books.slot(metric, route, endpoint)
+            counters.index(metric, route, endpoint)
     return DeadmanPlan(
         route=route,
         timeout=deadman.timeout,

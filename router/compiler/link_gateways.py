@@ -5,7 +5,8 @@ Expects gateways without errors: nothing here is checked, and nothing is found.
 
 from __future__ import annotations
 
-from router.compiler.books import (
+from router.compiler.checked import CheckedGateway, CheckedInbound
+from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     CLIENTS,
     GATEWAY_DROP_REASONS,
@@ -13,30 +14,29 @@ from router.compiler.books import (
     INBOUND_DROP_REASONS,
     QOS_POLICIES,
     TOPIC_STATES,
-    Books,
+    Counters,
 )
-from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
 from router.table.model import ROS, Gateway, InboundDeadman
 
 
-def link_gateway(checked: CheckedGateway, books: Books) -> GatewayPlan:
-    """The plan of one gateway; opens its series in the books."""
+def link_gateway(checked: CheckedGateway, counters: Counters) -> GatewayPlan:
+    """The plan of one gateway; opens its series in the counters."""
     settings = checked.settings
-    _open_books(books, settings)
-    return GatewayPlan(settings, {entry.topic: _inbound(entry, settings.name, books) for entry in checked.inbound})
+    _open_counters(counters, settings)
+    return GatewayPlan(settings, {entry.topic: _inbound(entry, settings.name, counters) for entry in checked.inbound})
 
 
-def _inbound(entry: CheckedInbound, gateway: str, books: Books) -> InboundPlan:
+def _inbound(entry: CheckedInbound, gateway: str, counters: Counters) -> InboundPlan:
     topic, inbound = entry.topic, entry.inbound
-    books.slot("messages_published", gateway, topic)
+    counters.index("messages_published", gateway, topic)
     for reason in INBOUND_DROP_REASONS:
-        books.slot("messages_dropped", gateway, topic, reason)
+        counters.index("messages_dropped", gateway, topic, reason)
     for policy in QOS_POLICIES:
-        books.slot("qos_incompatible", gateway, topic, policy)
+        counters.index("qos_incompatible", gateway, topic, policy)
     deadman = None
     if inbound.deadman is not None and entry.stop is not None:
-        deadman = _deadman(f"{gateway}:{topic}", inbound.deadman, topic, entry.stop, books)
+        deadman = _deadman(f"{gateway}:{topic}", inbound.deadman, topic, entry.stop, counters)
     return InboundPlan(
         topic=topic,
         name=inbound.topic.topic.value,
@@ -47,32 +47,32 @@ def _inbound(entry: CheckedInbound, gateway: str, books: Books) -> InboundPlan:
     )
 
 
-def _deadman(name: str, deadman: InboundDeadman, topic: str, stop: bytes, books: Books) -> DeadmanPlan:
+def _deadman(name: str, deadman: InboundDeadman, topic: str, stop: bytes, counters: Counters) -> DeadmanPlan:
     for metric in ("deadman_active", "deadman_trips"):
-        books.slot(metric, name)
+        counters.index(metric, name)
     for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
-        books.slot(metric, name, topic)
+        counters.index(metric, name, topic)
     return DeadmanPlan(name, deadman.timeout.value, deadman.repeat.value, ((topic, stop),), deadman.at_start)
 
 
-def _open_books(books: Books, gateway: Gateway) -> None:
+def _open_counters(counters: Counters, gateway: Gateway) -> None:
     name = gateway.name
     for metric in ("datagrams_received", "received_bytes", "gateway_clients"):
-        books.slot(metric, name)
-    books.slot("route_last_message_timestamp_seconds", name)
+        counters.index(metric, name)
+    counters.index("route_last_message_timestamp_seconds", name)
     for reason in GATEWAY_REJECT_REASONS:
-        books.slot("datagrams_rejected", name, reason)
+        counters.index("datagrams_rejected", name, reason)
     for source in (ROS, CLIENTS):
-        books.slot("messages_received", name, source)
+        counters.index("messages_received", name, source)
     for metric in ("messages_sent", "messages_filtered"):
-        books.slot(metric, name, CLIENTS)
+        counters.index(metric, name, CLIENTS)
     for reason in GATEWAY_DROP_REASONS:
-        books.slot("messages_dropped", name, CLIENTS, reason)
+        counters.index("messages_dropped", name, CLIENTS, reason)
     for metric in ("datagrams_sent", "sent_bytes"):
-        books.slot(metric, name, gateway.transport.value.value)
+        counters.index(metric, name, gateway.transport.value.value)
     if gateway.zenoh is not None:
-        books.slot("gateway_key_conflicts", name)
+        counters.index("gateway_key_conflicts", name)
     for state in TOPIC_STATES:
-        books.slot("gateway_topics", name, state)
+        counters.index("gateway_topics", name, state)
     for reason in CLIENT_DROP_REASONS:
-        books.slot("client_messages_dropped", name, reason)
+        counters.index("client_messages_dropped", name, reason)

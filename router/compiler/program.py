@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import chain
 from types import CodeType
 
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 from router.table.model import Address, Framing, Gateway, Keep, Priority, RouteTable, bound_to
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
@@ -179,7 +179,7 @@ class Program:
 
     table: RouteTable
     envelope: Envelope
-    books: Books
+    counters: Counters
     listeners: tuple[ListenerPlan, ...]
     senders: tuple[SenderPlan, ...]
     publishers: tuple[TopicPlan, ...]

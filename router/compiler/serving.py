@@ -9,9 +9,9 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from router.compiler.books import DROP_REASONS, Books
 from router.compiler.cdr import write_message
 from router.compiler.expressions import Typed
+from router.compiler.metrics import DROP_REASONS, Counters
 from router.compiler.payload import write_envelope
 from router.compiler.program import TargetPlan
 from router.compiler.source import Source, namespace_name
@@ -31,17 +31,17 @@ class ServingSource:
     out: Source
     route: Route
     case: PayloadCase
-    books: Books
+    counters: Counters
     plans: list[TargetPlan] = field(default_factory=list)
 
     def named(self, target: Target) -> NamedTarget:
         """Opens the target's series, which all exist from the start."""
         for reason in DROP_REASONS:
-            self.books.slot("messages_dropped", self.route.name, target.name, reason)
-        self.books.slot("messages_filtered", self.route.name, target.name)
+            self.counters.index("messages_dropped", self.route.name, target.name, reason)
+        self.counters.index("messages_filtered", self.route.name, target.name)
         delivered = ("messages_published",) if target.is_topic else ("datagrams_sent", "sent_bytes")
         for metric in delivered:
-            self.books.slot(metric, self.route.name, target.name)
+            self.counters.index(metric, self.route.name, target.name)
         name = self._unique(namespace_name(target.name))
         self.plans.append(
             TargetPlan(
@@ -120,8 +120,8 @@ class ServingSource:
             serve(name, target)
 
     def _count(self, metric: str, target: Target, *reason: str) -> None:
-        slot = self.books.slot(metric, self.route.name, target.name, *reason)
-        self.out.line(f"counts[{slot}] += 1  # {' '.join((metric, *reason))}", target.span)
+        index = self.counters.index(metric, self.route.name, target.name, *reason)
+        self.out.line(f"counts[{index}] += 1  # {' '.join((metric, *reason))}", target.span)
 
     def _data(self, name: str, target: Target) -> str:
         """Appends what makes the bytes for a target, and returns the expression that is them."""
@@ -137,8 +137,8 @@ class ServingSource:
         data = self._data(name, target)
         if target.deadmen:  # before the command is sent, so that nothing which a deadman sends can follow it
             self.out.line(f"feed_{name}(now)", target.span)
-        slot = self.books.slot("sent_bytes", self.route.name, target.name)
-        self.out.line(f"counts[{slot}] += send_{name}({data})  # sent_bytes", target.span)
+        index = self.counters.index("sent_bytes", self.route.name, target.name)
+        self.out.line(f"counts[{index}] += send_{name}({data})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
 
     def _publish(self, name: str, target: Target) -> None:

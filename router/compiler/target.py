@@ -12,7 +12,7 @@ from router.table.model import Keep, Priority
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A destination or a topic. `name` is its label in the books. Without a `plan` the datagram is forwarded.
+    """A destination or a topic. `name` is its label in the counters. Without a `plan` the datagram is forwarded.
 
     `reads` makes the variables of its expressions; None where they are made once for all targets of the route.
     `deadmen` are the routes whose deadmen hear of each command to it.

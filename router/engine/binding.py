@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import FunctionType
 from typing import Any
 
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
 from router.engine.delivery import Deliver, Feed, immediately
@@ -59,7 +59,7 @@ class Outlets:
     state: State = field(default_factory=State)
 
 
-def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness) -> FunctionType:
+def bind(handler: Handler, counters: Counters, outlets: Outlets, freshness: Freshness) -> FunctionType:
     namespace: dict[str, Any] = {
         **handler.constants,
         "counts": outlets.counts,
@@ -68,9 +68,9 @@ def bind(handler: Handler, books: Books, outlets: Outlets, freshness: Freshness)
         "monotonic": freshness.born,
     }
     if handler.collect_timeout is not None:
-        namespace["collect"] = _collect(handler, handler.collect_timeout, books, outlets)
+        namespace["collect"] = _collect(handler, handler.collect_timeout, counters, outlets)
     for target in handler.targets:
-        namespace |= _bound(target, handler, books, outlets)
+        namespace |= _bound(target, handler, counters, outlets)
     exec(handler.code, namespace)  # noqa: S102 - code that our compiler made of a checked table
     handle: FunctionType = namespace[handler.function]
     return handle
@@ -81,14 +81,14 @@ def unbind(handle: FunctionType) -> None:
     handle.__globals__.clear()
 
 
-def _bound(target: TargetPlan, handler: Handler, books: Books, outlets: Outlets) -> dict[str, Any]:
+def _bound(target: TargetPlan, handler: Handler, counters: Counters, outlets: Outlets) -> dict[str, Any]:
     name, route = target.name, handler.route
     place = route, handler.topic, target
-    bound: dict[str, Any] = {f"lost_{name}": Outcome(books, outlets.counts, route, target, outlets.report).failed}
+    bound: dict[str, Any] = {f"lost_{name}": Outcome(counters, outlets.counts, route, target, outlets.report).failed}
     if target.is_topic:
         bound[f"wanted_{name}"] = outlets.wanted[target.target]
     if target.is_deferred:
-        outcome = Outcome(books, outlets.pacing.counts, route, target, outlets.report)
+        outcome = Outcome(counters, outlets.pacing.counts, route, target, outlets.report)
         bound[f"deliver_{name}"] = _deliver(place, outcome, outlets)
     elif target.is_topic:
         bound[f"publish_{name}"] = outlets.publish[target.target]
@@ -102,12 +102,14 @@ def _bound(target: TargetPlan, handler: Handler, books: Books, outlets: Outlets)
     return bound
 
 
-def _collect(handler: Handler, timeout: int, books: Books, outlets: Outlets) -> Callable[..., list[object] | None]:
+def _collect(
+    handler: Handler, timeout: int, counters: Counters, outlets: Outlets
+) -> Callable[..., list[object] | None]:
     counts = outlets.collecting.counts
     targets = tuple(target for target in handler.targets if target.is_topic)
 
     def collector() -> Collector:
-        outcomes = [FrameOutcome(books, counts, handler.route, target, outlets.report) for target in targets]
+        outcomes = [FrameOutcome(counters, counts, handler.route, target, outlets.report) for target in targets]
         return Collector(timeout, outcomes)
 
     parts = handler.case.message_class  # those of another one would not make a frame with them

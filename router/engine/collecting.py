@@ -20,7 +20,7 @@ MOST_CLOSED = 1024
 
 
 class PartOutcome(Protocol):
-    """What becomes of a part at one target of frames; FrameOutcome counts that in the books."""
+    """What becomes of a part at one target of frames; FrameOutcome counts that in the counters."""
 
     def collected(self) -> None: ...
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
 from router.engine.delivery import Feed
 from router.engine.machine import Guard
@@ -54,7 +54,7 @@ class Deadman:
     def __init__(
         self,
         plan: DeadmanPlan,
-        books: Books,
+        counters: Counters,
         counts: list[int],
         send: Mapping[str, Callable[[bytes], int]],
         report: Callable[[Report], None],
@@ -67,15 +67,15 @@ class Deadman:
         self._plan = plan
         self._tripped = False
         self._counts = counts
-        self._active = books.slot("deadman_active", plan.route)
-        self._trips = books.slot("deadman_trips", plan.route)
+        self._active = counters.index("deadman_active", plan.route)
+        self._trips = counters.index("deadman_trips", plan.route)
         self._destinations = [
             _Destination(
                 endpoint,
                 datagram,
                 send[endpoint],
-                books.slot("deadman_datagrams_sent", plan.route, endpoint),
-                books.slot("deadman_send_errors", plan.route, endpoint),
+                counters.index("deadman_datagrams_sent", plan.route, endpoint),
+                counters.index("deadman_send_errors", plan.route, endpoint),
             )
             for endpoint, datagram in plan.datagrams
         ]

@@ -10,7 +10,7 @@ from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 
 from router.compiler import STRANGER, source_label
-from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, REJECT_REASONS
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
 from router.engine.binding import Handle, Outlets, bind, unbind
@@ -23,7 +23,7 @@ Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]
 _Addresses = Sequence[tuple[object, str]]
 """By what endpoints are recognised, and their names."""
-_SUM = HISTOGRAM_SLOTS - 1
+_SUM = HISTOGRAM_CELLS - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Engine:
         self._arrived_at = arrived_at
         self._freshness = outlets.state.keep("freshness of datagrams", Freshness)
         self._handles = {
-            handler.route: bind(handler, program.books, outlets, self._freshness)
+            handler.route: bind(handler, program.counters, outlets, self._freshness)
             for handlers in program.inbound.values()
             for handler in handlers
         }
@@ -87,14 +87,14 @@ class Engine:
         )
 
     def _route(self, handler: Handler, source: str | None, listener: str) -> _Route:
-        books, label = self._program.books, source_label(source)
+        counters, label = self._program.counters, source_label(source)
         handle = self._handles[handler.route]
         return _Route(
-            received=books.slot("messages_received", handler.route, label),
+            received=counters.index("messages_received", handler.route, label),
             name=label,
             handle=handle if handler.ttl is None else self._aged(handle, self._arrived_at[listener]),
-            last_message=books.slot("route_last_message_timestamp_seconds", handler.route),
-            seconds=books.slot("route_seconds", handler.route),
+            last_message=counters.index("route_last_message_timestamp_seconds", handler.route),
+            seconds=counters.index("route_duration_seconds", handler.route),
         )
 
     def _aged(self, handle: Handle, arrived_at: Callable[[], int]) -> Handle:
@@ -112,7 +112,7 @@ class Engine:
         This is the hot path: everything it needs is a local name, and the usual datagram (one payload,
         complete, of a routed case, from its endpoint) goes straight through.
         """
-        books, counts = self._program.books, self._counts
+        counters, counts = self._program.counters, self._counts
         # Whose they are: an endpoint that is believed by another listener is a stranger here.
         by_host, by_address = recognisers(self._program.table.endpoints, listener)
         addresses: _Addresses = [*by_host.items(), *by_address.items()]
@@ -120,8 +120,11 @@ class Engine:
         # Of those whose tag is two bytes at most.
         by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
         clock_ns, wall_ns, bounds = self._outlets.clock_ns, self._outlets.wall_ns, HISTOGRAM_BOUNDS_NS
-        received, received_bytes = books.slot("datagrams_received", listener), books.slot("received_bytes", listener)
-        seen = self._seen_slots(addresses)
+        received, received_bytes = (
+            counters.index("datagrams_received", listener),
+            counters.index("received_bytes", listener),
+        )
+        seen = self._seen_indexes(addresses)
         settle, reject = Settler(self._program, counts, listener, cases).settle, self._rejecter(listener)
 
         def receive(data: bytes, peer: Peer) -> None:
@@ -163,13 +166,13 @@ class Engine:
 
         return receive
 
-    def _seen_slots(self, addresses: _Addresses) -> dict[object, int]:
+    def _seen_indexes(self, addresses: _Addresses) -> dict[object, int]:
         metric = "endpoint_last_seen_timestamp_seconds"
-        return {key: self._program.books.slot(metric, name) for key, name in addresses}
+        return {key: self._program.counters.index(metric, name) for key, name in addresses}
 
     def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
-        books, counts, report = self._program.books, self._counts, self._outlets.report
-        slots = {reason: books.slot("datagrams_rejected", listener, reason) for reason in REJECT_REASONS}
+        counters, counts, report = self._program.counters, self._counts, self._outlets.report
+        slots = {reason: counters.index("datagrams_rejected", listener, reason) for reason in REJECT_REASONS}
 
         def reject(reason: str, peer: Peer, what: str) -> None:
             counts[slots[reason]] += 1

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from types import FunctionType
 
-from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS
 from router.compiler.program import Handler, Program
 from router.engine.binding import Handle, Outlets, bind, unbind
 from router.engine.freshness import Freshness
@@ -43,7 +43,7 @@ class OutboundEngine:
         It never raises for what was received.
         """
         routes = [self._route(handler) for handler in self._program.outbound[topic]]
-        counts, bounds, total = self._outlets.counts, HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS - 1
+        counts, bounds, total = self._outlets.counts, HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS - 1
         clock_ns, wall_ns, born = self._outlets.clock_ns, self._outlets.wall_ns, self._freshness.born
 
         def take(cdr: bytes, arrived_at: int) -> None:
@@ -62,11 +62,11 @@ class OutboundEngine:
         return take
 
     def _route(self, handler: Handler) -> _Route:
-        books = self._program.books
-        self._handles.append(handle := bind(handler, books, self._outlets, self._freshness))
+        counters = self._program.counters
+        self._handles.append(handle := bind(handler, counters, self._outlets, self._freshness))
         return _Route(
             handle=handle,
             is_aged=handler.ttl is not None,
-            last_message=books.slot("route_last_message_timestamp_seconds", handler.route),
-            seconds=books.slot("route_seconds", handler.route),
+            last_message=counters.index("route_last_message_timestamp_seconds", handler.route),
+            seconds=counters.index("route_duration_seconds", handler.route),
         )

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from router.compiler.books import DROP_REASONS, Books
+from router.compiler.metrics import DROP_REASONS, Counters
 from router.compiler.program import TargetPlan
 from router.errors import MappingError, NonFiniteError
 
@@ -37,13 +37,13 @@ class Report:
 
 
 class Outcome:
-    """The books of one target of one route, in a list of counts that its user owns.
+    """The counters of one target of one route, in a list of counts that its user owns.
 
     Every loss is reported but `rate_limited`, which is what the table asks for.
     """
 
     def __init__(
-        self, books: Books, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
+        self, counters: Counters, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
     ) -> None:
         self.place: Place = route, target.target
         self._counts = counts
@@ -52,13 +52,13 @@ class Outcome:
         self._is_topic = target.is_topic
         self._report = report
         self._dropped = {
-            reason: books.slot("messages_dropped", route, target.target, reason) for reason in DROP_REASONS
+            reason: counters.index("messages_dropped", route, target.target, reason) for reason in DROP_REASONS
         }
-        self._filtered = books.slot("messages_filtered", route, target.target)
-        self._delivered = books.slot(
+        self._filtered = counters.index("messages_filtered", route, target.target)
+        self._delivered = counters.index(
             "messages_published" if target.is_topic else "datagrams_sent", route, target.target
         )
-        self._sent_bytes = None if target.is_topic else books.slot("sent_bytes", route, target.target)
+        self._sent_bytes = None if target.is_topic else counters.index("sent_bytes", route, target.target)
 
     def delivered(self, size: int) -> None:
         """Handed over: published, or sent with `size` bytes."""
@@ -84,10 +84,10 @@ class FrameOutcome(Outcome):
     """Of a target that gets frames: it counts parts, which no other target has a series for."""
 
     def __init__(
-        self, books: Books, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
+        self, counters: Counters, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
     ) -> None:
-        super().__init__(books, counts, route, target, report)
-        self._collected = books.slot("messages_collected", route, target.target)
+        super().__init__(counters, counts, route, target, report)
+        self._collected = counters.index("messages_collected", route, target.target)
 
     def collected(self) -> None:
         """Joined a frame."""

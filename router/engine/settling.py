@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 
-from router.compiler.books import UNKNOWN_CASE
+from router.compiler.metrics import UNKNOWN_CASE
 from router.compiler.program import Program
 from router.engine.framing import restored
 from router.engine.payloadless import why_no_payload
@@ -37,8 +37,8 @@ class Settler(Generic[Case]):
     def __init__(self, program: Program, counts: list[int], listener: str, cases: Mapping[int, Case]) -> None:
         plan = next(plan for plan in program.listeners if plan.name == listener)
         self._repairs = plan.framing is Framing.ZERO_TRIMMED
-        self._padded = program.books.slot("datagrams_padded", listener)
-        self._books = program.books
+        self._padded = program.counters.index("datagrams_padded", listener)
+        self._counters = program.counters
         self._envelope = program.envelope
         self._ignored = program.ignored
         self._case_numbers = frozenset(case.number for case in program.envelope.cases.values())
@@ -77,4 +77,4 @@ class Settler(Generic[Case]):
         raise Rejected("unhandled", name)
 
     def _count_unhandled(self, case: str) -> None:
-        self._counts[self._books.slot("unhandled", case)] += 1
+        self._counts[self._counters.index("unhandled", case)] += 1

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from router.compiler.books import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Books
+from router.compiler.metrics import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Counters
 from router.compiler.program import GatewayPlan, InboundPlan
 from router.engine import Report
 from router.engine.delivery import Feed as FeedDeadman
@@ -49,14 +49,15 @@ class InletOutlets:
 class _Topic:
     """One topic that clients may publish on."""
 
-    def __init__(self, plan: InboundPlan, style: Style, books: Books, gateway: Gateway) -> None:
+    def __init__(self, plan: InboundPlan, style: Style, counters: Counters, gateway: Gateway) -> None:
         self.plan = plan
         self.most = int(min(longest_text(plan.type, style) + _BESIDES, gateway.max_message))
         self.build = cdr_builder(plan.type, style)
         self.may_pass = RateLimit(plan.max_rate).may_pass if plan.max_rate is not None else None
-        self.published = books.slot("messages_published", gateway.name, plan.topic)
+        self.published = counters.index("messages_published", gateway.name, plan.topic)
         self.dropped = {
-            reason: books.slot("messages_dropped", gateway.name, plan.topic, reason) for reason in INBOUND_DROP_REASONS
+            reason: counters.index("messages_dropped", gateway.name, plan.topic, reason)
+            for reason in INBOUND_DROP_REASONS
         }
 
 
@@ -71,16 +72,20 @@ class Checked(NamedTuple):
 class Inlet:
     """Of one gateway, for the thread that owns `counts`."""
 
-    def __init__(self, plan: GatewayPlan, style: Style, books: Books, counts: list[int], outlets: InletOutlets) -> None:
+    def __init__(
+        self, plan: GatewayPlan, style: Style, counters: Counters, counts: list[int], outlets: InletOutlets
+    ) -> None:
         name = plan.settings.name
         self._gateway = name
-        self._topics = {topic: _Topic(each, style, books, plan.settings) for topic, each in plan.inbound.items()}
+        self._topics = {topic: _Topic(each, style, counters, plan.settings) for topic, each in plan.inbound.items()}
         self._counts = counts
         self._outlets = outlets
         self._freshness = Freshness()
-        self._accepted = books.slot("messages_received", name, CLIENTS)
-        self._last = books.slot("route_last_message_timestamp_seconds", name)
-        self._rejected = {reason: books.slot("datagrams_rejected", name, reason) for reason in GATEWAY_REJECT_REASONS}
+        self._accepted = counters.index("messages_received", name, CLIENTS)
+        self._last = counters.index("route_last_message_timestamp_seconds", name)
+        self._rejected = {
+            reason: counters.index("datagrams_rejected", name, reason) for reason in GATEWAY_REJECT_REASONS
+        }
 
     def reject(self, reason: str, detail: str = "") -> None:
         """Counts something that is not published."""

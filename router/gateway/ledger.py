@@ -1,10 +1,10 @@
-"""The books of one gateway: what came from ROS, what clients got, and what was lost on the way."""
+"""The counters of one gateway: what came from ROS, what clients got, and what was lost on the way."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from router.compiler.books import CLIENT_DROP_REASONS, CLIENTS, GATEWAY_DROP_REASONS, TOPIC_STATES, Books
+from router.compiler.metrics import CLIENT_DROP_REASONS, CLIENTS, GATEWAY_DROP_REASONS, TOPIC_STATES, Counters
 from router.engine import Report
 from router.table.model import ROS, Gateway
 
@@ -18,7 +18,7 @@ class Ledger:
     def __init__(
         self,
         settings: Gateway,
-        books: Books,
+        counters: Counters,
         counts: list[int],
         report: Callable[[Report], None],
         wall_ns: Callable[[], int],
@@ -28,21 +28,21 @@ class Ledger:
         self._counts = counts
         self._report = report
         self._wall_ns = wall_ns
-        self._received = books.slot("messages_received", name, ROS)
-        self._last = books.slot("route_last_message_timestamp_seconds", name)
-        self._sent = books.slot("messages_sent", name, CLIENTS)
-        self._filtered = books.slot("messages_filtered", name, CLIENTS)
+        self._received = counters.index("messages_received", name, ROS)
+        self._last = counters.index("route_last_message_timestamp_seconds", name)
+        self._sent = counters.index("messages_sent", name, CLIENTS)
+        self._filtered = counters.index("messages_filtered", name, CLIENTS)
         self._dropped = {
-            reason: books.slot("messages_dropped", name, CLIENTS, reason) for reason in GATEWAY_DROP_REASONS
+            reason: counters.index("messages_dropped", name, CLIENTS, reason) for reason in GATEWAY_DROP_REASONS
         }
-        self._written = books.slot("datagrams_sent", name, way)
-        self._written_bytes = books.slot("sent_bytes", name, way)
-        self._arrived = books.slot("datagrams_received", name)
-        self._arrived_bytes = books.slot("received_bytes", name)
-        self._clients = books.slot("gateway_clients", name)
-        self._topics = [books.slot("gateway_topics", name, state) for state in TOPIC_STATES]
-        self._contended = books.slot("gateway_key_conflicts", name) if settings.zenoh else None
-        self._lost = {reason: books.slot("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
+        self._written = counters.index("datagrams_sent", name, way)
+        self._written_bytes = counters.index("sent_bytes", name, way)
+        self._arrived = counters.index("datagrams_received", name)
+        self._arrived_bytes = counters.index("received_bytes", name)
+        self._clients = counters.index("gateway_clients", name)
+        self._topics = [counters.index("gateway_topics", name, state) for state in TOPIC_STATES]
+        self._contended = counters.index("gateway_key_conflicts", name) if settings.zenoh else None
+        self._lost = {reason: counters.index("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
 
     def received(self, times: int) -> None:
         """Messages came from ROS."""
@@ -95,5 +95,5 @@ class Ledger:
         self._counts[self._clients] = number
 
     def topics(self, served: int, several_types: int, not_installed: int) -> None:
-        for slot, number in zip(self._topics, (served, several_types, not_installed), strict=True):
-            self._counts[slot] = number
+        for index, number in zip(self._topics, (served, several_types, not_installed), strict=True):
+            self._counts[index] = number

@@ -1,4 +1,4 @@
-"""What becomes of the messages of a gateway's topics: frames, the schema first, and each message in the books once.
+"""What becomes of the messages of a gateway's topics: frames, the schema first, and each message in the counters once.
 
 Knows neither clients nor which topics there are: frames go to whoever `deliver` is.
 """

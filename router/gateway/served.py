@@ -16,7 +16,7 @@ MOST_UNCONVERTED = 4
 
 @dataclass(slots=True)
 class Served:
-    """`period` in ns, EACH for every message. `counted` is what of `feed.arrived` is in the books, of `feed.missed`
+    """`period` in ns, EACH for every message. `counted` is what of `feed.arrived` is in the counters, of `feed.missed`
     where every message is handed on; `told` is what of `feed.arrived` was told to clients as a rate. `number` tells
     when in a period it has its turn. `sample` is the latest one that was looked at, `readable` the latest that could be
     converted. `is_busy` while a large one is converted, for which `unconverted` wait.

@@ -66,7 +66,7 @@ class GatewayService:
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
 
     def anew(self) -> GatewayService:
-        """One like this, which was closed: with the same limits and books, without its clients."""
+        """One like this, which was closed: with the same limits and counters, without its clients."""
         return GatewayService(self.plan, self._around, self._ledger, self._inlet, self._new_transport)
 
     async def open(self) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.clock import monotonic_ns, wall_ns
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 from router.compiler.program import GatewayPlan, Program
 from router.engine import Report
 from router.engine.deadman import FeedMaker
@@ -97,7 +97,7 @@ class GatewayThread:
                 if plan.settings.name not in kept:
                     for rival in [each for each in change.left if _meet(each.plan.settings, plan.settings)]:
                         await rival.close()
-                    service = await self._open(plan, program.books, outlets)
+                    service = await self._open(plan, program.counters, outlets)
                     change.opened.append(service)
                     change.services[service.name] = service
         except BaseException:
@@ -144,10 +144,10 @@ class GatewayThread:
         for service in change.opened:
             service.start()
 
-    async def _open(self, plan: GatewayPlan, books: Books, outlets: InletOutlets) -> GatewayService:
+    async def _open(self, plan: GatewayPlan, counters: Counters, outlets: InletOutlets) -> GatewayService:
         settings = plan.settings
-        ledger = Ledger(settings, books, self._counts, outlets.report, wall_ns)
-        inlet = Inlet(plan, ENCODINGS[settings.format].style, books, self._counts, outlets)
+        ledger = Ledger(settings, counters, self._counts, outlets.report, wall_ns)
+        inlet = Inlet(plan, ENCODINGS[settings.format].style, counters, self._counts, outlets)
         service = GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))
         try:
             await service.open()

@@ -173,7 +173,7 @@ def _careful_send(connected: socket.socket, address: Address) -> Callable[[bytes
 
     "Connection refused" is news about an earlier datagram, which was taken for sent. The kernel gives it
     instead of sending this one, so this one is sent now, and the error still raised: it stands for the
-    loss of the earlier one. So one is counted as lost for one that is, and the books balance.
+    loss of the earlier one. So one is counted as lost for one that is, and the counters balance.
 
     Where the network has changed, a socket of today is made of `connected` first.
     """

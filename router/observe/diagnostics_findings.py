@@ -6,7 +6,7 @@ import enum
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from router.compiler.books import INTENDED_REASONS
+from router.compiler.metrics import INTENDED_REASONS
 from router.observe.diagnostics_snapshot import SEEN, Rest, Situation
 from router.table.model import Endpoint
 

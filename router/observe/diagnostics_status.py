@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from router.compiler.books import RECORD_DROP_REASONS
+from router.compiler.metrics import RECORD_DROP_REASONS
 from router.compiler.program import GatewayPlan
 from router.observe.diagnostics_findings import (
     Status,

@@ -1,4 +1,4 @@
-"""Prometheus: reads the books' integers when it is asked.
+"""Prometheus: reads the counters' integers when it is asked.
 
 Counting happens elsewhere, in plain lists; nothing here is called per datagram.
 """
@@ -14,8 +14,8 @@ from prometheus_client.metrics_core import Metric as Family
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample
 
-from router.compiler.books import HISTOGRAM_BOUNDS_NS, HISTOGRAM_SLOTS, METRICS, Books, Metric
-from router.compiler.books import metric as metric_named
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, METRICS, Counters, Metric
+from router.compiler.metrics import metric as metric_named
 
 PREFIX = "router_"
 
@@ -30,8 +30,8 @@ Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
 """Gives the label values, in the metric's order, and the value of each series."""
 
 
-class BooksCollector(Collector):
-    """All series of the books, each from its first scrape on, at 0 while nothing has happened.
+class CountersCollector(Collector):
+    """All series of the counters, each from its first scrape on, at 0 while nothing has happened.
 
     `counts` has the list of each thread that counts: a counter is their sum, a number or a time the largest of them.
     `asked` has what is asked for at each scrape instead, by metric: label values and the value of each series there is
@@ -40,7 +40,7 @@ class BooksCollector(Collector):
 
     def __init__(
         self,
-        books: Books,
+        counters: Counters,
         counts: Sequence[list[int]],
         asked: Mapping[str, Asked],
         build: Mapping[str, str],
@@ -49,10 +49,10 @@ class BooksCollector(Collector):
         self._asked = asked
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._slots: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
-        for series, slot in books.series():
+        for series, index in counters.series():
             if series.part == 0:
                 labels = dict(zip(metric_named(series.metric).labels, series.labels, strict=True))
-                self._slots[series.metric].append((labels, slot))
+                self._slots[series.metric].append((labels, index))
 
     def collect(self) -> Iterator[Family]:
         threads = [counts.copy() for counts in self._counts]  # at one instant each: copying holds the interpreter lock
@@ -69,15 +69,15 @@ class BooksCollector(Collector):
             for values, value in self._asked[metric.name]():
                 yield Sample(name + suffix, dict(zip(metric.labels, values, strict=True)), value)
             return
-        for labels, slot in self._slots[metric.name]:
+        for labels, index in self._slots[metric.name]:
             if metric.kind == "histogram":
-                yield from _histogram(name, labels, [thread[slot : slot + HISTOGRAM_SLOTS] for thread in threads])
+                yield from _histogram(name, labels, [thread[index : index + HISTOGRAM_CELLS] for thread in threads])
             elif metric.kind == "time":
-                yield Sample(name, labels, max(thread[slot] for thread in threads) / 1e9)
+                yield Sample(name, labels, max(thread[index] for thread in threads) / 1e9)
             elif metric.kind == "number":
-                yield Sample(name, labels, max(thread[slot] for thread in threads))
+                yield Sample(name, labels, max(thread[index] for thread in threads))
             else:
-                yield Sample(name + suffix, labels, sum(thread[slot] for thread in threads))
+                yield Sample(name + suffix, labels, sum(thread[index] for thread in threads))
 
 
 def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:

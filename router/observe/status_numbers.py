@@ -1,6 +1,6 @@
 """All that a router counts, by route, endpoint and listener, as a page wants it: plain JSON.
 
-Knows the metrics' names and labels, which `books` declares; not what the page shows of them.
+Knows the metrics' names and labels, which `counters` declares; not what the page shows of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DELIVERED = {
 def numbers(samples: Iterable[Sample]) -> Numbers:
     """What did not happen is mostly left out. Times in seconds, counts since the start.
 
-    `routes` has gateways as well. A route's `buckets` are those of `route_seconds`, cumulative, in the order of bounds.
+    `routes` has gateways as well. A route's `buckets` are cumulative, in the order of bounds.
     """
     found: Numbers = {"routes": {}, "endpoints": {}, "listeners": {}, "unhandled": {}, "reload": {}}
     for name, labels, value in samples:
@@ -126,7 +126,7 @@ TAKERS: dict[str, Taker] = {
     "messages_dropped_total": _dropped,
     "messages_filtered_total": _of_target("filtered"),
     "messages_collected_total": _of_target("collected"),
-    "route_seconds_bucket": _bucket,
+    "route_duration_seconds_bucket": _bucket,
     "route_last_message_timestamp_seconds": _of_route("last"),
     "deadman_active": _of_route("deadman_active"),
     "deadman_trips_total": _of_route("deadman_trips"),

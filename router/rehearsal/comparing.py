@@ -91,7 +91,7 @@ class Comparison:
                     yield from self._differences(item, event, happened)
 
     def _missing(self, target: str, items: Sequence[Item], happened: Happened) -> Failure:
-        """With what became of the message instead, where the books know."""
+        """With what became of the message instead, where the counters know."""
         for event in happened.events:
             if isinstance(event, Dropped) and event.target == target:
                 why = f"it was dropped as {event.reason}" + (f" ({event.detail})" if event.detail else "")

@@ -1,11 +1,11 @@
-"""What can become of a message in a rehearsal, told from what the router's books count. Plain data."""
+"""What can become of a message in a rehearsal, told from what the router's counters count. Plain data."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from router.compiler.books import Series
+from router.compiler.metrics import Series
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Published(Event):
 
 @dataclass(frozen=True, slots=True)
 class Dropped(Event):
-    """A target did not get a message, for one of books.DROP_REASONS; `detail` says more where there is more."""
+    """A target did not get a message, for one of counters.DROP_REASONS; `detail` says more where there is more."""
 
     route: str
     target: str
@@ -70,7 +70,7 @@ class Collected(Event):
 
 @dataclass(frozen=True, slots=True)
 class Rejected(Event):
-    """No route took a datagram, for one of books.REJECT_REASONS."""
+    """No route took a datagram, for one of counters.REJECT_REASONS."""
 
     listener: str
     reason: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from router.compiler.books import DROP_REASONS, REJECT_REASONS
+from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.errors import Code, SourceSpan, did_you_mean
 from router.rehearsal.matching import MessageMatch
 from router.rehearsal.model import Content, Counted, Expected, Item, Message, Payload, Unchanged, Whatever

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from router.compiler.books import Series
+from router.compiler.metrics import Series
 from router.compiler.program import Program
 from router.engine import Engine, OutboundEngine
 from router.engine.binding import Guarded, Outlets
@@ -78,7 +78,7 @@ class Rehearsal:
     def _outlets(self, counts: list[int]) -> Outlets:
         program, send = self._program, {plan.endpoint: self._take_datagram for plan in self._program.senders}
         deadmen = {
-            plan.route: Deadman(plan, program.books, counts, send, self._explain, self._deadman_changed)
+            plan.route: Deadman(plan, program.counters, counts, send, self._explain, self._deadman_changed)
             for plan in program.deadmen
         }
         pacers = {plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in program.senders if plan.budget}
@@ -113,7 +113,7 @@ class Rehearsal:
         self._data = bytes(cdr)
 
     def _counted(self, series: Series) -> None:
-        """The books tell what became of a message, at which target of which route: outlets know no routes."""
+        """The counters tell what became of a message, at which target of which route: outlets know no routes."""
         self.events.append(event_of(series, self.now, self._data))
 
     def _explain(self, report: Report) -> None:
@@ -127,14 +127,14 @@ class Rehearsal:
 
 
 class _Counts(list[int]):
-    """The counts of a program's books, which tell of each series that is counted up."""
+    """The counts of a program's counters, which tell of each series that is counted up."""
 
     def __init__(self, program: Program, counted: Callable[[Series], None]) -> None:
-        super().__init__(program.books.fresh_counts())
-        self._series = {slot: series for series, slot in program.books.series() if is_told(series)}
+        super().__init__(program.counters.fresh_counts())
+        self._series = {index: series for series, index in program.counters.series() if is_told(series)}
         self._counted = counted
 
-    def __setitem__(self, slot, value) -> None:  # type: ignore[no-untyped-def]  # it is never a slice
-        super().__setitem__(slot, value)
-        if slot in self._series:
-            self._counted(self._series[slot])
+    def __setitem__(self, index, value) -> None:  # type: ignore[no-untyped-def]  # it is never a slice
+        super().__setitem__(index, value)
+        if index in self._series:
+            self._counted(self._series[index])

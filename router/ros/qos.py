@@ -20,7 +20,7 @@ from rclpy.qos import (
     qos_policy_name_from_kind,
 )
 
-from router.compiler.books import QOS_POLICIES
+from router.compiler.metrics import QOS_POLICIES
 from router.compiler.program import QosPlan, TopicPlan
 from router.log import logger
 from router.ros.node import RCL

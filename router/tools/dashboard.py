@@ -142,7 +142,10 @@ def _route(route: Route, series: Series) -> Iterator[Column]:
         yield [number(f"{name}: last message", age, SECONDS, 4, 8, empty="never")]
     yield [
         heat_map(
-            f"{name}: time in the router", Query(series.buckets("route_seconds", route=name), "{{le}}"), SECONDS, 8
+            f"{name}: time in the router",
+            Query(series.buckets("route_duration_seconds", route=name), "{{le}}"),
+            SECONDS,
+            8,
         )
     ]
 

@@ -48,8 +48,10 @@ def _losses(table: RouteTable, series: Series) -> Iterator[Column]:
         yield [lines("Dropped", [dropped], MESSAGES, 8, note="Messages that a target should have got, and did not.")]
     unhandled = Query(f"{series.rate('unhandled', 'payload_case')} > 0", "{{payload_case}}")
     yield [lines("Without a route", [unhandled], MESSAGES, 8, note="Payload cases that the table does not have.")]
-    if series.has("route_seconds"):
-        latency = [Query(series.quantile(share, "route_seconds"), f"{share:.0%}") for share in (0.5, 0.9, 0.99)]
+    if series.has("route_duration_seconds"):
+        latency = [
+            Query(series.quantile(share, "route_duration_seconds"), f"{share:.0%}") for share in (0.5, 0.9, 0.99)
+        ]
         yield [lines("Time in the router", latency, SECONDS, 8, note="From message received to all targets served.")]
     if series.has("deadman_active"):
         active = Query(series.of("deadman_active"), "{{route}}")

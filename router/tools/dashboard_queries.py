@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import json
 
-from router.compiler.books import metric as metric_named
+from router.compiler.metrics import metric as metric_named
 from router.compiler.program import Program
 
 INTERVAL = "$__rate_interval"
 
 
 class Series:
-    """What the books of `program` have, as selectors."""
+    """What the counters of `program` have, as selectors."""
 
     def __init__(self, program: Program) -> None:
-        named = ((each.metric, each.labels) for each, _ in program.books.series() if each.part == 0)
+        named = ((each.metric, each.labels) for each, _ in program.counters.series() if each.part == 0)
         self._series = [
             (metric, dict(zip(metric_named(metric).labels, values, strict=True))) for metric, values in named
         ]

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from router.compiler.books import INTENDED_REASONS
+from router.compiler.metrics import INTENDED_REASONS
 from router.compiler.program import Program
 from router.errors import TransportError
 from router.table.model import RouteTable

@@ -1,6 +1,6 @@
 """A running router seen from outside: the text of /metrics into rates and rows, one for each route.
 
-Knows the metrics' names from the books; not where the text comes from (`running_router`), nor who shows the rows
+Knows the metrics' names from the counters; not where the text comes from (`running_router`), nor who shows the rows
 (`live_view`).
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from router.compiler.books import INTENDED_REASONS, METRICS
+from router.compiler.metrics import INTENDED_REASONS, METRICS
 from router.observe.status_numbers import DELIVERED
 
 Labels = tuple[str, ...]
@@ -30,8 +30,8 @@ _DELIVERED = tuple(metric.removesuffix("_total") for metric in DELIVERED)
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The router's metrics at one time. `at` in seconds of any clock; values by the books' metric name
-    and label values, both as the books order them. `table_sha256` tells which table it ran, empty where that is not
+    """The router's metrics at one time. `at` in seconds of any clock; values by the counters' metric name
+    and label values, both as the counters order them. `table_sha256` tells which table it ran, empty where that is not
     told."""
 
     at: float

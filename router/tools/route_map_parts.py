@@ -9,7 +9,7 @@ import enum
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from router.compiler.books import CLIENTS
+from router.compiler.metrics import CLIENTS
 from router.compiler.topics import resolved
 from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, RouteTable, Topic
 from router.table.quantities import duration

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from router.tools.live import BUCKETS, Counts, RouteRow, Snapshot, View, view
 
-_HISTOGRAM = f"route_seconds{BUCKETS}"
+_HISTOGRAM = f"route_duration_seconds{BUCKETS}"
 
 
 class Order(enum.Enum):

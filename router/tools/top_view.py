@@ -12,7 +12,7 @@ from dataclasses import replace
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from router.compiler.books import HISTOGRAM_BOUNDS_NS
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.table.quantities import duration
 from router.tools.live import RouteRow
 from router.tools.live_view import Column, route_table, summary_line

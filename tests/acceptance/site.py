@@ -44,7 +44,7 @@ IMPATIENT_ROVER = ROVER.replace("patient.yaml", "quiet.yaml")
 SO_MEMINFO = 55
 """Of Linux; word 8 of what it tells are the datagrams dropped."""
 
-SERVED = "route_seconds_count"
+SERVED = "route_duration_seconds_count"
 """Counts the messages whose targets have all been served."""
 
 
@@ -188,7 +188,7 @@ def total(counts: Mapping[str, int], metric: str, **labels: str) -> int:
 
 
 def balance(counts: Mapping[str, int], topics: Iterable[str] = TOPICS_FROM_ROS) -> None:
-    """The identities of the books: nothing that was received is unaccounted for. From `topics` messages come."""
+    """The identities of the counters: nothing that was received is unaccounted for. From `topics` messages come."""
     accepted = total(counts, "messages_received")
     from_ros = sum(total(counts, "messages_received", source=topic) for topic in topics)
     assert total(counts, "datagrams_received") == total(counts, "datagrams_rejected") + accepted - from_ros

@@ -75,7 +75,7 @@ def long_to_read(topic: str, type_name: str) -> bytes:
 
 
 def settled(now: Scene, gateway: str, datagrams: int) -> None:
-    """Waits until so many have come, and what became of each is in the books."""
+    """Waits until so many have come, and what became of each is in the counters."""
 
     def is_settled() -> bool:
         counts = now.site.scrape()

@@ -1,4 +1,4 @@
-"""The books balance when more comes in than the router can take, and when destinations are down."""
+"""The counters balance when more comes in than the router can take, and when destinations are down."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from router.app.accounts import Accounts
 from router.app.edges import Edges
 from router.app.watching import watched_files
 from router.compiler import check_table
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 from router.net.receiver import ReceiveThread
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
@@ -587,7 +587,7 @@ def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
         assert [site.basestation.recv(1000) for _ in range(2)] == [numbered(2), DRIVE]
 
 
-@pytest.mark.parametrize("late", ["router.app.accounts.Books.settle", "router.app.BooksCollector"])
+@pytest.mark.parametrize("late", ["router.app.accounts.Counters.settle", "router.app.CountersCollector"])
 def test_what_fails_when_the_table_runs_already_is_not_told_as_if_nothing_had_changed(
     site: Site, monkeypatch: pytest.MonkeyPatch, late: str
 ) -> None:
@@ -632,13 +632,13 @@ def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
 
 
 def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:
-    accounts = Accounts(Books())
-    abandoned = accounts.books.continued()
-    slot = abandoned.slot("datagrams_padded", "another")
+    accounts = Accounts(Counters())
+    abandoned = accounts.counters.continued()
+    index = abandoned.index("datagrams_padded", "another")
     accounts.make_room(abandoned)
-    accounts.gateways[slot] += 1
-    then = accounts.books.continued()
-    assert then.slot("datagrams_received", "rover") == slot
+    accounts.gateways[index] += 1
+    then = accounts.counters.continued()
+    assert then.index("datagrams_received", "rover") == index
     accounts.make_room(then)
     accounts.settle(then)
     assert accounts.total("datagrams_received") == 0

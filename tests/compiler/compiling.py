@@ -116,9 +116,9 @@ class Published:
         self.sent = {endpoint: [] for endpoint in endpoints}
         self._handle = bind(
             self.handler,
-            self.program.books,
+            self.program.counters,
             plain_outlets(
-                self.program.books,
+                self.program.counters,
                 send={name: self._sender(name) for name in endpoints},
                 publish={topic: self._publisher(topic) for topic in topics},
                 report=self.reports.append,

@@ -22,18 +22,18 @@ def message_class(name: str) -> Any:
 def to_object(cls: Any, value: dict[str, Any]) -> Any:
     """A message whose fields are `value`; a field that `value` lacks keeps what the constructor gives it."""
     made = cls()
-    for name, slot in zip(cls.get_fields_and_field_types(), cls.SLOT_TYPES, strict=True):
+    for name, index in zip(cls.get_fields_and_field_types(), cls.SLOT_TYPES, strict=True):
         if name in value:
-            setattr(made, name, _to_slot(slot, value[name]))
+            setattr(made, name, _to_slot(index, value[name]))
     return made
 
 
-def _to_slot(slot: Any, value: Any) -> Any:
-    if isinstance(slot, AbstractNestedType):
-        return [_to_slot(slot.value_type, element) for element in value]
-    if isinstance(slot, NamespacedType):
-        return to_object(message_class("/".join(slot.namespaced_name())), value)
-    if isinstance(slot, BasicType) and slot.typename == "octet":
+def _to_slot(index: Any, value: Any) -> Any:
+    if isinstance(index, AbstractNestedType):
+        return [_to_slot(index.value_type, element) for element in value]
+    if isinstance(index, NamespacedType):
+        return to_object(message_class("/".join(index.namespaced_name())), value)
+    if isinstance(index, BasicType) and index.typename == "octet":
         return bytes([value])
     return value
 
@@ -41,15 +41,15 @@ def _to_slot(slot: Any, value: Any) -> Any:
 def to_value(message: Any) -> dict[str, Any]:
     names = message.get_fields_and_field_types()
     return {
-        name: _from_slot(slot, getattr(message, name)) for name, slot in zip(names, message.SLOT_TYPES, strict=True)
+        name: _from_slot(index, getattr(message, name)) for name, index in zip(names, message.SLOT_TYPES, strict=True)
     }
 
 
-def _from_slot(slot: Any, value: Any) -> Any:
-    if isinstance(slot, AbstractNestedType):
+def _from_slot(index: Any, value: Any) -> Any:
+    if isinstance(index, AbstractNestedType):
         elements = value.tolist() if hasattr(value, "tolist") else value
-        return [_from_slot(slot.value_type, element) for element in elements]
-    if isinstance(slot, NamespacedType):
+        return [_from_slot(index.value_type, element) for element in elements]
+    if isinstance(index, NamespacedType):
         return to_value(value)
     return value[0] if isinstance(value, bytes) else value
 

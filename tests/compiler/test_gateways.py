@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from router.compiler import Checked
-from router.compiler.books import (
+from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     CLIENTS,
     GATEWAY_DROP_REASONS,
@@ -259,14 +259,14 @@ def test_an_ignored_gateway_has_no_series_no_address_and_no_name(check_text: Che
     assert found.diagnostics == []
     assert found.program
     assert [gateway.settings.name for gateway in found.program.gateways] == ["it"]
-    names = {series.labels[0] for series, _ in found.program.books.series() if series.metric == "messages_sent"}
+    names = {series.labels[0] for series, _ in found.program.counters.series() if series.metric == "messages_sent"}
     assert names == {"it"}
 
 
 def test_conflicts_about_its_key_are_counted_of_a_zenoh_gateway_alone(check_text: CheckText) -> None:
     found = checked(check_text, f"far: {{transport: {{zenoh: {{key: a}}}}}}, it: {{{TCP}}}")
     assert found.program
-    conflicts = [each.labels for each, _ in found.program.books.series() if each.metric == "gateway_key_conflicts"]
+    conflicts = [each.labels for each, _ in found.program.counters.series() if each.metric == "gateway_key_conflicts"]
     assert conflicts == [("far",)]
 
 
@@ -298,7 +298,7 @@ def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText
         ("deadman_datagrams_sent", watch, topic),
         ("deadman_send_errors", watch, topic),
     }
-    series = {(each.metric, *each.labels) for each, _ in program.books.series()}
+    series = {(each.metric, *each.labels) for each, _ in program.counters.series()}
     assert {each for each in series if each[1:] and re.match("it(:|$)", each[1])} == expected
 
 

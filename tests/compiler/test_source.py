@@ -9,9 +9,9 @@ import traceback
 import pytest
 
 from router.compiler import Checked, check_table
-from router.compiler.books import Books
 from router.compiler.definitions import Definitions
 from router.compiler.handlers import HandlerSource
+from router.compiler.metrics import Counters
 from router.compiler.source import Source
 from router.errors import SourceSpan
 from tests.compiler.compiling import Published
@@ -25,12 +25,12 @@ def generated(checked: Checked) -> list[Source]:
     """The code of all routes of a table."""
     made = []
     for route in checked.routes:
-        generator = HandlerSource(route.route, route.case, Books())
+        generator = HandlerSource(route.route, route.case, Counters())
         if not route.route.is_outbound:
             generator.inbound([served.target for served in route.targets], route.collect)
             made.append(generator.out)
         for feed in route.feeds:
-            generator = HandlerSource(route.route, route.case, Books())
+            generator = HandlerSource(route.route, route.case, Counters())
             generator.outbound(feed)
             made.append(generator.out)
     assert made

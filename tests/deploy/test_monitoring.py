@@ -165,7 +165,7 @@ def test_a_routes_panels_show_what_it_does(case: str, monitored: Monitored, prom
     [age] = shown["router_route_last_message_timestamp_seconds"]
     assert 0 <= float(age["value"][1]) < 60
     assert float(shown["router_messages_received_total"][0]["value"][1]) > 0
-    assert any(float(bucket["value"][1]) > 0 for bucket in shown["router_route_seconds_bucket"])
+    assert any(float(bucket["value"][1]) > 0 for bucket in shown["router_route_duration_seconds_bucket"])
     targets = {each["metric"]["destination"] for each in shown.get("router_datagrams_sent_total", ())}
     assert targets == set(FLOWS[case].destinations)
 

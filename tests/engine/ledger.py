@@ -1,15 +1,15 @@
-"""Reads the books by name, and says where they do not balance."""
+"""Reads the counters by name, and says where they do not balance."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from router.compiler.books import HISTOGRAM_SLOTS
+from router.compiler.metrics import HISTOGRAM_CELLS
 from router.compiler.program import Handler, Program
 
 
 class Ledger:
-    """The books of a program with their counts at the time of each call; timestamps and histograms left out."""
+    """The counters of a program with their counts at the time of each call; timestamps and histograms left out."""
 
     def __init__(self, program: Program, counts: Sequence[int]) -> None:
         self._program = program
@@ -18,9 +18,9 @@ class Ledger:
     def counted(self, *prefixes: str) -> Mapping[tuple[str, ...], int]:
         """What is not zero, by metric and labels, of the metrics whose name starts like one of these."""
         return {
-            (series.metric, *series.labels): self._counts[slot]
-            for series, slot in self._program.books.series()
-            if self._counts[slot] and series.metric.startswith(prefixes) and not series.metric.endswith("seconds")
+            (series.metric, *series.labels): self._counts[index]
+            for series, index in self._program.counters.series()
+            if self._counts[index] and series.metric.startswith(prefixes) and not series.metric.endswith("seconds")
         }
 
     def total(self, metric: str, *labels: str) -> int:
@@ -42,8 +42,8 @@ class Ledger:
 
     def _time_of_route(self, route: str) -> Iterator[str]:
         accepted = self.total("messages_received", route)
-        first = self._program.books.slot("route_seconds", route)
-        if accepted != (timed := sum(self._counts[first : first + HISTOGRAM_SLOTS - 1])):
+        first = self._program.counters.index("route_duration_seconds", route)
+        if accepted != (timed := sum(self._counts[first : first + HISTOGRAM_CELLS - 1])):
             yield f"{route}: accepted {accepted}, but the histogram holds {timed}"
 
     def _fates(self, handler: Handler) -> Iterator[str]:

@@ -14,14 +14,14 @@ from tests.engine.rig import Rig
 
 
 class Naive:
-    """Stands in for the engine of a rig: same handlers, outlets and books, another way to get there."""
+    """Stands in for the engine of a rig: same handlers, outlets and counters, another way to get there."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.program = rig.program
         handlers = [(number, handler) for number, [handler] in self.program.inbound.items()]
         self.handles = {
-            number: bind(handler, self.program.books, rig.outlets, Freshness()) for number, handler in handlers
+            number: bind(handler, self.program.counters, rig.outlets, Freshness()) for number, handler in handlers
         }
 
     def receive(self, data: bytes, peer: tuple[str, int], listener: str) -> None:
@@ -34,10 +34,10 @@ class Naive:
             self._add(1, "datagrams_rejected", listener, reason)
 
     def _add(self, amount: int, metric: str, *labels: str) -> None:
-        self.rig.counts[self.program.books.slot(metric, *labels)] += amount
+        self.rig.counts[self.program.counters.index(metric, *labels)] += amount
 
     def _stamp(self, metric: str, label: str) -> None:
-        self.rig.counts[self.program.books.slot(metric, label)] = self.rig.WALL + self.rig.now
+        self.rig.counts[self.program.counters.index(metric, label)] = self.rig.WALL + self.rig.now
 
     def _take(self, data: bytes, peer: tuple[str, int], listener: str) -> str | None:
         if len(data) > MAX_DATAGRAM:
@@ -78,7 +78,7 @@ class Naive:
         self._add(1, "messages_received", name, label)
         self.handles[number](getattr(message, name), data, self.rig.WALL + self.rig.now, self.rig.now, label)
         self._stamp("route_last_message_timestamp_seconds", name)
-        self._add(1, "route_seconds", name)  # the first bucket: the clock of these tests stands still
+        self._add(1, "route_duration_seconds", name)  # the first bucket: the clock of these tests stands still
         return None
 
     def _endpoint(self, peer: tuple[str, int], listener: str) -> str | None:

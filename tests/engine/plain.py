@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 from router.engine import Report
 from router.engine.binding import Guarded, Outlets
 
 
 def plain_outlets(
-    books: Books,
+    counters: Counters,
     send: Mapping[str, Callable[[bytes], int]],
     publish: Mapping[str, Callable[[bytes], None]],
     report: Callable[[Report], None],
@@ -19,7 +19,7 @@ def plain_outlets(
     publish_errors: tuple[type[Exception], ...] = (),
 ) -> Outlets:
     """Everybody listens on every topic, the clocks stand still, and no deadman ever trips."""
-    counts = books.fresh_counts() if counts is None else counts
+    counts = counters.fresh_counts() if counts is None else counts
     unguarded = Guarded(counts, lambda _, call: call)
     return Outlets(
         counts=counts,

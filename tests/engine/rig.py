@@ -80,7 +80,7 @@ class Rig:
 
     def __init__(self, made: Program, unwanted: frozenset[str] = frozenset()) -> None:
         self.program = made
-        self.counts = made.books.fresh_counts()
+        self.counts = made.counters.fresh_counts()
         self.ledger = Ledger(made, self.counts)
         self.now = 0
         self.work_ns = 0
@@ -94,7 +94,7 @@ class Rig:
         send = {plan.endpoint: self._sender(plan.endpoint) for plan in made.senders}
         pacers = {plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in made.senders if plan.budget}
         deadmen = {
-            plan.route: Deadman(plan, made.books, self.counts, send, self.reports.append, self._changed)
+            plan.route: Deadman(plan, made.counters, self.counts, send, self.reports.append, self._changed)
             for plan in made.deadmen
         }
         self.machines += pacers.values()
@@ -148,7 +148,7 @@ class Rig:
         self.changes.append((route, active))
 
     def count(self, metric: str, *labels: str, part: int = 0) -> int:
-        return self.counts[self.program.books.slot(metric, *labels) + part]
+        return self.counts[self.program.counters.index(metric, *labels) + part]
 
     def counted(self, *prefixes: str) -> Mapping[tuple[str, ...], int]:
         return self.ledger.counted(*prefixes)
@@ -163,7 +163,7 @@ class Rig:
         found = self.counted("messages_dropped").items()
         return {labels[3]: count for labels, count in found if labels[1:3] == (route, target)}
 
-    def assert_books_balance(self) -> None:
+    def assert_counters_balance(self) -> None:
         assert list(self.ledger.imbalances()) == []
 
     def _sender(self, endpoint: str) -> Callable[[bytes], int]:

@@ -134,7 +134,7 @@ def test_a_ros_message_is_sent_to_each_destination_as_its_mapping_says(rig: Rig)
     ]
     assert rig.count("messages_received", "drive_motor", "drive_motor") == 1
     assert rig.count("sent_bytes", "drive_motor", "recorder") == len(recorded)
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_what_fails_for_one_destination_leaves_the_other_alone(rig: Rig) -> None:
@@ -142,7 +142,7 @@ def test_what_fails_for_one_destination_leaves_the_other_alone(rig: Rig) -> None
 
     assert [name for name, _ in rig.sent] == ["driving_board"]
     assert rig.dropped("drive_motor", "recorder") == {"mapping_error": 1}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_the_condition_of_a_topic_holds_for_all_destinations_and_its_own_for_one(rig: Rig) -> None:
@@ -152,7 +152,7 @@ def test_the_condition_of_a_topic_holds_for_all_destinations_and_its_own_for_one
     assert [name for name, _ in rig.sent] == ["recorder"]
     assert rig.count("messages_filtered", "drive_motor", "driving_board") == 2
     assert rig.count("messages_filtered", "drive_motor", "recorder") == 1
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 @pytest.mark.parametrize("damaged", [b"", b"\0\0\0\0" + bytes(8), drive(2.0)[:-1], b"\0\1\0\0"])
@@ -162,7 +162,7 @@ def test_bytes_that_are_no_such_message_are_lost_for_every_destination(rig: Rig,
     assert rig.sent == []
     assert rig.dropped("drive_motor", "driving_board") == {"mapping_error": 1}
     assert rig.dropped("drive_motor", "recorder") == {"mapping_error": 1}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 # ---- ages
@@ -177,7 +177,7 @@ def test_a_ros_message_that_the_middleware_held_too_long_is_stale(rig: Rig) -> N
     assert len(rig.sent) == 2
     assert rig.dropped("drive_motor", "driving_board") == {"stale": 1}
     assert rig.dropped("drive_motor", "recorder") == {"stale": 1}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_a_datagram_that_waited_in_the_socket_is_stale(rig: Rig) -> None:
@@ -188,7 +188,7 @@ def test_a_datagram_that_waited_in_the_socket_is_stale(rig: Rig) -> None:
 
     assert rig.sent == [("driving_board", datagram)]
     assert rig.dropped("manual_drive_from_basestation", "driving_board") == {"stale": 1}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_the_age_counts_from_the_stamp_where_there_is_one(rig: Rig) -> None:
@@ -201,7 +201,7 @@ def test_the_age_counts_from_the_stamp_where_there_is_one(rig: Rig) -> None:
 
     assert len(rig.sent) == 3
     assert rig.dropped("rover_localization", "basestation") == {"stale": 2}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 # ---- deadmen
@@ -226,7 +226,7 @@ def test_a_deadman_sends_in_place_of_commands_until_they_are_back(rig: Rig) -> N
     assert rig.changes == [("drive_motor", True), ("drive_motor", False)]
     assert (rig.count("deadman_active", "drive_motor"), rig.count("deadman_trips", "drive_motor")) == (0, 1)
     assert rig.count("deadman_datagrams_sent", "drive_motor", "driving_board") == 3
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 @pytest.mark.parametrize("unsent", ["filtered", "stale", "damaged"])
@@ -243,7 +243,7 @@ def test_what_is_not_sent_is_no_command(rig: Rig, unsent: str) -> None:
             rig.take("drive_motor", b"" if unsent == "damaged" else drive(2.0))
 
     assert ("driving_board", BRAKE) in rig.sent
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 # ---- elements and frames
@@ -267,7 +267,7 @@ def test_each_element_is_a_message_of_its_own(rig: Rig) -> None:
     ]  # fmt: skip
     assert rig.count("messages_received", "detected_object_from_ros", "detections") == 3
     assert rig.count("messages_filtered", "detected_object_from_ros", "basestation") == 1
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_an_empty_list_sends_nothing_and_is_no_message(rig: Rig) -> None:
@@ -275,7 +275,7 @@ def test_an_empty_list_sends_nothing_and_is_no_message(rig: Rig) -> None:
 
     assert rig.sent == []
     assert rig.count("messages_received", "detected_object_from_ros", "detections") == 0
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_a_frame_is_published_once_when_it_is_complete_and_forwarded_as_it_came(rig: Rig) -> None:
@@ -292,7 +292,7 @@ def test_a_frame_is_published_once_when_it_is_complete_and_forwarded_as_it_came(
     route = "detected_object_from_basestation"
     assert rig.count("messages_collected", route, "objects") == 2
     assert rig.count("messages_filtered", route, "objects") == 2
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_an_incomplete_frame_is_counted_when_its_time_is_up(rig: Rig) -> None:
@@ -302,7 +302,7 @@ def test_an_incomplete_frame_is_counted_when_its_time_is_up(rig: Rig) -> None:
 
     assert rig.published == []
     assert rig.dropped("detected_object_from_basestation", "objects") == {"incomplete": 1}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 @pytest.mark.parametrize(("count", "index", "reason"), [(0, 0, "mapping_error"), (3, 3, "mapping_error"),
@@ -313,7 +313,7 @@ def test_numbers_that_make_no_frame_are_lost_for_every_topic(rig: Rig, count: in
     for topic in ("objects", "how_many"):
         assert rig.dropped("detected_object_from_basestation", topic) == {reason: 1}
     assert len(rig.sent) == 1
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 # ---- several routes of one case, and what is served later
@@ -327,7 +327,7 @@ def test_the_sender_decides_between_the_routes_of_a_case(rig: Rig) -> None:
 
     assert rig.sent == [("recorder", datagram.rstrip(b"\0")), ("driving_board", datagram)]
     assert rig.rejected() == "source_mismatch"
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_the_latest_of_what_a_rate_holds_back_goes_when_it_may(rig: Rig) -> None:
@@ -341,7 +341,7 @@ def test_the_latest_of_what_a_rate_holds_back_goes_when_it_may(rig: Rig) -> None
     assert [data for _, data in rig.sent] == [datagrams[0], datagrams[2]]
     assert [struct.unpack_from("<f", data, 4) for _, data in rig.published] == [(1.0,), (3.0,)]
     assert rig.dropped("imu_info", "accel") == {"rate_limited": 1}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_a_budget_holds_back_and_in_the_end_drops(rig: Rig) -> None:
@@ -354,7 +354,7 @@ def test_a_budget_holds_back_and_in_the_end_drops(rig: Rig) -> None:
     assert len(rig.sent) * len(datagram) == pytest.approx(2000, rel=0.1)
     assert set(rig.dropped("ph_info", "slow")) == {"queue_full"}
     rig.pass_time(HOUR)
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_a_command_that_reaches_only_others_than_the_deadman_stops_does_not_feed_it(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.compiler.books import Books
+from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
 from router.engine.deadman import GREETING, START, Deadman, feeder
 from router.engine.machine import Machine
@@ -39,10 +39,10 @@ class Watched:
         self.failures: dict[str, Exception] = {}
         self.reports: list[Report] = []
         self.told: list[tuple[str, bool, int, int]] = []
-        self.books = Books()
+        self.counters = Counters()
         self._counts = [0] * 100
         send = {endpoint: self._sender(endpoint) for endpoint, _ in plan.datagrams}
-        self.deadman = Deadman(plan, self.books, self._counts, send, self.reports.append, self._changed)
+        self.deadman = Deadman(plan, self.counters, self._counts, send, self.reports.append, self._changed)
 
     def feed(self, now: int) -> None:
         self.now = now
@@ -61,7 +61,7 @@ class Watched:
         return [time for time, name, _ in self.sent if name == endpoint]
 
     def count(self, metric: str, *labels: str) -> int:
-        return self._counts[self.books.slot(metric, "drive", *labels)]
+        return self._counts[self.counters.index(metric, "drive", *labels)]
 
     def _changed(self, route: str, active: bool) -> None:
         self.told.append((route, active, len(self.sent), self.count("deadman_active")))
@@ -244,9 +244,9 @@ def test_served_at_any_time_it_neither_speaks_too_soon_nor_twice_for_one_repeat(
         if fed is None or now < fed + TIMEOUT:
             assert sent == []
             continue
-        slot = (now - fed - TIMEOUT) // REPEAT
+        index = (now - fed - TIMEOUT) // REPEAT
         earlier = [(time - fed - TIMEOUT) // REPEAT for time in watched.times()[:before] if time > fed]
-        assert sent == ([] if slot in earlier else [now])
+        assert sent == ([] if index in earlier else [now])
 
 
 def succession(before: Watched, plan: DeadmanPlan) -> Watched:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from router.compiler.books import REJECT_REASONS
+from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM
 from router.engine.dispatch import Peer
@@ -77,7 +77,7 @@ def rig(made: Program) -> Rig:
 
 
 class Both:
-    """Engine and oracle side by side; `receive` asserts that they did the same: all of the books, every byte out."""
+    """Engine and oracle side by side; `receive` asserts that they did the same: all of the counters, every byte out."""
 
     def __init__(self, made: Program) -> None:
         self.rig, self.expected = Rig(made), Rig(made)
@@ -89,15 +89,15 @@ class Both:
         differences = self.differences() if self.rig.counts != self.expected.counts else []
         out = [(list(rig.sent), list(rig.published)) for rig in (self.rig, self.expected)]
         for rig in (self.rig, self.expected):  # begin anew, so that the next datagram is judged by itself
-            rig.counts[:] = rig.program.books.fresh_counts()
+            rig.counts[:] = rig.program.counters.fresh_counts()
             rig.sent.clear()
             rig.published.clear()
         assert not differences
         assert out[0] == out[1]
 
     def differences(self) -> list[tuple[object, int, int]]:
-        series = self.rig.program.books.series()
-        both = [(one, self.rig.counts[slot], self.expected.counts[slot]) for one, slot in series]
+        series = self.rig.program.counters.series()
+        both = [(one, self.rig.counts[index], self.expected.counts[index]) for one, index in series]
         return [(one, ours, theirs) for one, ours, theirs in both if ours != theirs]
 
 
@@ -207,7 +207,7 @@ def test_a_datagram_that_no_route_takes_is_counted_with_its_reason(rig: Rig, rea
     assert rig.rejected() == reason
     assert (rig.sent, rig.published) == ([], [])
     assert [report.reason for report in rig.reports] == ([] if reason == "ignored" else [reason])
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_every_reason_has_its_datagram() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.fuzz_engine import fuzz
-from router.compiler.books import REJECT_REASONS
+from router.compiler.metrics import REJECT_REASONS
 
 
 def test_damaged_datagrams_are_counted_and_nothing_else() -> None:

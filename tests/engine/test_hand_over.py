@@ -106,7 +106,7 @@ def test_a_deadman_that_has_tripped_is_released_by_who_takes_over(rig: Rig) -> N
     operator_drives(rig, 50 * MS)
     rig.pass_time(SECOND)
     assert rig.changes[2:] == [("manual_drive", True)]
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_at_the_end_only_the_deadman_of_who_drives_has_a_last_word(rig: Rig) -> None:

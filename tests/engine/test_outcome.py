@@ -6,7 +6,7 @@ import errno
 
 import pytest
 
-from router.compiler.books import DROP_REASONS
+from router.compiler.metrics import DROP_REASONS
 from router.errors import MappingError, NonFiniteError
 from tests.engine.target import Destination, Topic
 

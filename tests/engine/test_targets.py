@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from router.compiler.books import HISTOGRAM_BOUNDS_NS
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.compiler.program import Program
 from tests.engine.rig import BASESTATION, DRIVING_BOARD, SENSOR_BOARD, STRANGER, PublishError, Rig, program
 from tests.engine.wire import I32, envelopes, framed, rover_envelope, tag
@@ -77,7 +77,7 @@ def test_a_destination_that_fails_is_counted_and_the_others_are_served(rig: Rig,
     [report] = rig.reports
     assert (report.kind, report.place, report.target) == ("drop", "imu_info", "basestation")
     assert (report.reason, report.error) == (reason, error)
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 @pytest.mark.parametrize("error", [PublishError("gone"), OSError(errno.EAGAIN, "full")])
@@ -87,14 +87,14 @@ def test_a_topic_that_fails_is_counted_and_the_others_are_served(rig: Rig, error
 
     assert rig.dropped("imu_info", "imu_data") == {"publish_error": 1}
     assert [name for name, _ in rig.sent + rig.published] == ["basestation", "recorder", "accel"]
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_everything_may_fail_at_once(rig: Rig) -> None:
     rig.failures = dict.fromkeys(("basestation", "recorder", "imu_data", "accel"), OSError(errno.EIO, "broken"))
     rig.receive(framed(IMU, b""))
     assert len(rig.reports) == 4
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_a_fault_of_our_own_is_loud(rig: Rig) -> None:
@@ -111,14 +111,14 @@ def test_a_value_without_a_result_costs_its_own_target_only(rig: Rig) -> None:
     rig.receive(ph(0.0))
     assert rig.dropped("ph_info", "inverse") == {"mapping_error": 1}
     assert [name for name, _ in rig.published] == ["whole", "narrow", "root"]
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_what_is_not_finite_has_a_reason_of_its_own(rig: Rig, value: float) -> None:
     rig.receive(ph(value))
     assert rig.dropped("ph_info", "whole") == {"non_finite": 1}
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_forwarding_waits_for_no_mapping(rig: Rig) -> None:
@@ -145,7 +145,7 @@ def test_a_topic_that_nobody_wants_is_filtered_and_not_filled(made: Program) -> 
     rig.wanted["inverse"][0] = True
     rig.receive(ph(2.0))
     assert rig.count("messages_published", "ph_info", "inverse") == 1
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_when_filters_without_a_word(rig: Rig) -> None:
@@ -155,7 +155,7 @@ def test_when_filters_without_a_word(rig: Rig) -> None:
     assert [name for name, _ in rig.sent] == ["recorder", "basestation", "recorder"]
     assert rig.count("messages_filtered", "ph_info", "basestation") == 1
     assert rig.reports == []
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_max_rate_thins_out_and_counts_what_it_dropped(rig: Rig) -> None:
@@ -168,7 +168,7 @@ def test_max_rate_thins_out_and_counts_what_it_dropped(rig: Rig) -> None:
     assert rig.dropped("gps_info", "basestation") == {"rate_limited": 1000 - delivered}
     assert rig.count("messages_published", "gps_info", "late") == 1000
     assert rig.reports == []
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_what_when_refuses_takes_no_place_in_the_rate(rig: Rig) -> None:
@@ -188,8 +188,8 @@ def test_a_route_is_timed_up_to_its_last_target(rig: Rig, work_ns: int) -> None:
     rig.receive(framed(IMU, b""))
 
     elapsed = 4 * rig.work_ns
-    assert rig.count("route_seconds", "imu_info", part=bisect_left(HISTOGRAM_BOUNDS_NS, elapsed)) == 1
-    assert rig.count("route_seconds", "imu_info", part=len(HISTOGRAM_BOUNDS_NS) + 1) == elapsed
+    assert rig.count("route_duration_seconds", "imu_info", part=bisect_left(HISTOGRAM_BOUNDS_NS, elapsed)) == 1
+    assert rig.count("route_duration_seconds", "imu_info", part=len(HISTOGRAM_BOUNDS_NS) + 1) == elapsed
     assert rig.count("route_last_message_timestamp_seconds", "imu_info") == rig.WALL + 1_000_000
 
 
@@ -219,4 +219,4 @@ def test_the_books_balance_whatever_happens(made: Program, data: st.DataObject) 
         peer = data.draw(st.sampled_from([SENSOR_BOARD, SENSOR_BOARD, DRIVING_BOARD, BASESTATION, STRANGER]))
         rig.receive(data.draw(datagrams), peer, listener)
         assert rig.ledger.total("datagrams_rejected", listener) + rig.ledger.total("messages_received") == before + 1
-        rig.assert_books_balance()
+        rig.assert_counters_balance()

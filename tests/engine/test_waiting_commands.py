@@ -71,7 +71,7 @@ def test_commands_beside_more_bulk_than_the_budget_are_neither_late_nor_stale(ri
     assert rig.changes == []
     assert rig.count("datagrams_sent", "ph_info", "far_board") * len(bulk) == pytest.approx(90_000, abs=15_001)
     rig.pass_time(100 * SECOND)
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_it_trips_when_all_commands_are_dropped(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_it_trips_when_all_commands_are_dropped(tmp_path: Path) -> None:
     assert rig.changes == [("manual_drive", True), ("manual_drive", False)]
     assert rig.sent[-1] == ("far_board", TURN)
     rig.pass_time(SECOND)
-    rig.assert_books_balance()
+    rig.assert_counters_balance()
 
 
 def test_one_that_takes_over_disarms_it_when_it_leaves_and_not_when_it_is_dropped(rig: Rig) -> None:

@@ -159,8 +159,8 @@ class Stage:
         self.faults: list[Exception] = []
         self.reports: list[Report] = []
         self.published: list[tuple[str, bytes]] = []
-        self.counts = made.books.fresh_counts()
-        self._books = made.books
+        self.counts = made.counters.fresh_counts()
+        self._counters = made.counters
         self._graph = graph
         self._plans = made.gateways
         self._closing = ExitStack()
@@ -183,10 +183,10 @@ class Stage:
         self._closing.close()
 
     def count(self, metric: str, *labels: str) -> int:
-        return self.counts[self._books.slot(metric, *labels)]
+        return self.counts[self._counters.index(metric, *labels)]
 
     def ledger(self, plan: GatewayPlan) -> Ledger:
-        return Ledger(plan.settings, self._books, self.counts, self.reports.append, wall_ns)
+        return Ledger(plan.settings, self._counters, self.counts, self.reports.append, wall_ns)
 
     def inlet(self, plan: GatewayPlan) -> Inlet:
         def publisher(topic: str) -> Any:
@@ -200,7 +200,7 @@ class Stage:
             clock_ns=monotonic_ns,
             wall_ns=wall_ns,
         )
-        return Inlet(plan, Style.PLAIN, self._books, self.counts, outlets)
+        return Inlet(plan, Style.PLAIN, self._counters, self.counts, outlets)
 
 
 class Played:

@@ -22,7 +22,7 @@ from tests.ports import free_port
 
 def opened(made: Program) -> GatewayThread:
     ros = cast("Any", SimpleNamespace(topics=Graph({}), publish={}, publish_errors=()))
-    thread = GatewayThread(ros, made.books.fresh_counts(), print, print)
+    thread = GatewayThread(ros, made.counters.fresh_counts(), print, print)
     try:
         thread.finish(thread.prepare(made, lambda *_: lambda _: None))
     except BaseException:

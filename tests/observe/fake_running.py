@@ -1,4 +1,4 @@
-"""A router that runs nothing: a real program, books that a test writes, and datagrams that it has seen come."""
+"""A router that runs nothing: a real program, counters that a test writes, and datagrams that it has seen come."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from prometheus_client.metrics_core import Metric as Family
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM
-from router.observe.metrics import BooksCollector
+from router.observe.metrics import CountersCollector
 from router.observe.running import ReloadResult
 from router.recording.mirror import Mirror
 from tests.tables import ROUTES
@@ -37,12 +37,12 @@ class FakeRunning:
         self.failures: list[Exception] = []
         self.collected = 0
         self.mirror = Mirror(MAX_DATAGRAM, lambda: None, self.failures.append)
-        self.counts = program.books.fresh_counts()
+        self.counts = program.counters.fresh_counts()
         self._turns = 0
 
     def count(self, metric: str, *labels: str, to: int) -> None:
-        """Times are in ns, as in the books."""
-        self.counts[self.program.books.slot(metric, *labels)] = to
+        """Times are in ns, as in the counters."""
+        self.counts[self.program.counters.index(metric, *labels)] = to
 
     def receive(self, data: bytes, peer: tuple[str, int], listener: str = "rover") -> None:
         self.mirror.tee(listener, lambda *_: None)(data, peer)
@@ -53,7 +53,7 @@ class FakeRunning:
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
         }
-        return BooksCollector(self.program.books, [self.counts], asked, {"version": "1"}).collect()
+        return CountersCollector(self.program.counters, [self.counts], asked, {"version": "1"}).collect()
 
     def samples(self) -> Iterator[tuple[str, dict[str, str], float]]:
         return ((sample.name, sample.labels, sample.value) for family in self.collect() for sample in family.samples)

@@ -18,7 +18,7 @@ from router.compiler.program import Program
 from router.observe import diagnostics
 from router.observe.diagnostics import LOOKS, Diagnostics, Watch, diagnostic_array
 from router.observe.diagnostics_findings import Level, Status
-from router.observe.metrics import BooksCollector
+from router.observe.metrics import CountersCollector
 from router.observe.running import Running
 from router.ros.types import installed_class
 from tests.tables import ROUTES
@@ -57,7 +57,7 @@ class Counting:
 
     def __post_init__(self) -> None:
         drops = {"kernel_drops": lambda: [(["rover"], self.kernel_drops)]}
-        self._collector = BooksCollector(self.program.books, [self.counts], drops, {})
+        self._collector = CountersCollector(self.program.counters, [self.counts], drops, {})
         self.watch = Watch(cast("Running", self))
         self.add(1, "config_last_reload_successful")
 
@@ -65,10 +65,10 @@ class Counting:
         return self._collector.collect()
 
     def add(self, times: int, metric: str, *labels: str) -> None:
-        self.counts[self.program.books.slot(metric, *labels)] += times
+        self.counts[self.program.counters.index(metric, *labels)] += times
 
     def set_to(self, value: int, metric: str, *labels: str) -> None:
-        self.counts[self.program.books.slot(metric, *labels)] = value
+        self.counts[self.program.counters.index(metric, *labels)] = value
 
     @property
     def wall(self) -> int:
@@ -94,7 +94,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Program:
 @pytest.fixture
 def router(program: Program) -> Counting:
     """It has been looked at once."""
-    counting = Counting(program, program.books.fresh_counts())
+    counting = Counting(program, program.counters.fresh_counts())
     counting.after(0)
     return counting
 

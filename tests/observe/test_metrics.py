@@ -13,10 +13,10 @@ from typing import cast
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from router.compiler.books import HISTOGRAM_BOUNDS_NS, METRICS, Books
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, METRICS, Counters
 from router.errors import SourceSpan, StartError
 from router.observe.http import HttpServer
-from router.observe.metrics import BooksCollector
+from router.observe.metrics import CountersCollector
 from router.observe.running import Running
 from router.table.model import Address
 
@@ -42,7 +42,7 @@ BUILD = {"version": "1", "table_sha256": "aa", "protos_sha256": "bb"}
 
 @dataclass
 class Scraped:
-    """Books with one series per metric, two threads' counts, and what a scrape shows of them."""
+    """Counters with one series per metric, two threads' counts, and what a scrape shows of them."""
 
     slots: dict[str, int]
     threads: list[list[int]]
@@ -66,11 +66,13 @@ class Scraped:
 @pytest.fixture
 def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     monkeypatch.setattr("router.observe.http_answers.KEPT_SECONDS", 0)
-    books = Books()
-    slots = {metric.name: books.slot(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS}
-    threads = [books.fresh_counts(), books.fresh_counts()]
+    counters = Counters()
+    slots = {
+        metric.name: counters.index(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS
+    }
+    threads = [counters.fresh_counts(), counters.fresh_counts()]
     result = Scraped(slots, threads, 0, LOOPBACK)
-    collector = BooksCollector(books, threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD)
+    collector = CountersCollector(counters, threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD)
     with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), None)) as server:
         result.address = server.address
         yield result
@@ -117,15 +119,15 @@ def test_what_is_in_no_slot_is_asked_for_at_each_scrape(scraped: Scraped) -> Non
 
 
 def test_histogram_buckets_are_cumulative_and_in_seconds(scraped: Scraped) -> None:
-    first = scraped.slots["route_seconds"]
+    first = scraped.slots["route_duration_seconds"]
     for counts, elapsed_ns in ((scraped.threads[0], 9_000), (scraped.threads[1], 9_000), (scraped.threads[0], 10**9)):
         counts[first + bisect_left(HISTOGRAM_BOUNDS_NS, elapsed_ns)] += 1
         counts[first + len(HISTOGRAM_BOUNDS_NS) + 1] += elapsed_ns
-    assert scraped.value("router_route_seconds_bucket", le="1e-05") == 2
-    assert scraped.value("router_route_seconds_bucket", le="0.05") == 2
-    assert scraped.value("router_route_seconds_bucket", le="+Inf") == 3
-    assert scraped.value("router_route_seconds_count") == 3
-    assert scraped.value("router_route_seconds_sum") == pytest.approx(1.000018)
+    assert scraped.value("router_route_duration_seconds_bucket", le="1e-05") == 2
+    assert scraped.value("router_route_duration_seconds_bucket", le="0.05") == 2
+    assert scraped.value("router_route_duration_seconds_bucket", le="+Inf") == 3
+    assert scraped.value("router_route_duration_seconds_count") == 3
+    assert scraped.value("router_route_duration_seconds_sum") == pytest.approx(1.000018)
 
 
 def test_the_process_is_described_and_python_is_not(scraped: Scraped) -> None:
@@ -138,4 +140,4 @@ def test_an_address_in_use_is_refused_with_who_has_it() -> None:
     with socket.create_server(LOOPBACK) as other:
         taken = Address(*other.getsockname())
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: metrics cannot be served at {taken}: .*\(pid \d+\)"):
-            HttpServer(taken, SPAN, cast("Running", BooksCollector(Books(), [[]], {}, BUILD)), None)
+            HttpServer(taken, SPAN, cast("Running", CountersCollector(Counters(), [[]], {}, BUILD)), None)

@@ -1,4 +1,4 @@
-"""What the status page is told: the numbers of the books, the map of the table, and last values while it looks."""
+"""What the status page is told: the numbers of the counters, the map of the table, and last values while it looks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from router.compiler.books import METRICS
+from router.compiler.metrics import METRICS
 from router.observe import last_values
 from router.observe.http_answers import PAGE
 from router.observe.status import Status

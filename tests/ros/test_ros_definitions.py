@@ -88,7 +88,7 @@ def test_a_request_without_fields_has_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("slot", "expected"),
+    ("index", "expected"),
     [
         (BasicType("boolean"), Bool()),
         (BasicType("octet"), Int(8, signed=False, octet=True)),
@@ -105,8 +105,8 @@ def test_a_request_without_fields_has_none() -> None:
         (BoundedSequence(UnboundedWString(), 4), List(String(wide=True), bound=4)),
     ],
 )
-def test_every_kind_of_slot_is_known(monkeypatch: pytest.MonkeyPatch, slot: object, expected: Type) -> None:
-    monkeypatch.setattr(ros_definitions, "installed_class", lambda _: generated(it=slot))
+def test_every_kind_of_slot_is_known(monkeypatch: pytest.MonkeyPatch, index: object, expected: Type) -> None:
+    monkeypatch.setattr(ros_definitions, "installed_class", lambda _: generated(it=index))
     assert shape(installed_type("made_msgs/msg/Made")) == ("made_msgs/msg/Made", [("it", shape(expected))])
 
 
@@ -125,8 +125,8 @@ def test_types_in_an_action_keep_their_namespace_and_are_one_each(monkeypatch: p
 
 @pytest.mark.parametrize("unknown", ["wchar", "long double", "char"])
 def test_a_type_that_only_idl_has_is_refused_with_its_place(monkeypatch: pytest.MonkeyPatch, unknown: str) -> None:
-    slot = UnboundedSequence(BasicType(unknown))
-    monkeypatch.setattr(ros_definitions, "installed_class", lambda _: generated(it=slot))
+    index = UnboundedSequence(BasicType(unknown))
+    monkeypatch.setattr(ros_definitions, "installed_class", lambda _: generated(it=index))
     with pytest.raises(StartError, match=f"^made_msgs/msg/Made.it is a {unknown}, which the router cannot read"):
         installed_type("made_msgs/msg/Made")
 

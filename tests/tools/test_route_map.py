@@ -74,7 +74,7 @@ def test_links_run_from_the_right_of_a_box_to_the_left_of_another(name: str) -> 
 @pytest.mark.parametrize("name", TABLES)
 def test_links_are_named_as_the_metrics_name_what_flows(name: str) -> None:
     program = program_of(name)
-    series = {(each.metric, *each.labels) for each, _ in program.books.series()}
+    series = {(each.metric, *each.labels) for each, _ in program.counters.series()}
     parts, ties = map_parts(program.table)
     kinds = {part.key: part.kind for part in parts}
     columns = {part.key: part.column for part in parts}
@@ -93,7 +93,7 @@ def test_every_delivery_of_the_books_has_a_link() -> None:
     program = program_of("sim.yaml")
     delivered = ("datagrams_sent", "messages_published", "messages_sent")
     ways = {(name, gateway.transport.value.value) for name, gateway in program.table.gateways.items()}
-    counted = {each.labels for each, _ in program.books.series() if each.metric in delivered} - ways
+    counted = {each.labels for each, _ in program.counters.series() if each.metric in delivered} - ways
     assert counted <= {(tie.route, tie.label) for tie in map_parts(program.table)[1]}
 
 

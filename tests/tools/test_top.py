@@ -7,7 +7,7 @@ import math
 import pytest
 from rich.console import Console
 
-from router.compiler.books import HISTOGRAM_BOUNDS_NS
+from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.tools.live import Snapshot
 from router.tools.top import Order, Top, quantile, top
 from router.tools.top_view import age_text, latency_text, page, screen
@@ -32,7 +32,7 @@ def snapshot(at: float, imu: int, gps: int, stale: int = 0, tripped: int = 0) ->
             "route_last_message_timestamp_seconds": {("imu_info",): NOW - 5, ("gps_info",): 0},
             "endpoint_last_seen_timestamp_seconds": {("sensor_board",): NOW - 1, ("arm_board",): 0},
             "deadman_active": {("imu_info",): tripped},
-            "route_seconds_bucket": {**buckets("imu_info", 0, imu), **buckets("gps_info", 0, 0, 0, 0, gps)},
+            "route_duration_seconds_bucket": {**buckets("imu_info", 0, imu), **buckets("gps_info", 0, 0, 0, 0, gps)},
         },
     )
 
@@ -58,12 +58,12 @@ def test_latencies_are_those_between_the_snapshots() -> None:
 
 def test_a_router_that_was_started_anew_has_no_latency_of_the_one_before() -> None:
     before, after = snapshot(10, 0, 3), snapshot(12, 0, 0)
-    anew = {**after.values, "route_seconds_bucket": buckets("gps_info", 0, 0, 2, 2, 4)}
+    anew = {**after.values, "route_duration_seconds_bucket": buckets("gps_info", 0, 0, 2, 2, 4)}
     row = top(before, Snapshot(12, anew), NOW).rows[1]
     assert row.slowest is not None
     assert row.slowest > 0
-    shrunk = {**before.values, "route_seconds_bucket": buckets("gps_info", 5, 5, 5, 5, 5)}
-    grown = {**after.values, "route_seconds_bucket": buckets("gps_info", 0, 0, 0, 6, 6)}
+    shrunk = {**before.values, "route_duration_seconds_bucket": buckets("gps_info", 5, 5, 5, 5, 5)}
+    grown = {**after.values, "route_duration_seconds_bucket": buckets("gps_info", 0, 0, 0, 6, 6)}
     assert top(Snapshot(10, shrunk), Snapshot(12, grown), NOW).rows[1].median == pytest.approx(75e-6)
 
 

@@ -1,7 +1,7 @@
-"""The books: every series that the router exports, and where in a flat list of integers it is counted.
+"""The counters: every series that the router exports, and where in a flat list of integers it is counted.
 
 The metrics are declared once, in `METRICS`; the collector, the documentation and the compiler read
-them from here. Counting itself is `counts[slot] += 1` in the thread that owns the list.
+them from here. Counting itself is `counts[index] += 1` in the thread that owns the list.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric. `kind` is counter, histogram, number, or time (nanoseconds in the books, seconds exported)."""
+    """One metric. `kind` is counter, histogram, number, or time (nanoseconds in the counters, seconds exported)."""
 
     name: str
     kind: str
@@ -35,7 +35,7 @@ METRICS = (
     Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
     Metric("messages_filtered", "counter", ("route", "target"), "Messages that `when` held back, or nobody wanted."),
     Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
-    Metric("route_seconds", "histogram", ("route",), "Time from message received to all targets served."),
+    Metric("route_duration_seconds", "histogram", ("route",), "Time from message received to all targets served."),
     Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last took a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
     Metric("endpoint_stale_after_seconds", "number", ("endpoint",), "Silent for longer, it is stale."),
@@ -160,7 +160,7 @@ HISTOGRAM_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One slot's meaning: a metric's name and its label values, in the metric's order.
+    """One index's meaning: a metric's name and its label values, in the metric's order.
 
     A histogram has a run of slots: one for each bound, one for everything slower, one for the sum (ns).
     """
@@ -170,14 +170,14 @@ class Series:
     part: int = 0
 
 
-HISTOGRAM_SLOTS = len(HISTOGRAM_BOUNDS_NS) + 2
+HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
 
 
 @dataclass(slots=True)
-class Books:
-    """Slots by series. Asking twice for one series gives the same slot, so series exist once.
+class Counters:
+    """Slots by series. Asking twice for one series gives the same index, so series exist once.
 
-    Books may continue those of an earlier program (`continued`): what both have is counted in the same slots. What
+    Counters may continue those of an earlier program (`continued`): what both have is counted in the same slots. What
     only the earlier one had is gone: it is no longer current, but keeps its slots until `settle` frees them.
     """
 
@@ -186,13 +186,13 @@ class Books:
     _free: dict[int, list[int]] = field(default_factory=dict)  # the first slots of free runs, by length
     _size: int = 0
 
-    def continued(self) -> Books:
-        """Books for the program that comes next, in which nothing is current yet. These here stay as they are."""
-        return Books(
+    def continued(self) -> Counters:
+        """Counters for the program that comes next, in which nothing is current yet. These here stay as they are."""
+        return Counters(
             self._slots.copy(), set(), {length: starts.copy() for length, starts in self._free.items()}, self._size
         )
 
-    def slot(self, metric: str, *labels: str) -> int:
+    def index(self, metric: str, *labels: str) -> int:
         declared = _BY_NAME[metric]
         if len(labels) != len(declared.labels):
             raise ValueError(f"{metric} has the labels {declared.labels}, not {labels}")
@@ -213,15 +213,15 @@ class Books:
         return self._size - length
 
     def series(self) -> Iterable[tuple[Series, int]]:
-        """Every series with its slot: those of this program, and those of earlier ones that counted something."""
+        """Every series with its index: those of this program, and those of earlier ones that counted something."""
         return self._slots.items()
 
     def fresh_counts(self) -> list[int]:
-        """A list of zeros, one for each slot, for one thread to own."""
+        """A list of zeros, one for each index, for one thread to own."""
         return [0] * self._size
 
     def grow(self, counts: list[int]) -> None:
-        """Gives the list of a thread that counts in earlier books room for these, in place."""
+        """Gives the list of a thread that counts in earlier counters room for these, in place."""
         counts.extend([0] * (self._size - len(counts)))
 
     def settle(self, threads: Iterable[list[int]]) -> None:
@@ -248,7 +248,7 @@ _COUNTED = ("counter", "histogram")
 
 
 def _slots_of(metric: Metric) -> int:
-    return HISTOGRAM_SLOTS if metric.kind == "histogram" else 1
+    return HISTOGRAM_CELLS if metric.kind == "histogram" else 1
 
 
 _BY_NAME = {metric.name: metric for metric in METRICS}

@@ -1,16 +1,16 @@
-"""Every series has a slot of its own from the start, and the histogram counts each duration once."""
+"""Every series has a index of its own from the start, and the histogram counts each duration once."""
 
 from __future__ import annotations
 
 import pytest
 
-from router.compiler.books import (
+from router.compiler.metrics import (
     DROP_REASONS,
-    HISTOGRAM_SLOTS,
+    HISTOGRAM_CELLS,
     METRICS,
     REJECT_REASONS,
     UNKNOWN_CASE,
-    Books,
+    Counters,
     Series,
     metric,
 )
@@ -18,23 +18,23 @@ from router.compiler.program import Program
 
 
 def test_asking_twice_gives_the_same_slot() -> None:
-    books = Books()
-    assert books.slot("datagrams_received", "a") == books.slot("datagrams_received", "a") == 0
-    assert books.slot("datagrams_received", "b") == 1
-    assert books.fresh_counts() == [0, 0]
+    counters = Counters()
+    assert counters.index("datagrams_received", "a") == counters.index("datagrams_received", "a") == 0
+    assert counters.index("datagrams_received", "b") == 1
+    assert counters.fresh_counts() == [0, 0]
 
 
 def test_histogram_takes_a_run_of_slots() -> None:
-    books = Books()
-    first = books.slot("route_seconds", "a")
-    assert books.slot("route_seconds", "b") == first + HISTOGRAM_SLOTS
-    parts = [series.part for series, _ in books.series() if series.labels == ("a",)]
-    assert parts == list(range(HISTOGRAM_SLOTS))
+    counters = Counters()
+    first = counters.index("route_duration_seconds", "a")
+    assert counters.index("route_duration_seconds", "b") == first + HISTOGRAM_CELLS
+    parts = [series.part for series, _ in counters.series() if series.labels == ("a",)]
+    assert parts == list(range(HISTOGRAM_CELLS))
 
 
 def test_wrong_number_of_labels_is_a_mistake_of_ours() -> None:
     with pytest.raises(ValueError, match="labels"):
-        Books().slot("datagrams_rejected", "a")
+        Counters().index("datagrams_rejected", "a")
 
 
 def test_metric_names_are_unique() -> None:
@@ -42,7 +42,7 @@ def test_metric_names_are_unique() -> None:
 
 
 def test_rover_has_every_series_before_the_first_datagram(rover_program: Program) -> None:
-    series = dict(rover_program.books.series())
+    series = dict(rover_program.counters.series())
     assert len(set(series.values())) == len(series)
     assert sorted(series.values()) == list(range(len(series)))
     for listener in rover_program.listeners:
@@ -57,20 +57,20 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Program
             assert Series(delivered, (route, target.target)) in series
             assert Series("messages_filtered", (route, target.target)) in series
             assert all(Series("messages_dropped", (route, target.target, reason)) in series for reason in DROP_REASONS)
-        for name in ("route_seconds", "route_last_message_timestamp_seconds"):
+        for name in ("route_duration_seconds", "route_last_message_timestamp_seconds"):
             assert Series(name, (route,)) in series
 
 
 def test_books_that_continue_others_keep_what_was_counted() -> None:
-    first = Books()
-    sent, gone = first.slot("datagrams_received", "rover"), first.slot("datagrams_received", "arm")
-    unused, active = first.slot("datagrams_padded", "arm"), first.slot("deadman_active", "drive")
-    timed = first.slot("route_seconds", "drive")
+    first = Counters()
+    sent, gone = first.index("datagrams_received", "rover"), first.index("datagrams_received", "arm")
+    unused, active = first.index("datagrams_padded", "arm"), first.index("deadman_active", "drive")
+    timed = first.index("route_duration_seconds", "drive")
     counts = first.fresh_counts()
     counts[sent], counts[gone], counts[active] = 3, 4, 1
     then = first.continued()
-    assert then.slot("datagrams_received", "rover") == sent
-    new = then.slot("datagrams_received", "new")
+    assert then.index("datagrams_received", "rover") == sent
+    new = then.index("datagrams_received", "new")
     then.grow(counts)
     assert (counts[sent], counts[new]) == (3, 0)
     then.settle([counts])
@@ -79,7 +79,10 @@ def test_books_that_continue_others_keep_what_was_counted() -> None:
     assert counts[active] == 0
     last = then.continued()
     size = len(last.fresh_counts())
-    assert {last.slot("datagrams_padded", "x"), last.slot("datagrams_padded", "y")} == {unused, active}
-    assert last.slot("route_seconds", "x") == timed
+    assert {last.index("datagrams_padded", "x"), last.index("datagrams_padded", "y")} == {unused, active}
+    assert last.index("route_duration_seconds", "x") == timed
     assert len(last.fresh_counts()) == size
-    assert {series.metric for series, _ in first.series()} >= {"deadman_active", "route_seconds"}  # as they were
+    assert {series.metric for series, _ in first.series()} >= {
+        "deadman_active",
+        "route_duration_seconds",
+    }  # as they were

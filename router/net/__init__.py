@@ -1,0 +1,1 @@
+"""UDP: sockets, the receive thread, what the kernel dropped."""

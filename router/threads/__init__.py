@@ -1,0 +1,1 @@
+"""Threads, wake events, and locks with timers."""
