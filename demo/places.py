@@ -5,8 +5,8 @@ from __future__ import annotations
 import random
 import socket
 
+from router.errors import UsageError
 from router.table.model import Address, RouteTable, Transport
-from router.tools import UsageError
 from router.tools.places import open_udp
 
 DOMAINS = range(1, 102)

@@ -158,6 +158,10 @@ class TableError(RouterError):
         self.diagnostics = tuple(diagnostics)
 
 
+class UsageError(RouterError):
+    """What the operator asked for cannot be done; the message is one line that says what and why."""
+
+
 class StartError(RouterError):
     """An edge could not be opened; the message says which and what to do."""
 

@@ -51,9 +51,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drawn(table: RouteTable, suffix: str) -> str:
+    from router.observe.route_map import route_map
     from router.tools.graph_svg import svg
     from router.tools.graph_text import dot, mermaid
-    from router.tools.route_map import route_map
 
     if suffix == ".svg":
         return svg(route_map(table), table.path.name)

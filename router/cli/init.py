@@ -12,8 +12,7 @@ from pathlib import Path
 from router.assets import asset
 from router.cli import OK, VERBS
 from router.cli.tool_options import explained
-from router.errors import shown_path
-from router.tools import UsageError
+from router.errors import UsageError, shown_path
 
 _PARTS = {
     "routes": "the example tables and their test: `router validate`, `router test`",

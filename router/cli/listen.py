@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import explained, whole
-from router.errors import TransportError
-from router.tools import UsageError
+from router.errors import TransportError, UsageError
 
 if TYPE_CHECKING:
     from router.tools.listening_reading import Heard

@@ -41,7 +41,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 @explained
 def run(args: argparse.Namespace) -> int:
     from router.assets import asset, is_installed
-    from router.tools import UsageError
+    from router.errors import UsageError
     from router.tools.new_message import new_message
     from router.tools.new_message_files import Written, changes
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import OK, VERBS
 from router.cli.tool_options import add_router_options, explained, progress, running_url
-from router.tools import UsageError
+from router.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import DEFAULT_TABLE, OK, VERBS
 from router.cli.tool_options import explained, progress
-from router.errors import TableError
-from router.tools import UsageError
+from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 from router.cli import VERBS
 from router.cli.tool_options import add_url_option, add_wire_options, explained, load_wire, running_url, whole
-from router.errors import StartError, nearest
+from router.errors import StartError, UsageError, nearest
 from router.ros.environment import check_environment, ros_remedy
-from router.tools import UsageError
 
 if TYPE_CHECKING:
     from router.table.model import RouteTable

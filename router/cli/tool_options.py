@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
 from router.cli import BAD_USAGE, DEFAULT_TABLE
-from router.errors import TransportError
-from router.tools import UsageError
+from router.errors import TransportError, UsageError
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn

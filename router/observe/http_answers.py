@@ -19,10 +19,10 @@ from typing import Any
 from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.exposition import choose_encoder
 
+from router.assets import page_policy
 from router.clock import wall_ns
 from router.errors import RouterError
 from router.observe.http_callers import COLLECTED_AT
-from router.observe.page_policy import page_policy
 from router.observe.running import Running
 from router.observe.status import MEASURES, Status
 

@@ -10,9 +10,9 @@ from typing import Any
 from router.clock import wall_ns
 from router.errors import shown_path
 from router.observe.last_values import LastValues
+from router.observe.route_map import NARROW, WIDE, Measures, RouteMap, route_map
 from router.observe.running import Running
 from router.observe.status_numbers import numbers
-from router.tools.route_map import NARROW, WIDE, Measures, RouteMap, route_map
 
 MEASURES: dict[str, Measures] = {
     "narrow": NARROW._replace(letters=17, letter=5.5),

@@ -22,11 +22,11 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from router.engine.framing import LEN
+from router.errors import UsageError
 from router.recording.channels import Holds, varint
 from router.recording.chunk import HEAD
 from router.recording.file import LIBRARY, METADATA
 from router.recording.schemas import Datagram
-from router.tools import UsageError
 
 Peer = tuple[str, int]
 

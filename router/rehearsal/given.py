@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from router.errors import Code, SourceSpan
+from router.errors import Code, SourceSpan, UsageError
 from router.rehearsal.matching import MessageMatch, Moments
 from router.rehearsal.messages import fill, values
 from router.rehearsal.model import Given, GivenDatagram, GivenMessage, Repetition
@@ -12,7 +12,6 @@ from router.table.model import Located
 from router.table.nodes import MappingNode, Node
 from router.table.reading import UnsoundError, boolean, integer, optional_text
 from router.table.units import parse_duration
-from router.tools import UsageError
 from router.tools.wire import Wire, as_old_boards_send
 from router.types.protobuf import PayloadCase
 from tests.oracles import reference_cdr

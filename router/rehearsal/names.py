@@ -8,10 +8,9 @@ from functools import cached_property
 from router.compiler import Checked
 from router.compiler.program import Program
 from router.engine.dispatch import Peer
-from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.errors import Code, Diagnostic, SourceSpan, UsageError, did_you_mean
 from router.table.model import Address, Endpoint
 from router.table.reading import UnsoundError
-from router.tools import UsageError
 from router.tools.places import origin
 from router.types.model import Enum, MessageType
 from router.types.protobuf import PayloadCase

@@ -9,13 +9,12 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 
-from router.errors import Code, SourceSpan, did_you_mean
+from router.errors import Code, SourceSpan, UsageError, did_you_mean
 from router.rehearsal.matching import AnyValue, Exactly, ListMatch, Match, MessageMatch, Moment, Near
 from router.rehearsal.names import unsound
 from router.rehearsal.shown import TIMES
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.table.units import parse_duration
-from router.tools import UsageError
 from router.tools.fields import parse
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, Type
 

@@ -15,10 +15,9 @@ from router.compiler.kinds import BoolKind
 from router.compiler.namespace import NAMESPACE
 from router.compiler.source import Source
 from router.engine.outcome import MAPPING_FAILURES
-from router.errors import Code, Diagnostic, SourceSpan
+from router.errors import Code, Diagnostic, SourceSpan, UsageError
 from router.table.model import Expression
 from router.table.places import TextPlace
-from router.tools import UsageError
 from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import PayloadCase
 

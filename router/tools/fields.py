@@ -12,8 +12,7 @@ from typing import Any
 
 from google.protobuf.message import Message
 
-from router.errors import did_you_mean
-from router.tools import UsageError
+from router.errors import UsageError, did_you_mean
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 LARGEST_LIST = 65_507

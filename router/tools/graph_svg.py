@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from xml.sax.saxutils import escape, quoteattr
 
-from router.tools.route_map import COLUMNS, Link, Node, RouteMap
+from router.observe.route_map import COLUMNS, Link, Node, RouteMap
 
 _STYLE = """
 .route-map { --ground: #fff; --box: #f3f4f6; --text: #000; --faint: #505050; --line: #b4b8bf; --edge: #7d838c;

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from xml.sax.saxutils import escape
 
+from router.observe.route_map import COLUMNS
+from router.observe.route_map_parts import Part, PartKind, Tie, map_parts
 from router.table.model import RouteTable
-from router.tools.route_map import COLUMNS
-from router.tools.route_map_parts import Part, PartKind, Tie, map_parts
 
 _MERMAID_SHAPES = {PartKind.TOPIC: ("([", "])"), PartKind.CLIENTS: ("([", "])"), PartKind.ANYONE: ("((", "))")}
 _DOT_STYLES = {

@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from urllib.parse import parse_qs
 
 from router.compiler.selection import matcher, pattern_problem
-from router.errors import SourceSpan, did_you_mean
+from router.errors import SourceSpan, UsageError, did_you_mean
 from router.table.model import Address, GatewayFormat, Located, TopicPattern, ZenohSettings
-from router.tools import UsageError, places
+from router.tools import places
 from router.tools.listening import Source
 
 _FORMS = "[udp://][HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?connect=LOCATOR"

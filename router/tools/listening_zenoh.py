@@ -8,9 +8,8 @@ from collections.abc import Callable, Sequence
 
 import zenoh
 
-from router.errors import TransportError
+from router.errors import TransportError, UsageError
 from router.table.model import ZenohSettings
-from router.tools import UsageError
 from router.tools.listening import Arrival
 
 _ANSWER_TIMEOUT = 1.0

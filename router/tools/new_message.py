@@ -11,10 +11,9 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
-from router.errors import did_you_mean, nearest, shown_path
+from router.errors import UsageError, did_you_mean, nearest, shown_path
 from router.table.model import Endpoint, EndpointKind, RouteTable
 from router.table.scalars import resolve, surprise
-from router.tools import UsageError
 from router.tools.new_message_model import SCALARS, NewField, NewMessage, Site, prefix_of
 from router.tools.new_message_number import check_number
 from router.types.model import Enum, MessageType

@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from router.errors import shown_path
+from router.errors import UsageError, shown_path
 from router.table.model import RouteTable
-from router.tools import UsageError
 from router.tools.new_message_model import NewMessage, Site
 from router.tools.new_message_proto import proto_texts
 from router.tools.new_message_ros import msg_text

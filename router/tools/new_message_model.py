@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from router.compiler import Checked
+from router.errors import UsageError
 from router.table.model import EnvelopeSettings, RouteTable
-from router.tools import UsageError
 from router.types.protobuf import Envelope, ProtoSchema, load_protos
 
 SCALARS = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from router.tools import UsageError
+from router.errors import UsageError
 from router.tools.new_message_model import Site
 from router.types.lock_file import read_lock
 

@@ -12,9 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from router.errors import Severity, TableError
+from router.errors import Severity, TableError, UsageError
 from router.table.model import Located
-from router.tools import UsageError
 from router.tools.new_message_layout import aligned
 from router.tools.new_message_model import SCALARS, NewMessage, Site
 from router.types.lock import check_lock, extended_lock

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from router.tools import UsageError
+from router.errors import UsageError
 from router.tools.new_message_layout import aligned
 from router.tools.new_message_model import SCALARS, NewField, NewMessage, Site
 

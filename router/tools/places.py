@@ -11,10 +11,9 @@ from collections.abc import Callable
 from functools import cache
 
 from router.compiler.network import recognisers
-from router.errors import did_you_mean
+from router.errors import UsageError, did_you_mean
 from router.net.kernel import interface_address
 from router.table.model import Address, Listener, RouteTable
-from router.tools import UsageError
 
 ANY_HOST = "0.0.0.0"
 LOOPBACK = "127.0.0.1"

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from time import monotonic_ns, time_ns
 
+from router.errors import UsageError
 from router.observe.tap_stream import Lost
 from router.recording.channels import Channels
 from router.recording.encoding import Encoder
@@ -14,7 +15,6 @@ from router.recording.mirror import Seen
 from router.recording.mirrored import Known
 from router.recording.queue import PERIOD
 from router.table.model import RouteTable
-from router.tools import UsageError
 from router.types.protobuf import Envelope
 
 

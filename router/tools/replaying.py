@@ -11,10 +11,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from router.errors import TransportError, did_you_mean
+from router.errors import TransportError, UsageError, did_you_mean
 from router.recording.reader_mcap import Recorded, Recording
 from router.table.model import Address, RouteTable
-from router.tools import UsageError, places
+from router.tools import places
 
 MOST_SOCKETS = 256
 

@@ -14,12 +14,11 @@ from contextlib import closing, contextmanager
 from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
-from router.errors import TransportError
+from router.errors import TransportError, UsageError
 from router.observe.http_callers import COLLECTED_AT
 from router.observe.tap_stream import Lost, StreamReader
 from router.recording.mirror import Seen
 from router.table.model import RouteTable
-from router.tools import UsageError
 from router.tools.places import reachable
 
 PATIENCE = 5.0

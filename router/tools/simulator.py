@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.program import DeadmanPlan
+from router.errors import UsageError
 from router.table.model import Address, Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
-from router.tools import UsageError
 from router.tools.board import Change, boards
 from router.tools.inbox import Inbox
 from router.tools.models import moment

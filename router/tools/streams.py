@@ -7,9 +7,8 @@ import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
-from router.errors import did_you_mean
+from router.errors import UsageError, did_you_mean
 from router.table.model import ANY, RouteTable
-from router.tools import UsageError
 from router.tools.models import usual_rate
 from router.tools.wire import Wire
 from router.types.protobuf import PayloadCase

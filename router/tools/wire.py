@@ -15,10 +15,9 @@ from google.protobuf.message import Message
 from router.engine import MAX_DATAGRAM
 from router.engine.framing import restored
 from router.engine.payloadless import why_no_payload
-from router.errors import DecodeError, Severity, SourceSpan, TableError, did_you_mean, shown_path
+from router.errors import DecodeError, Severity, SourceSpan, TableError, UsageError, did_you_mean, shown_path
 from router.table import load_table
 from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, Located, RouteTable
-from router.tools import UsageError
 from router.tools.fields import set_fields
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
 

@@ -10,9 +10,9 @@ from router.app.watching import watched_files
 from router.compiler import Checked, check_table
 from router.compiler.definitions import Definitions
 from router.errors import Code, Diagnostic, Severity
+from router.observe.route_map import route_map
 from router.recording.mirrored import Known
 from router.tools.differences import differences
-from router.tools.route_map import route_map
 from tests.tables import PROTOS
 
 ONLY = "version: 1\ngateways: {headset: {transport: {udp: 127.0.0.9:8502}}}\n"

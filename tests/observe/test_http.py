@@ -31,10 +31,10 @@ from router.observe.http_answers import text
 from router.observe.http_callers import refusal
 from router.observe.http_connection import MOST_ANSWERING
 from router.observe.http_places import MOST_FROM_OTHERS, MOST_PER_HOST, MOST_TAPS
+from router.observe.route_map import Measures, RouteMap, route_map
 from router.observe.running import ReloadResult
 from router.observe.tap_stream import MAGIC
 from router.table.model import Address, RouteTable
-from router.tools.route_map import Measures, RouteMap, route_map
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import FakeRunning, sim_program
 

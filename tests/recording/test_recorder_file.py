@@ -12,10 +12,10 @@ from google.protobuf.message_factory import GetMessages
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel, Message, Schema
 
+from router.errors import UsageError
 from router.recording.channels import DATAGRAMS, Channels
 from router.recording.file import RecordingFile
 from router.recording.reader_mcap import Recording
-from router.tools import UsageError
 from tests.recording.recorder_rig import (
     MILLISECOND,
     START,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from router.tools import UsageError
+from router.errors import UsageError
 from router.tools.conditions import Condition
 from tests.observe.fake_running import sim_program
 

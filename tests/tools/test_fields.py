@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from router.tools import UsageError
+from router.errors import UsageError
 from router.tools.fields import set_fields
 from router.types.protobuf import PayloadCase
 

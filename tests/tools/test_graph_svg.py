@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
+from router.observe.route_map import route_map
 from router.table.model import RouteTable
 from router.tools.graph_svg import svg
-from router.tools.route_map import route_map
 from tests.tables import PROTOS, ROUTES
 
 SVG = "{http://www.w3.org/2000/svg}"

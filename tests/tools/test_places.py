@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from router.errors import UsageError
 from router.table.model import Address, RouteTable
-from router.tools import UsageError, places
+from router.tools import places
 from router.tools.wire import read_table
 
 

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from router.errors import TransportError
-from router.tools import UsageError
+from router.errors import TransportError, UsageError
 from router.tools.running_router import metrics
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from router.errors import UsageError
 from router.table.model import Address, RouteTable
-from router.tools import UsageError
 from router.tools.board import State
 from router.tools.places import LOOPBACK, open_udp, reachable
 from router.tools.sim_view import SimView

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from router.tools import UsageError
+from router.errors import UsageError
 from router.tools.streams import Silence, Stream, parse_silence
 from router.tools.wire import Wire
 

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from router.errors import DecodeError, TableError
-from router.tools import UsageError
+from router.errors import DecodeError, TableError, UsageError
 from router.tools.wire import Wire, as_old_boards_send, payload, read_table
 
 

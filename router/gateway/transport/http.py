@@ -9,7 +9,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from router.observe.page_policy import page_policy
+from router.assets import page_policy
 
 _HOST = re.compile(r"[A-Za-z0-9.:\[\]-]+")
 _LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")

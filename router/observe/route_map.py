@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from router.observe.route_map_parts import Part, Tie, map_parts
 from router.table.model import RouteTable
-from router.tools.route_map_parts import Part, Tie, map_parts
 
 COLUMNS = ("from", "payload case", "to")
 _MARGIN = 1

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.observe.route_map import NARROW, WIDE, Measures, route_map, shortened, spread
+from router.observe.route_map_parts import PartKind, map_parts
 from router.table.model import ANY, RouteTable
-from router.tools.route_map import NARROW, WIDE, Measures, route_map, shortened, spread
-from router.tools.route_map_parts import PartKind, map_parts
 from tests.tables import PROTOS, ROUTES
 
 TABLES = ("rover.yaml", "legacy.yaml", "sim.yaml")
