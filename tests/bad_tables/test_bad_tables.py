@@ -1,9 +1,4 @@
-"""One bad table for each kind of finding: `NAME.yaml` and, in `NAME.txt`, all that `router validate` says.
-
-A table is named after the code that it shows. To write the text of a new one, from the folder above:
-`router validate --strict bad_tables/NAME.yaml > bad_tables/NAME.txt`; then read it as if you had made the mistake.
-Most of them extend `base/base.yaml`, which has nothing wrong in it.
-"""
+"""Each table of the corpus gets exactly the findings that stand beside it."""
 
 from __future__ import annotations
 
@@ -13,26 +8,30 @@ import pytest
 
 from router.cli import BAD_TABLE, OK, main
 from router.errors import Code
+from tests.bad_tables.corpus import HERE, PAGES, sections, unpack, validate
 
-HERE = Path(__file__).parent
-TABLES = sorted(HERE.glob("*.yaml"))
-
-
-@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.stem)
-def test_validate_says_what_is_wrong_and_where(
-    table: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(HERE.parent)
-    code = main(["validate", "--strict", str(table.relative_to(HERE.parent))])
-    assert capsys.readouterr().out == table.with_suffix(".txt").read_text(encoding="utf-8")
-    assert code == BAD_TABLE
+TABLES = {page.stem: list(sections(page)) for page in PAGES}
 
 
-@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.stem)
-def test_a_bad_table_is_named_after_the_code_that_it_shows(table: Path) -> None:
-    shown = table.with_suffix(".txt").read_text(encoding="utf-8")
-    named = [code.value for code in Code if table.stem == code.value or table.stem.startswith(f"{code.value}-")]
-    assert [name for name in named if f"[{name}]" in shown]
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("corpus")
+    unpack(folder, [table for tables in TABLES.values() for table in tables])
+    return folder
+
+
+@pytest.mark.parametrize("code", TABLES)
+def test_validate_says_what_is_wrong_and_where(code: str, unpacked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(unpacked)
+    said = {table.name: validate(table.name) for table in TABLES[code]}
+    assert said == {table.name: (BAD_TABLE, table.said) for table in TABLES[code]}
+
+
+def test_a_bad_table_is_named_after_the_code_that_it_shows() -> None:
+    for tables in TABLES.values():
+        for table in tables:
+            assert table.name == table.code or table.name.startswith(f"{table.code}-")
+            assert f"[{table.code}]" in table.said
 
 
 def test_what_the_bad_tables_extend_has_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:
@@ -40,7 +39,9 @@ def test_what_the_bad_tables_extend_has_nothing_wrong(capsys: pytest.CaptureFixt
     assert "base.yaml: ok (" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("code", Code, ids=lambda code: code.value)
-def test_every_code_has_a_bad_table(code: Code) -> None:
-    shown = [table.with_suffix(".txt").read_text(encoding="utf-8") for table in TABLES]
-    assert any(f"error[{code.value}]" in text for text in shown)
+def test_every_code_has_a_page_with_its_meaning_and_an_error() -> None:
+    assert set(TABLES) == {code.value for code in Code}
+    for code in Code:
+        page = (HERE / f"{code.value}.md").read_text(encoding="utf-8")
+        assert page.startswith(f"# {code.value}\n\n{code.meaning}\n")
+        assert f"error[{code.value}]" in page
