@@ -11,7 +11,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Says what must be sourced; nothing at all unless ROS comes from outside .venv.
 ENV := . .venv/env.sh &&
 
-.PHONY: help setup install-service test demo bench validate lint clean
+.PHONY: help setup install-service test test-all demo bench validate lint clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 17
@@ -22,8 +22,14 @@ setup:  ## build .venv with the router, ROS 2 Jazzy and the comms interfaces; wh
 install-service:  ## install the router as a systemd service and start it, with sudo; TABLE=... for another table
 	@deploy/install-service.sh $(TABLE)
 
-test: setup  ## run the tests of the router; TESTS=tests/wire for some of them. Your tables: make validate
-	@$(ENV) .venv/bin/python -m pytest $(TESTS)
+# By files, since the tests of one share what they start. Many of them wait: more processes than cores.
+PYTEST = .venv/bin/python -m pytest -n 4 --dist loadfile
+
+test: setup  ## run the tests of the router but the slow ones; TESTS=tests/wire for some. Your tables: make validate
+	@$(ENV) $(PYTEST) -m "not slow" $(TESTS)
+
+test-all: setup  ## run every test: also browser, systemd, Prometheus, every ROS type, long properties
+	@$(ENV) HYPOTHESIS_PROFILE=full $(PYTEST) $(TESTS)
 
 demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost link halts the rover
 	@$(ENV) .venv/bin/python -m demo

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import socket
 from itertools import cycle
 from pathlib import Path
+
+from tests.lanes import LANE, LANES
 
 GIVEN_BY_KERNEL = Path("/proc/sys/net/ipv4/ip_local_port_range")
 """Each socket that does not choose gets one of these: callers, and all that ROS sends with."""
@@ -26,11 +27,10 @@ def _is_free(host: str, port: int, kind: socket.SocketKind) -> bool:
 
 
 def _outside() -> list[int]:
-    """Those that the kernel gives to nobody, and ROS neither; each process begins elsewhere among them."""
+    """The share of this process in the ports that neither the kernel nor ROS hand out."""
     first, last = map(int, GIVEN_BY_KERNEL.read_text().split())
     ports = [*range(last + 1, 65536)] or [*range(1024, min(first, 7400))]
-    begin = os.getpid() * 97 % len(ports)
-    return ports[begin:] + ports[:begin]
+    return ports[LANE::LANES]
 
 
 _ports = cycle(_outside())

@@ -13,7 +13,10 @@ from tests.acceptance.site import RouterProcess, Site, key, site, wait_until
 from tests.gateway.browser import Browser, Page, executable
 
 PROGRAM = executable()
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
+]
 
 TABLE = """\
 version: 1

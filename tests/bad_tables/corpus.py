@@ -1,7 +1,7 @@
 """The corpus of bad tables: `CODE.md` has tables with one kind of finding, and what `router validate` says of each.
 
-Each section is named after its table, `bad_tables/NAME.yaml`, and has two blocks: the table (with its encoding, if that is
-not UTF-8) and the exact text. Most tables extend `base/base.yaml`, which has nothing wrong in it.
+Each section is named after its table, `bad_tables/NAME.yaml`, and has two blocks: the table, with its encoding if that
+is not UTF-8, and the exact text. Most tables extend `base/base.yaml`, which has nothing wrong in it.
 
 To write the texts of new or changed sections: `python -m tests.bad_tables.corpus`; then read them as if you had made
 the mistake.

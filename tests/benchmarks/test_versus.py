@@ -12,6 +12,8 @@ import pytest
 
 from benchmarks.versus.building import ROOT, missing_packages
 
+pytestmark = pytest.mark.slow
+
 PATIENCE = 300
 ONLY = ["own_table", "latency", "outbound", "footprint", "flood"]
 """One of each way of measuring that is done soon."""

@@ -20,7 +20,10 @@ from tests.oracles.reference import fill
 from tests.oracles.reference_cdr import cdr
 
 pytest.importorskip("rclpy")
-pytestmark = pytest.mark.skipif(not is_buildable(), reason="cmake and the ROS interface generators are needed")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not is_buildable(), reason="cmake and the ROS interface generators are needed"),
+]
 
 
 @pytest.fixture(scope="module")

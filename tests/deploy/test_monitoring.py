@@ -26,6 +26,8 @@ from tests.deploy.test_prometheus import ALERTS, RECORDED
 from tests.ports import free_port
 from tests.tables import ROUTES
 
+pytestmark = pytest.mark.slow
+
 MONITORED = (
     ROVER.replace("acceptance/patient.yaml", "rover/routes/rover.yaml")
     + """

@@ -13,6 +13,8 @@ import yaml
 
 from tests.deploy.promql import selectors
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 FOLDER = ROOT / "deploy/prometheus"
 PAGE = ROOT / "docs/monitoring.md"

@@ -24,6 +24,8 @@ import pytest
 from tests.ports import free_port
 from tests.tables import PROTOS, ship
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "deploy" / "ros" / "rover_router"
 PATIENCE = 120.0

@@ -15,6 +15,8 @@ from router.compiler import check_table
 from tests.deploy.machine import Machine, hidden_by, machine
 from tests.tables import ROUTES
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 UNITS = ROOT / "deploy" / "systemd"
 NAMES = ("rover-router.service", "rover-router.socket", "rover-router-hold.service")

@@ -16,6 +16,8 @@ import router.assets
 from router.ros.environment import ros_package_remedy, ros_remedy
 from tests import tables
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
 

@@ -20,6 +20,8 @@ from tests.acceptance.site import ROOT, wait_until
 from tests.acceptance.two_networks import DRIVE, LAN, RADIO, Rover, attacker, rover_with_networks, udp
 from tests.tables import PROTOS, ROUTES
 
+pytestmark = pytest.mark.slow
+
 KEYS = ROOT / "deploy" / "wireguard" / "keys.sh"
 STATION, ROVER = ("10.77.0.10", 9000), ("10.77.0.1", 5000)
 TABLE = """\

@@ -16,7 +16,10 @@ from tests.compiler.interface_package import MESSAGES, InterfacePackage, built, 
 from tests.gateway.client_json import FORMS, tree, values, written
 
 pytest.importorskip("rclpy")
-pytestmark = pytest.mark.skipif(not is_buildable(), reason="cmake and the ROS interface generators are needed")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not is_buildable(), reason="cmake and the ROS interface generators are needed"),
+]
 
 
 @pytest.fixture(scope="module")

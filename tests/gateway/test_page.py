@@ -15,7 +15,10 @@ from tests.gateway.browser import Browser, Page, executable
 from tests.gateway.fake_gateway import MIXED, PAGE, FakeGateway, data_document, field, schema
 
 PROGRAM = executable()
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
+]
 
 HOSTILE = '<img src=x onerror="window.hacked=1">'
 

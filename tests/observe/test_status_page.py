@@ -20,7 +20,10 @@ from tests.gateway.browser import Browser, Page, executable
 from tests.observe.fake_running import FakeRunning, sim_program
 
 PROGRAM = executable()
-pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
+]
 
 BOARD = ("127.0.0.30", 25008)
 PHONE, DESKTOP = (390, 844), (1366, 900)

@@ -14,6 +14,8 @@ import pytest
 from tests.table.language_server import LanguageServer
 from tests.tables import ROUTES
 
+pytestmark = pytest.mark.slow
+
 SERVER = "yaml-language-server"
 VERSION = "1.19.2"
 REPOSITORY = Path(__file__).parents[2]
