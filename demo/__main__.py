@@ -22,8 +22,8 @@ from demo.places import taken_places
 from demo.processes import TABLE, Demo, DemoError
 from demo.verdict import Finding
 from router.errors import RouterError
+from router.table import read_table
 from router.table.model import Address, RouteTable
-from router.tools.wire import read_table
 
 ROOT = Path(__file__).parent.parent
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -20,7 +20,7 @@ from rclpy.serialization import deserialize_message
 
 from demo.expected import inbound_topics
 from demo.ros_messages import message_class
-from router.tools.wire import read_table
+from router.table import read_table
 
 REPORT_INTERVAL = 0.5
 """Seconds."""

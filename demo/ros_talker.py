@@ -20,7 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from demo.expected import command_topics, outbound_topics
 from demo.ros_messages import filled, message_class
-from router.tools.wire import read_table
+from router.table import read_table
 
 INTERVAL = 0.1
 """Seconds."""

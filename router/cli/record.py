@@ -54,10 +54,11 @@ def _save_last(args: argparse.Namespace) -> int:
 
 
 def _record(args: argparse.Namespace) -> int:
+    from router.engine.wire import wire_of_table
+    from router.table import read_table
     from router.threads.background import background_threads
     from router.tools.recording_tap import TapRecording
     from router.tools.running_router import tap
-    from router.tools.wire import read_table, wire_of_table
 
     table = read_table(args.table)
     url = running_url(args)

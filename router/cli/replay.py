@@ -67,9 +67,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _send(args: argparse.Namespace, recording: Recording) -> int:
+    from router.table import read_table
     from router.tools import places
     from router.tools.replaying import Replayer, on_time, parse_rate
-    from router.tools.wire import read_table
 
     rate = parse_rate(args.rate or "1x")
     path = args.table or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)

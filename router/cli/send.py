@@ -43,14 +43,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 @explained
 def run(args: argparse.Namespace) -> int:
+    from router.engine.wire import framed
     from router.tools import places
     from router.tools.sending import Sent, send
-    from router.tools.wire import as_old_boards_send, payload
+    from router.values import payload
 
     wire, table = load_wire(args)
     case = wire.case(args.case)
     exact = wire.encode(case, payload(case, args.fields))
-    data = as_old_boards_send(exact, args.trim, args.pad)
+    data = framed(exact, args.trim, args.pad)
     to = places.destination(args.to, table)
     origin = places.origin(args.origin, table) if args.origin else places.ANYWHERE
     count = args.count if args.count is not None else None if args.rate else 1

@@ -56,10 +56,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 @explained
 def run(args: argparse.Namespace) -> int:
     from router.compiler import check_table
+    from router.engine.wire import Wire
     from router.tools.sim_view import SimView
     from router.tools.simulator import Simulator
     from router.tools.streams import parse_silence
-    from router.tools.wire import Wire
 
     silences = [parse_silence(text) for text in args.silent]
     checked = check_table(args.table)

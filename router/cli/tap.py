@@ -15,9 +15,9 @@ from router.errors import StartError, UsageError, nearest
 from router.ros.environment import check_environment, ros_remedy
 
 if TYPE_CHECKING:
+    from router.engine.wire import Wire
     from router.table.model import RouteTable
     from router.tools.tapping import Heard, HeardMessage
-    from router.tools.wire import Wire
 
 _DESCRIPTION = """\
 Print what a running router receives, before it routes it, one line for each datagram: the fields that are not default.

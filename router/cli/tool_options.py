@@ -20,8 +20,8 @@ from router.errors import TransportError, UsageError
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
+    from router.engine.wire import Wire
     from router.table.model import RouteTable
-    from router.tools.wire import Wire
 
 
 def add_wire_options(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +32,8 @@ def add_wire_options(parser: argparse.ArgumentParser) -> None:
 
 def load_wire(args: argparse.Namespace) -> tuple[Wire, RouteTable | None]:
     """Raises TableError."""
-    from router.tools.wire import read_table, wire_of_protos, wire_of_table
+    from router.engine.wire import wire_of_protos, wire_of_table
+    from router.table import read_table
 
     if args.protos is None and (args.table is not None or DEFAULT_TABLE.exists()):
         table = read_table(args.table or DEFAULT_TABLE)

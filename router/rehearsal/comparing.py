@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from router.engine.wire import Wire
 from router.errors import DecodeError, SourceSpan
 from router.rehearsal.events import Dropped, Event, Filtered, Published, Received, Rejected, Sent
 from router.rehearsal.matching import Difference
@@ -13,7 +14,6 @@ from router.rehearsal.model import Counted, Expected, Item, Message, Payload, St
 from router.rehearsal.places import Place, Places
 from router.rehearsal.words import Happened, Words
 from router.table.model import Located, RouteTable
-from router.tools.wire import Wire
 from tests.oracles import reference_cdr
 
 _SHOWN = 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from router.engine.wire import Wire, framed
 from router.errors import Code, SourceSpan, UsageError
 from router.rehearsal.matching import MessageMatch, Moments
 from router.rehearsal.messages import fill, values
@@ -12,7 +13,6 @@ from router.table.model import Located
 from router.table.nodes import MappingNode, Node
 from router.table.reading import UnsoundError, boolean, integer, optional_text
 from router.table.units import parse_duration
-from router.tools.wire import Wire, as_old_boards_send
 from router.types.protobuf import PayloadCase
 from tests.oracles import reference_cdr
 
@@ -92,7 +92,7 @@ def datagram(given: GivenDatagram, wire: Wire, moments: Moments) -> bytes:
         fill(payload, case.type, fields, moments)
         data = wire.encode(case, payload)
     try:
-        return as_old_boards_send(data, given.trim, given.pad)
+        return framed(data, given.trim, given.pad)
     except UsageError as error:
         raise unsound(given.span, Code.BAD_VALUE, str(error)) from error
 

@@ -8,10 +8,10 @@ from functools import cached_property
 from router.compiler import Checked
 from router.compiler.program import Program
 from router.engine.dispatch import Peer
-from router.errors import Code, Diagnostic, SourceSpan, UsageError, did_you_mean
-from router.table.model import Address, Endpoint
+from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
+from router.table.address import BadAddressError, parse_address
+from router.table.model import Endpoint
 from router.table.reading import UnsoundError
-from router.tools.places import origin
 from router.types.model import Enum, MessageType
 from router.types.protobuf import PayloadCase
 
@@ -37,13 +37,15 @@ class Names:
 
     def peer(self, name: str, span: SourceSpan) -> Peer:
         """The address that an endpoint sends from, or any other that is written HOST:PORT."""
+        if endpoint := self._table.endpoints.get(name):
+            address = endpoint.address.value
+            return address.host, endpoint.source_port.value if endpoint.source_port else address.port
+        host, colon, port = name.partition(":")
         try:
-            address = origin(name, self._table)
-        except UsageError as error:
-            raise unsound(span, Code.UNKNOWN_ENDPOINT, str(error)) from error
-        if name in self._table.endpoints and not address.port:
-            address = Address(address.host, self._table.endpoints[name].address.value.port)
-        return address.host, address.port or _PORT
+            return parse_address(f"{'127.0.0.1' if host == 'localhost' else host}:{port if colon else _PORT}")
+        except BadAddressError as error:
+            message = f"'{name}' is neither HOST[:PORT] nor a name of the route table"
+            raise unsound(span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, self._table.endpoints)) from error
 
     def listener(self, name: str, span: SourceSpan) -> str:
         self._known(name, self._table.listeners, span, "listener", Code.BAD_VALUE)

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from router.compiler import Checked
+from router.engine.wire import Wire
 from router.errors import DecodeError, MappingError
 from router.rehearsal.events import Published, Sent
 from router.rehearsal.places import Places
 from router.rehearsal.replaying_against import Against, Delivery, Row
 from router.rehearsal.replaying_flat import fields
-from router.tools.wire import Wire
 from tests.oracles import reference_cdr
 
 MOST_FIELDS = 12

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from router.compiler.program import Program
+from router.engine.wire import Wire
 from router.errors import Diagnostic
 from router.rehearsal.comparing import Comparison, Failure
 from router.rehearsal.events import Event
@@ -16,7 +17,6 @@ from router.rehearsal.places import Places
 from router.rehearsal.rehearsal import START, Rehearsal
 from router.rehearsal.words import Happened
 from router.table.reading import UnsoundError
-from router.tools.wire import Wire
 
 
 @dataclass(slots=True)

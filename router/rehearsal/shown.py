@@ -15,8 +15,8 @@ from google.protobuf.message import Message
 from router.compiler.implementations import NS_PER_SECOND, entries
 from router.rehearsal.rehearsal import START
 from router.table.quantities import duration
-from router.tools.show import float_text
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from router.values import float_text
 
 TIMES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
 

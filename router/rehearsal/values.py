@@ -15,8 +15,8 @@ from router.rehearsal.names import unsound
 from router.rehearsal.shown import TIMES
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.table.units import parse_duration
-from router.tools.fields import parse
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, Type
+from router.values import parse
 
 RECEIVED_AT = "received_at"
 ANY = "any"

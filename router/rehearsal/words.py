@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from router.engine.wire import Wire
 from router.errors import DecodeError
 from router.rehearsal.events import Dropped, Event, Filtered, Published, Sent
 from router.rehearsal.matching import Moments
 from router.rehearsal.model import Step
 from router.rehearsal.places import Place, Places
 from router.rehearsal.shown import offset, shown
-from router.tools.wire import Wire
 from tests.oracles import reference_cdr
 
 

@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from router.errors import Diagnostic, TableError
+from router.errors import Diagnostic, Severity, TableError
 from router.table.build import build_table
 from router.table.extends import load_chain
 from router.table.model import RouteTable
@@ -36,6 +36,14 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
     except TableError as error:
         findings.extend(error.diagnostics)
     return table, in_order(findings)
+
+
+def read_table(path: Path) -> RouteTable:
+    """The table at `path`. Raises TableError if it has errors."""
+    table, findings = load_table(path)
+    if table is None or any(finding.severity is Severity.ERROR for finding in findings):
+        raise TableError(findings)
+    return table
 
 
 def in_order(findings: list[Diagnostic]) -> list[Diagnostic]:

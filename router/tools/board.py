@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from google.protobuf.message import Message
 
 from router.compiler.program import DeadmanPlan
+from router.engine.wire import Decoded, Wire
 from router.table.model import EndpointKind, Priority, RouteTable
-from router.tools.show import compact
-from router.tools.wire import Decoded, Wire
+from router.values import compact
 
 TIMEOUT = 1.0
 """Seconds without a command after which a board stops by itself: it trusts no router."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 from google.protobuf.message import Message
 
+from router.engine.wire import Wire
 from router.errors import DecodeError
 from router.tools.board import Board
 from router.tools.frames import Frames, is_part
-from router.tools.wire import Wire
 
 
 @dataclass(slots=True)

@@ -7,17 +7,14 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from router.tools.listening_reading import Heard, Message, Problem, Remark, Schema, Shape
-from router.tools.show import one_line
+from router.values import SHOWN_ELEMENTS, Tree, list_text, one_line, plain_text, words
 
 Piece = tuple[str, str]
 """Text, and a style of rich."""
-
-_MOST_SHOWN = 6
-"""Elements of a list, before it is cut short."""
 
 _LONGEST_TEXT = 120
 """Characters of a string."""
@@ -47,7 +44,7 @@ def _as_json(heard: Heard) -> Mapping[str, object]:
 def pieces(heard: Heard) -> list[Piece]:
     """`12:00:00.123 /imu/data sensor_msgs/msg/Imu x=0.01`."""
     if isinstance(heard, Message):
-        values = _line(_members(heard.data, heard.shape or _NO_SHAPE, "", heard.is_wrapped))
+        values = _line(words(_tree(heard.data, heard.shape or _NO_SHAPE, heard.is_wrapped)))
         return [(_clock(heard.time), "dim"), _name(heard.topic, "green"), _name(heard.type_name, "dim"), (values, "")]
     if isinstance(heard, Schema):
         fields = _line(f"{name}:{_type_text(shape)}" for name, shape in heard.shape.items())
@@ -61,7 +58,7 @@ def pieces(heard: Heard) -> list[Piece]:
 def _remark(document: Mapping[str, Any]) -> Iterable[str]:
     """Of topics their names."""
     if not isinstance(rows := document.get("topics"), list):
-        return _members(document, _NO_SHAPE, "", is_wrapped=False)
+        return words(_tree(document, _NO_SHAPE, is_wrapped=False))
     names = (str(row["topic"]) for row in rows if isinstance(row, dict) and "topic" in row)
     return [document["op"], f"{len(rows)}:", *names]
 
@@ -83,45 +80,43 @@ def _name(text: str, style: str) -> Piece:
     return one_line([text]), style
 
 
-def _line(words: Iterable[str]) -> str:
-    listed = list(words)
-    return one_line(listed) if listed else "(empty)"
+def _line(listed: Iterable[str]) -> str:
+    return one_line(listed, empty="(empty)")
 
 
 def _type_text(shape: Shape) -> str:
     return shape.type_name + "[]" * shape.is_array
 
 
-def _members(values: Mapping[str, Any], shapes: Mapping[str, Shape], prefix: str, is_wrapped: bool) -> Iterator[str]:
+def _tree(values: Mapping[str, Any], shapes: Mapping[str, Shape], is_wrapped: bool) -> Mapping[str, Tree]:
+    """A single value is taken out of its list."""
+    tree: dict[str, Tree] = {}
     for name, value in values.items():
-        yield from _words(value, shapes.get(name), prefix + name, is_wrapped)
+        shape = shapes.get(name)
+        if is_wrapped and shape is not None and not shape.is_array and isinstance(value, list) and len(value) == 1:
+            [value] = value  # noqa: PLW2901
+        if isinstance(value, list) and any(isinstance(element, dict) for element in value):
+            for index, element in enumerate(value[:SHOWN_ELEMENTS]):
+                tree[f"{name}[{index}]"] = _value(element, shape, is_wrapped)
+            if len(value) > SHOWN_ELEMENTS:
+                tree[name] = f"...({len(value)})"
+        else:
+            tree[name] = _value(value, shape, is_wrapped)
+    return tree
 
 
-def _words(value: Any, shape: Shape | None, path: str, is_wrapped: bool) -> Iterator[str]:
-    """`path=value`, or several where a message has members. A single value is taken out of its list."""
-    if is_wrapped and shape is not None and not shape.is_array and isinstance(value, list) and len(value) == 1:
-        [value] = value
+def _value(value: Any, shape: Shape | None, is_wrapped: bool) -> Tree:
     if isinstance(value, dict):
-        members = shape.members if shape is not None else _NO_SHAPE
-        yield from _members(value, members, f"{path}.", is_wrapped) if value else [f"{path}="]
-    elif isinstance(value, list) and any(isinstance(element, dict) for element in value):
-        for index, element in enumerate(value[:_MOST_SHOWN]):
-            yield from _words(element, shape, f"{path}[{index}]", is_wrapped)
-        if len(value) > _MOST_SHOWN:
-            yield f"{path}[...{len(value)}]"
-    else:
-        yield f"{path}={_text(value, shape)}"
+        return _tree(value, shape.members if shape is not None else _NO_SHAPE, is_wrapped)
+    if isinstance(value, list):
+        return list_text((_text(element, shape) for element in value[:SHOWN_ELEMENTS]), len(value), SHOWN_ELEMENTS)
+    return _text(value, shape)
 
 
 def _text(value: Any, shape: Shape | None) -> str:
-    if isinstance(value, list):
-        shown = [_text(element, shape) for element in value[:_MOST_SHOWN]]
-        return f"[{','.join(shown)}{f',...{len(value)}' if len(value) > _MOST_SHOWN else ''}]"
     if isinstance(value, str):
         return _cut(value)
-    if isinstance(value, float) and shape is not None and shape.type_name == "float32":
-        return f"{value:.7g}"  # what it was before it was widened
-    return json.dumps(value)
+    return plain_text(value, 32 if shape is not None and shape.type_name == "float32" else 64)
 
 
 def _cut(text: str) -> str:

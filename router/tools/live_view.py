@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from router.tools.live import RouteRow, TargetRow, View, unwanted
-from router.tools.show import rate_text
+from router.values import rate_text
 
 Column = Callable[[RouteRow], Text]
 """One more cell for a route, from whoever knows more than the metrics."""

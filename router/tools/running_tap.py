@@ -8,12 +8,12 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Callable, Collection, Iterable, Iterator
 
+from router.engine.wire import Wire
 from router.errors import DecodeError
 from router.observe.tap_stream import Lost
 from router.recording.mirror import Seen
 from router.tools.conditions import Condition
 from router.tools.tapping import Heard
-from router.tools.wire import Wire
 
 
 class RunningTap:

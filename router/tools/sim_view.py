@@ -13,11 +13,11 @@ from google.protobuf.json_format import MessageToDict
 from rich.table import Table
 from rich.text import Text
 
+from router.engine.wire import Wire
 from router.tools.board import Change, State
 from router.tools.inbox import Arrivals
-from router.tools.show import compact, rate_text
 from router.tools.simulator import Statistics
-from router.tools.wire import Wire
+from router.values import compact, rate_text
 
 DIGITS = 4
 

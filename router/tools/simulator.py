@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.program import DeadmanPlan
+from router.engine.wire import Wire
 from router.errors import UsageError
 from router.table.model import Address, Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
@@ -24,7 +25,6 @@ from router.tools.models import moment
 from router.tools.payload_model import PayloadModel
 from router.tools.places import LOOPBACK, listener_address, open_udp
 from router.tools.streams import STRANGER, Silence, check_silences, streams
-from router.tools.wire import Wire
 
 DRAIN = 256
 """Datagrams taken from one socket before the others, and the sending, have their turn."""

@@ -7,10 +7,10 @@ import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
+from router.engine.wire import Wire
 from router.errors import UsageError, did_you_mean
 from router.table.model import ANY, RouteTable
 from router.tools.models import usual_rate
-from router.tools.wire import Wire
 from router.types.protobuf import PayloadCase
 
 STRANGER = "(anybody)"

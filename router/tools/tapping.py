@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from google.protobuf.json_format import MessageToDict
 
+from router.engine.wire import Decoded, Wire
 from router.errors import DecodeError
 from router.table.units import LARGEST_DATAGRAM
-from router.tools.ros_show import ros_json, ros_words
-from router.tools.show import compact, one_line
-from router.tools.wire import Decoded, Wire
+from router.values import compact, one_line, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
     from router.ros.listen import TopicListener
@@ -75,7 +74,7 @@ class HeardMessage:
 
     def line(self, with_hex: bool) -> str:
         """`12:00:00.123 comms/msg/BasestationManualDrive forward_backward=5`."""
-        line = f"{_clock(self.at)} {self.type_name} {one_line(ros_words(self.message))}"
+        line = f"{_clock(self.at)} {self.type_name} {one_line(words(ros_tree(self.message)))}"
         return f"{line} [{self.cdr.hex()}]" if with_hex else line
 
     def json(self, with_hex: bool) -> str:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
-from router.tools.wire import wire_of_protos
+from router.engine.wire import wire_of_protos
 from tests.tables import PROTOS
 
 WIRE = wire_of_protos(PROTOS)

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+from router.engine.wire import Wire, wire_of_protos
 from router.errors import SourceSpan
 from router.observe.running import Running
 from router.recording.channels import Channels
@@ -20,7 +21,6 @@ from router.recording.mirror import Seen
 from router.recording.mirrored import Known
 from router.recording.reader_mcap import Recorded, Recording
 from router.table.model import Address, Endpoint, EndpointKind, Framing, Located, RecordSettings, RouteTable
-from router.tools.wire import Wire, wire_of_protos
 from tests.tables import PROTOS
 
 SPAN = SourceSpan("table.yaml", 3)

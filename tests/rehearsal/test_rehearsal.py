@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from router.engine.wire import Wire
 from router.rehearsal.events import (
     Collected,
     DeadmanChanged,
@@ -17,7 +18,7 @@ from router.rehearsal.events import (
     Sent,
 )
 from router.rehearsal.rehearsal import START, Rehearsal
-from router.tools.wire import Wire, payload
+from router.values import payload
 from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, STRANGER, program
 
 MS = 1_000_000

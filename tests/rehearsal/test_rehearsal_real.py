@@ -11,13 +11,14 @@ from pathlib import Path
 from router.app import Router
 from router.compiler import check_table
 from router.compiler.definitions import Definitions
+from router.engine.wire import Wire
 from router.rehearsal.coverage import Coverage
 from router.rehearsal.events import Filtered, Rejected, Sent
 from router.rehearsal.reading import read_test_file
 from router.rehearsal.rehearsal import Rehearsal
 from router.rehearsal.running import Runner
 from router.rehearsal.words import Happened
-from router.tools.wire import Wire, payload
+from router.values import payload
 from tests.ports import free_port
 from tests.tables import PROTOS, ROUTES
 

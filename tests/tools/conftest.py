@@ -1,17 +1,17 @@
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from router.engine.wire import Wire, wire_of_protos
+from router.table import read_table
 from router.table.model import RouteTable
-from router.tools.wire import Wire, read_table, wire_of_protos
 from router.types.protobuf import PayloadCase
 from tests.ports import free_port
 
-HERE = Path(__file__).parent
+PROTOS = Path(__file__).parents[1] / "protos"
 
 TABLE = """\
 version: 1
@@ -28,16 +28,14 @@ routes:
 
 
 @pytest.fixture(scope="session")
-def protos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def protos() -> Path:
     """A folder with `every_kind.proto` alone."""
-    folder = tmp_path_factory.mktemp("protos")
-    shutil.copy(HERE / "every_kind.proto", folder)
-    return folder
+    return PROTOS
 
 
 @pytest.fixture(scope="session")
-def wire(protos: Path) -> Wire:
-    return wire_of_protos(protos)
+def wire() -> Wire:
+    return wire_of_protos(PROTOS)
 
 
 @pytest.fixture(scope="session")
@@ -46,14 +44,14 @@ def every_kind(wire: Wire) -> PayloadCase:
 
 
 @pytest.fixture
-def table_path(protos: Path, tmp_path: Path) -> Callable[..., Path]:
+def table_path(tmp_path: Path) -> Callable[..., Path]:
     """A table of a board and a basestation on free ports; `source` is that of `every_kind`."""
 
     def write(source: str = "board", source_port: bool = False) -> Path:
         path = tmp_path / "table.yaml"
         path.write_text(
             TABLE.format(
-                protos=protos,
+                protos=PROTOS,
                 rover=free_port("0.0.0.0"),
                 board=free_port("127.0.6.30"),
                 station=free_port("127.0.6.10"),

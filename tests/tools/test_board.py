@@ -3,9 +3,10 @@ from __future__ import annotations
 import pytest
 
 from router.compiler.program import DeadmanPlan
+from router.engine.wire import Decoded, Wire
 from router.table.model import RouteTable
 from router.tools.board import Board, Change, State, Stop, boards
-from router.tools.wire import Decoded, Wire, payload
+from router.values import payload
 
 
 def decoded(wire: Wire, case: str, *words: str) -> Decoded:

@@ -32,10 +32,10 @@ from demo.page import Shown, look
 from demo.places import free_ros_domain, taken_places
 from demo.recorded import Recorded, first_of
 from demo.verdict import judge
+from router.table import read_table
 from router.table.model import Address, Located, RouteTable
 from router.tools.live import RouteRow, TargetRow, View
 from router.tools.places import open_udp
-from router.tools.wire import read_table
 from tests.ports import free_port
 from tests.tables import ROUTES
 

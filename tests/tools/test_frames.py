@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+from router.engine.wire import wire_of_protos
 from router.tools.frames import TIMEOUT, Frames, is_part
-from router.tools.wire import wire_of_protos
 from tests.tables import PROTOS
 
 

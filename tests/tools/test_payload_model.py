@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from router.engine.wire import Wire, wire_of_protos
 from router.tools.models import moment
 from router.tools.payload_model import PayloadModel
-from router.tools.wire import Wire, wire_of_protos
 from router.types.protobuf import PayloadCase
 from tests.tables import PROTOS
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from router.errors import UsageError
+from router.table import read_table
 from router.table.model import Address, RouteTable
 from router.tools import places
-from router.tools.wire import read_table
 
 
 def test_addresses_as_typed(table: RouteTable) -> None:

@@ -5,12 +5,12 @@ import io
 from rich.console import Console
 from rich.table import Table
 
+from router.engine.wire import Wire
 from router.tools.board import Board, Change, State
 from router.tools.frames import Frames
 from router.tools.inbox import Arrivals, Inbox
 from router.tools.sim_view import SimView
 from router.tools.simulator import Statistics
-from router.tools.wire import Wire
 
 
 def some_statistics(wire: Wire) -> Statistics:

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from router.engine.wire import Wire
 from router.errors import UsageError
+from router.table import read_table
 from router.table.model import Address, RouteTable
 from router.tools.board import State
 from router.tools.places import LOOPBACK, open_udp, reachable
 from router.tools.sim_view import SimView
 from router.tools.simulator import Simulator
 from router.tools.streams import Silence, streams
-from router.tools.wire import Wire, read_table
 
 FAST = 100.0
 

@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from router.engine.wire import Wire
 from router.errors import UsageError
 from router.tools.streams import Silence, Stream, parse_silence
-from router.tools.wire import Wire
 
 
 @pytest.mark.parametrize(

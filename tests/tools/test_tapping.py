@@ -3,10 +3,11 @@ from __future__ import annotations
 import json
 import socket
 
+from router.engine.wire import Wire
 from router.table.model import Address
 from router.tools.places import open_udp
 from router.tools.tapping import heard, listen
-from router.tools.wire import Wire, payload
+from router.values import payload
 
 
 def datagram(wire: Wire, *words: str) -> bytes:

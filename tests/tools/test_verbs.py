@@ -18,7 +18,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from router.cli import main
-from router.tools.wire import read_table
+from router.table import read_table
 
 EMPTY_PLAIN = bytes.fromhex("1200")
 

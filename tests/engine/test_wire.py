@@ -4,8 +4,15 @@ from pathlib import Path
 
 import pytest
 
+from router.engine.wire import Wire, framed, wire_of_protos
 from router.errors import DecodeError, TableError, UsageError
-from router.tools.wire import Wire, as_old_boards_send, payload, read_table
+from router.table import read_table
+from router.values import payload
+
+
+@pytest.fixture(scope="module")
+def wire() -> Wire:
+    return wire_of_protos(Path(__file__).parents[1] / "protos")
 
 
 def test_an_envelope_comes_back_as_it_was_built(wire: Wire) -> None:
@@ -27,7 +34,7 @@ def test_an_unknown_case_gets_the_nearest_name(wire: Wire) -> None:
 
 def test_trimmed_and_padded_datagrams_are_repaired(wire: Wire) -> None:
     exact = wire.encode(wire.case("plain"), payload(wire.case("plain"), []))
-    trimmed, padded = as_old_boards_send(exact, trim=True, pad=0), as_old_boards_send(exact, trim=True, pad=40)
+    trimmed, padded = framed(exact, trim=True, pad=0), framed(exact, trim=True, pad=40)
     assert (trimmed.hex(), len(padded)) == ("12", 40)
     assert wire.decode(trimmed).zeros == 1
     assert wire.decode(padded).zeros == -38
@@ -35,7 +42,7 @@ def test_trimmed_and_padded_datagrams_are_repaired(wire: Wire) -> None:
 
 def test_padding_never_cuts() -> None:
     with pytest.raises(UsageError, match="the datagram has 3 bytes and cannot be padded to 2"):
-        as_old_boards_send(b"abc", trim=False, pad=2)
+        framed(b"abc", trim=False, pad=2)
 
 
 @pytest.mark.parametrize(

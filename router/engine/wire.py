@@ -1,11 +1,7 @@
-"""The envelope as a tool sees it: which there is, datagrams built and taken apart.
-
-Loads table and `.proto` files once at start; knows no sockets.
-"""
+"""Datagrams built from payloads and taken apart, one by one: for tools and rehearsals, not for the running router."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +11,8 @@ from google.protobuf.message import Message
 from router.engine import MAX_DATAGRAM
 from router.engine.framing import restored
 from router.engine.payloadless import why_no_payload
-from router.errors import DecodeError, Severity, SourceSpan, TableError, UsageError, did_you_mean, shown_path
-from router.table import load_table
+from router.errors import DecodeError, SourceSpan, UsageError, did_you_mean, shown_path
 from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, Located, RouteTable
-from router.tools.fields import set_fields
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
 
 
@@ -33,7 +27,7 @@ class Decoded:
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """The envelope and its payload cases, for building datagrams and taking them apart."""
+    """The wire format of an envelope and its payload cases."""
 
     envelope: Envelope
 
@@ -73,14 +67,6 @@ class Wire:
         return Decoded(self.envelope.cases[name], getattr(outer, name), len(whole) - len(datagram))
 
 
-def read_table(path: Path) -> RouteTable:
-    """Raises TableError when the table has errors: a half-read one would send to the wrong place."""
-    table, findings = load_table(path)
-    if table is None or any(finding.severity is Severity.ERROR for finding in findings):
-        raise TableError(findings)
-    return table
-
-
 def wire_of_table(table: RouteTable) -> Wire:
     """The envelope that the table names. Raises TableError, and UsageError where it names none."""
     if table.envelope is None:
@@ -98,16 +84,12 @@ def _wire(settings: EnvelopeSettings) -> Wire:
     return Wire(find_envelope(load_protos(settings), settings))
 
 
-def payload(case: PayloadCase, words: Sequence[str]) -> Message:
-    """A payload with these `field=value` words set. Raises UsageError."""
-    message = case.message_class()
-    set_fields(message, case.type, words)
-    return message
+def framed(exact: bytes, trim: bool, pad: int) -> bytes:
+    """A datagram as boards may send it: without its trailing zeros, then filled with zeros up to `pad` bytes.
 
-
-def as_old_boards_send(exact: bytes, trim: bool, pad: int) -> bytes:
-    """Without trailing zero bytes when `trim`; then filled with zeros to `pad` bytes. Raises UsageError."""
-    framed = exact.rstrip(b"\0") if trim else exact
-    if pad and len(framed) > pad:
-        raise UsageError(f"the datagram has {len(framed)} bytes and cannot be padded to {pad}")
-    return framed.ljust(pad, b"\0")
+    Raises UsageError for one that is longer than `pad`.
+    """
+    sent = exact.rstrip(b"\0") if trim else exact
+    if pad and len(sent) > pad:
+        raise UsageError(f"the datagram has {len(sent)} bytes and cannot be padded to {pad}")
+    return sent.ljust(pad, b"\0")

@@ -1,0 +1,347 @@
+"""Values of message fields as text, for all verbs: `field=value` words parsed, values printed.
+
+Words are what `router send` takes and what `tap`, `listen` and `sim` print; for protobuf messages the two are inverse.
+Every source of values is first brought into a `Tree`, which `words` prints.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Union
+
+from google.protobuf.message import Message
+
+from router.errors import UsageError, did_you_mean
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from router.types.protobuf import PayloadCase
+
+# Parsing
+
+
+def payload(case: PayloadCase, assignments: Sequence[str]) -> Message:
+    """A payload with these `field=value` words set. Raises UsageError."""
+    message = case.message_class()
+    set_fields(message, case.type, assignments)
+    return message
+
+
+def set_fields(message: Message, kind: MessageType, assignments: Sequence[str]) -> None:
+    """Apply `path=value` words in order. A path is `x`, `bbox.x`, `points[1]` or `boxes[0].x`.
+
+    A list without an index is appended to; `bbox=` alone makes an empty message present. Raises UsageError.
+    """
+    for assignment in assignments:
+        path, equals, text = assignment.partition("=")
+        if not equals:
+            raise UsageError(f"'{assignment}' is not an assignment; write {assignment or 'field'}=value")
+        _assign(message, kind, path, text)
+
+
+def _assign(message: Any, kind: MessageType, path: str, text: str) -> None:
+    *parents, last = path.split(".")
+    for position, step in enumerate(parents):
+        field, index = _step(kind, step, path)
+        inner = field.type.element if isinstance(field.type, List) else field.type
+        if not isinstance(inner, MessageType):
+            raise UsageError(f"{'.'.join(parents[: position + 1])} of {kind.name} is {inner}, it has no fields")
+        message = _inner_message(message, field, index, path)
+        kind = inner
+    field, index = _step(kind, last, path)
+    if isinstance(field.type, List):
+        _assign_element(getattr(message, field.name), field.type, index, path, text)
+    elif index is not None:
+        raise UsageError(f"{path}: {field.name} is {field.type} and no list")
+    elif isinstance(field.type, MessageType) and not text:
+        getattr(message, field.name).SetInParent()
+    else:
+        setattr(message, field.name, parse(field.type, text, path))
+
+
+_STEP = re.compile(r"(?P<name>\w+)(?:\[(?P<index>\d+)\])?")
+
+
+def _step(kind: MessageType, step: str, path: str) -> tuple[Field, int | None]:
+    match = _STEP.fullmatch(step)
+    if match is None:
+        raise UsageError(f"'{path}' is not a field path; write it as x, bbox.x or points[0]")
+    field = kind.field(match["name"])
+    if field is None:
+        hint = did_you_mean(match["name"], (known.name for known in kind.fields))
+        raise UsageError(f"{kind.name} has no field '{match['name']}'" + (f"; {hint}" if hint else ""))
+    return field, None if match["index"] is None else int(match["index"])
+
+
+def _inner_message(message: Any, field: Field, index: int | None, path: str) -> Any:
+    member = getattr(message, field.name)
+    if not isinstance(field.type, List):
+        if index is not None:
+            raise UsageError(f"{path}: {field.name} is {field.type} and no list")
+        member.SetInParent()
+        return member
+    if index is None:
+        raise UsageError(f"{path}: {field.name} is a list; say which element, such as {field.name}[0]")
+    _extend(member, field.type, index, path)
+    return member[index]
+
+
+def _assign_element(values: Any, kind: List, index: int | None, path: str, text: str) -> None:
+    index = len(values) if index is None else index
+    if isinstance(kind.element, MessageType) and not text:
+        _extend(values, kind, index, path)
+        return
+    value = parse(kind.element, text, path)
+    _extend(values, kind, index, path)
+    values[index] = value
+
+
+LARGEST_LIST = 65_507
+"""Elements; no list is longer than the largest datagram has bytes."""
+
+_ZEROS: Mapping[type, object] = {Bool: False, Int: 0, Enum: 0, Float: 0.0, String: "", Bytes: b""}
+
+
+def _extend(values: Any, kind: List, index: int, path: str) -> None:
+    """Make the list long enough for `index`, with zeros."""
+    bound = kind.length if kind.length is not None else kind.bound
+    limit = LARGEST_LIST if bound is None else bound
+    if index >= limit:
+        raise UsageError(f"{path}: {kind} holds at most {limit} elements")
+    while len(values) <= index:
+        if isinstance(kind.element, MessageType):
+            values.add()
+        else:
+            values.append(_ZEROS[type(kind.element)])
+
+
+_TRUTH = {"true": True, "1": True, "yes": True, "on": True, "false": False, "0": False, "no": False, "off": False}
+_LARGEST = {32: 3.4028235e38, 64: sys.float_info.max}
+_ENUM_RANGE = Int(32, signed=True)
+
+
+def parse(kind: Type, text: str, path: str) -> object:
+    """The text as a value of a scalar type. `path` names the field in errors. Raises UsageError."""
+    match kind:
+        case Bool():
+            if text.lower() not in _TRUTH:
+                raise UsageError(f"{path}: '{text}' is not a bool; write true or false")
+            return _TRUTH[text.lower()]
+        case Int():
+            return _parse_int(kind, text, path)
+        case Float():
+            return _parse_float(kind, text, path)
+        case Enum():
+            return _parse_enum(kind, text, path)
+        case String(bound=bound):
+            if bound is not None and len(text.encode()) > bound:
+                raise UsageError(f"{path}: '{text}' has {len(text.encode())} bytes, {kind} holds at most {bound}")
+            return text
+        case Bytes():
+            return _parse_bytes(kind, text, path)
+        case _:
+            field = kind.fields[0].name if isinstance(kind, MessageType) and kind.fields else "x"
+            raise UsageError(f"{path} is the message {kind}; set its fields, such as {path}.{field}=...")
+
+
+def _parse_int(kind: Int, text: str, path: str) -> int:
+    try:
+        value = int(text, 0)
+    except ValueError:
+        raise UsageError(f"{path}: '{text}' is not an integer ({kind}); write it as 42, -1 or 0x2a") from None
+    if not kind.low <= value <= kind.high:
+        raise UsageError(f"{path}: {text} does not fit {kind}, which holds {kind.low} to {kind.high}")
+    return value
+
+
+def _parse_float(kind: Float, text: str, path: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise UsageError(f"{path}: '{text}' is not a number ({kind}); write it as 1.5, -2e3, nan or inf") from None
+    largest = _LARGEST[kind.bits]
+    if abs(value) > largest and "inf" not in text.lower():
+        raise UsageError(f"{path}: {text} does not fit {kind}, which holds {-largest!r} to {largest!r}")
+    return value
+
+
+def _parse_enum(kind: Enum, text: str, path: str) -> int:
+    """A name, qualified or not (`SensorState.SENSOR_ERROR`), or any int32: protobuf enums are open."""
+    values = dict(kind.values)
+    name = text.removeprefix(f"{kind.name}.").removeprefix(f"{kind.name.rpartition('.')[2]}.")
+    if name in values:
+        return values[name]
+    if text.lstrip("-")[:1].isdigit():
+        return _parse_int(_ENUM_RANGE, text, path)
+    raise UsageError(f"{path}: {kind.name} has no value '{text}'; {did_you_mean(name, values)}")
+
+
+def _parse_bytes(kind: Bytes, text: str, path: str) -> bytes:
+    try:
+        value = bytes.fromhex(text.removeprefix("0x"))
+    except ValueError:
+        raise UsageError(f"{path}: '{text}' is not hex; write bytes as 0a1b2c") from None
+    if kind.bound is not None and len(value) > kind.bound:
+        raise UsageError(f"{path}: {len(value)} bytes do not fit {kind}, which holds at most {kind.bound}")
+    return value
+
+
+# Printing
+
+
+Tree = Union[str, Mapping[str, "Tree"]]
+"""The text of a scalar or of a list of scalars; or the members of a message by name, with `x[0]` for an element."""
+
+
+def words(tree: Tree, path: str = "") -> Iterator[str]:
+    """`path=value` for each text in the tree, and `path=` for an empty message."""
+    if isinstance(tree, str):
+        yield f"{path}={tree}"
+    elif tree or not path:
+        for name, member in tree.items():
+            yield from words(member, f"{path}.{name}" if path else name)
+    else:
+        yield f"{path}="
+
+
+def list_text(first: Iterable[str], length: int, limit: int) -> str:
+    """`[1,2]` of the first `limit` elements at most; `[1,2,...](360)` where there are more."""
+    listed = ",".join(first)
+    return f"[{listed},...]({length})" if length > limit else f"[{listed}]"
+
+
+def one_line(listed: Iterable[str], empty: str = "(all default)") -> str:
+    """The words as one line, or `empty`."""
+    return " ".join(word if word.isprintable() and " " not in word else repr(word) for word in listed) or empty
+
+
+def compact(message: Message, kind: MessageType, digits: int | None = None) -> str:
+    """A protobuf message as one line: the fields that are not their default."""
+    return one_line(words(protobuf_tree(message, kind, digits)))
+
+
+def scalar_text(value: Any, kind: Type, digits: int | None = None) -> str:
+    """A scalar of this type; an enum by name, bytes as hex. `digits` as in float_text."""
+    if isinstance(kind, Enum):
+        return next((name for name, number in kind.values if number == value), str(value))
+    return plain_text(value, kind.bits if isinstance(kind, Float) else 64, digits)
+
+
+def plain_text(value: object, bits: int = 64, digits: int | None = None) -> str:
+    """A scalar of which only the Python type is known. `bits` is the width of a float, `digits` as in float_text."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case None:
+            return "null"
+        case float():
+            return float_text(value, bits, digits)
+        case bytes():
+            return value.hex()
+        case _:
+            return str(value)
+
+
+def float_text(value: float, bits: int, digits: int | None = None) -> str:
+    """The shortest decimal that reads back as the same float of this width.
+
+    With `digits`, rounded to that many, and to twice as many for 64 bits: a degree of latitude has 111 km.
+    """
+    if digits is not None:
+        return f"{value:.{digits * bits // 32}g}"
+    if not math.isfinite(value):
+        return str(value)
+    if bits == 64:
+        return repr(value)
+    packed = struct.pack("<f", value)
+    return next(text for p in range(6, 10) if struct.pack("<f", float(text := f"{value:.{p}g}")) == packed)
+
+
+def rate_text(rate: float) -> str:
+    """Per second, in at most four characters up to 9999."""
+    return f"{rate:.1f}" if 0 < rate < 9.95 else f"{rate:.0f}"
+
+
+def protobuf_tree(message: Any, kind: MessageType, digits: int | None = None) -> Mapping[str, Tree]:
+    """The fields of a protobuf message that are not their default. Lists are whole, each element a member: `x[0]`."""
+    tree: dict[str, Tree] = {}
+    for field in kind.fields:
+        value = getattr(message, field.name)
+        if isinstance(field.type, List):
+            for index, element in enumerate(value):
+                tree[f"{field.name}[{index}]"] = _protobuf_value(element, field.type.element, digits)
+        elif isinstance(field.type, MessageType) or field.has_presence:
+            if message.HasField(field.name):
+                tree[field.name] = _protobuf_value(value, field.type, digits)
+        elif value or _is_negative_zero(value):
+            tree[field.name] = scalar_text(value, field.type, digits)
+    return tree
+
+
+def _protobuf_value(value: Any, kind: Type, digits: int | None) -> Tree:
+    return protobuf_tree(value, kind, digits) if isinstance(kind, MessageType) else scalar_text(value, kind, digits)
+
+
+def _is_negative_zero(value: Any) -> bool:
+    """Protobuf writes -0.0 although it equals the default."""
+    return isinstance(value, float) and math.copysign(1.0, value) < 0
+
+
+SHOWN_ELEMENTS = 8
+"""Of a list in a ROS message; a picture has a million."""
+
+
+def ros_tree(message: Any) -> Mapping[str, Tree]:
+    """The fields of an rclpy message that are not zero or empty; of lists the first elements."""
+    tree: dict[str, Tree] = {}
+    for name, spelled in message.get_fields_and_field_types().items():
+        value = getattr(message, name)
+        if not _is_array(value):
+            member = _ros_value(value, spelled)
+            if member and value not in (0, "", b"\0"):
+                tree[name] = member
+        elif any(value):
+            first = _elements(value[:SHOWN_ELEMENTS])
+            shown = [_ros_value(element, spelled) for element in first]
+            if not _is_ros_message(first[0]):
+                tree[name] = list_text(shown, len(value), SHOWN_ELEMENTS)
+                continue
+            tree.update({f"{name}[{index}]": element for index, element in enumerate(shown) if element})
+            if len(value) > len(first):
+                tree[name] = f"...({len(value)})"
+    return tree
+
+
+def _ros_value(value: Any, spelled: str) -> Any:
+    """`spelled` is the type of the field in rclpy's words: `float`, `sequence<double, 5>`, `uint8[4]`."""
+    if _is_ros_message(value):
+        return ros_tree(value)
+    octet = value[0] if isinstance(value, bytes) else value
+    return plain_text(octet, 64 if "double" in spelled else 32)
+
+
+def ros_json(value: Any) -> Any:
+    """An rclpy message as a dict, an array as a list; numbers that JSON lacks as in protobuf's JSON mapping."""
+    if _is_ros_message(value):
+        return {name: ros_json(getattr(value, name)) for name in value.get_fields_and_field_types()}
+    if _is_array(value):
+        return [ros_json(element) for element in _elements(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value[0] if isinstance(value, bytes) else value
+
+
+def _is_ros_message(value: Any) -> bool:
+    return hasattr(value, "get_fields_and_field_types")
+
+
+def _is_array(value: Any) -> bool:
+    """A list, an array.array or a numpy array."""
+    return hasattr(value, "__len__") and not isinstance(value, (str, bytes))
+
+
+def _elements(array: Any) -> list[Any]:
+    """The elements as Python's own numbers."""
+    return array.tolist() if hasattr(array, "tolist") else list(array)
