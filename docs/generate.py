@@ -11,7 +11,7 @@ from pathlib import Path
 from textwrap import fill
 
 from benchmarks.versus.report import page
-from router.compiler.functions import FUNCTIONS
+from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     DROP_REASONS,

@@ -18,7 +18,7 @@ from router.app.watching import PATIENCE, wait_for_rest, watched_files
 from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.check import Checked
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from router.errors import Diagnostic, Severity, StartError
 from router.log import logger

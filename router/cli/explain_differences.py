@@ -11,7 +11,7 @@ from pathlib import Path
 from router.cli import BAD_TABLE, OK
 from router.cli.findings import print_findings
 from router.compiler import check_table
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.tools.differences import differences
 
 

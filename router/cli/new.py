@@ -76,7 +76,7 @@ def _check(table: Path) -> list[Checked]:
     """The table, and those beside it."""
     from router.cli.validate import find_tables
     from router.compiler import check_table
-    from router.compiler.definitions import Definitions
+    from router.compiler.lookup import Definitions
 
     definitions = Definitions()
     checked = check_table(table, definitions=definitions)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
     from router.compiler import Checked
-    from router.compiler.definitions import Definitions
+    from router.compiler.lookup import Definitions
     from router.recording.reader_mcap import Recording
     from router.tools.replaying import Resent
 
@@ -104,7 +104,7 @@ def _advise(resent: Resent) -> int:
 
 
 def _compare(args: argparse.Namespace, recording: Recording) -> int:
-    from router.compiler.definitions import Definitions
+    from router.compiler.lookup import Definitions
     from router.rehearsal.replaying_against import Against
     from router.rehearsal.replaying_report import Report
 

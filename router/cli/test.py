@@ -11,7 +11,7 @@ from pathlib import Path
 from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
 from router.cli.findings import FORMATS, print_findings
 from router.cli.test_report import print_results, summary
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, TableError
 from router.rehearsal.coverage import Coverage
 from router.rehearsal.reading import read_test_file

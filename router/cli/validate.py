@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
 from router.cli.findings import FORMATS, count_line, plural, print_findings, severity
 from router.compiler import check_table
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, Severity, shown_path
 
 if TYPE_CHECKING:

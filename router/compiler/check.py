@@ -11,15 +11,13 @@ from functools import cached_property
 from pathlib import Path
 
 from router.compiler.checked import CheckedGateway, CheckedRoute
-from router.compiler.definitions import Definitions
 from router.compiler.gateways import check_gateways
-from router.compiler.lookup import Lookup
-from router.compiler.meetings import clash_findings, topic_findings
+from router.compiler.lookup import Definitions, Lookup
 from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
 from router.compiler.program import Program
-from router.compiler.routes import RouteChecker, sorted_findings
-from router.compiler.topics import diagnostics_topic
+from router.compiler.routes import check_routes, clash_findings
+from router.compiler.topics import diagnostics_topic, topic_findings
 from router.errors import Diagnostic, Severity, TableError
 from router.table import load_table
 from router.table.model import RouteTable, Topic
@@ -77,7 +75,7 @@ def check_table(
         return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
     locked = locked_size(schema) if table.envelope else None
     lookup = Lookup(table, schema, envelope, definitions, locked or envelope.max_size)
-    routes = RouteChecker(lookup).check_all()
+    routes = check_routes(lookup)
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
     own_type = lookup.ros_type(own) if own else None
@@ -100,3 +98,8 @@ def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Env
         return without_protos()
     schema = definitions.protos(table.envelope)
     return schema, find_envelope(schema, table.envelope)
+
+
+def sorted_findings(findings: Sequence[Diagnostic]) -> list[Diagnostic]:
+    """Each once, in the order in which a person reads the files."""
+    return sorted(dict.fromkeys(findings), key=lambda finding: (finding.span, finding.code.value, finding.message))

@@ -1,7 +1,4 @@
-"""A route or a gateway after its check: what the generation of its code, and `explain`, take it from.
-
-Plain data. Who finds out what is in it: `routes` and `gateways`, and the modules that they ask.
-"""
+"""Routes and gateways after their checks: plain data from which code is generated and `explain` prints."""
 
 from __future__ import annotations
 
@@ -9,11 +6,38 @@ from dataclasses import dataclass
 
 from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
-from router.compiler.target import Target
+from router.compiler.plan import Record
 from router.errors import SourceSpan
-from router.table.model import Gateway, Inbound, Route, Topic
+from router.table.model import Gateway, Inbound, Keep, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A destination or a topic. `name` is its label in the counters. Without a `plan` the datagram is forwarded.
+
+    `reads` makes the variables of its expressions; None where they are made once for all targets of the route.
+    `deadmen` are the routes whose deadmen hear of each command to it.
+    """
+
+    name: str
+    span: SourceSpan
+    is_topic: bool
+    reads: Reads | None
+    when: Typed | None = None
+    max_rate: float | None = None
+    keep: Keep = Keep.FIRST
+    priority: Priority = Priority.TELEMETRY
+    has_budget: bool = False
+    trim: bool = False
+    plan: Record | None = None
+    deadmen: tuple[str, ...] = ()
+
+    @property
+    def is_deferred(self) -> bool:
+        """Whether it may be served later, and by another thread."""
+        return self.has_budget or self.keep is Keep.LATEST
 
 
 @dataclass(frozen=True, slots=True)

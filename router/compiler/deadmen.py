@@ -9,15 +9,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
-from router.compiler.destinations import feeding, keep, recipient, takes_over
 from router.compiler.expressions import ParsedReads
-from router.compiler.implementations import NS_PER_SECOND
+from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
 from router.errors import Code, Diagnostic, MappingError, SourceSpan
-from router.table.model import Deadman, EndpointKind, FieldMap, InboundDeadman, Keep, Route
+from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, Keep, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -39,7 +38,7 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
     if case is None:
         return None
     for name in deadman.to:
-        recipient(lookup, case, name, sources=frozenset())
+        lookup.recipient(case, name, sources=frozenset())
     hands_over_to = _successors(lookup, route, deadman)
     datagram = _datagram(lookup, deadman, case)
     if datagram is None:
@@ -141,3 +140,27 @@ def constant_plan(
     findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
     lookup.findings += findings
     return None if findings else mapping.plan
+
+
+def feeding(route: Route, deadman: Deadman) -> list[Destination]:
+    """The destinations that commands have to reach for a route's own deadman: those that it stops.
+
+    Where it stops others than the route commands, all of the route's.
+    """
+    stopped = {to.value for to in deadman.to}
+    return [each for each in route.destinations if each.endpoint.value in stopped] or list(route.destinations)
+
+
+def takes_over(route: Route, endpoint: str, other: Route) -> bool:
+    """Whether a command of `route` to `endpoint` disarms the deadman of the `other` route."""
+    deadman = other.deadman
+    return (
+        deadman is not None
+        and other.name != route.name
+        and route.case.value in [case.value for case in deadman.hands_over_to]
+        and endpoint in [to.value for to in deadman.to]
+    )
+
+
+def keep(limited: Destination | Topic) -> Keep:
+    return limited.keep.value if limited.keep else Keep.FIRST

@@ -1,21 +1,26 @@
 """Assemble the program: handlers, what must be opened for them, and the counters with every series.
 
-Expects a table without errors: nothing here is checked, and nothing is found.
+Expects a table without errors: nothing here is checked.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedRoute
+from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedInbound, CheckedRoute
 from router.compiler.handlers import HandlerSource
-from router.compiler.link_gateways import link_gateway
 from router.compiler.lookup import layout
 from router.compiler.metrics import (
+    CLIENT_DROP_REASONS,
+    CLIENTS,
+    GATEWAY_DROP_REASONS,
+    GATEWAY_REJECT_REASONS,
+    INBOUND_DROP_REASONS,
     QOS_POLICIES,
     RECORD_DROP_REASONS,
     REJECT_REASONS,
     RELOAD_RESULTS,
+    TOPIC_STATES,
     UNKNOWN_CASE,
     Counters,
 )
@@ -23,7 +28,9 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.program import (
     STRANGER,
     DeadmanPlan,
+    GatewayPlan,
     Handler,
+    InboundPlan,
     ListenerPlan,
     Program,
     SenderPlan,
@@ -31,7 +38,7 @@ from router.compiler.program import (
     source_label,
 )
 from router.compiler.topics import qos_of
-from router.table.model import ANY, RouteTable, Topic
+from router.table.model import ANY, ROS, Gateway, InboundDeadman, RouteTable, Topic
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -213,3 +220,64 @@ def _deadman(route: str, deadman: CheckedDeadman, table: RouteTable, counters: C
         ),
         at_start=deadman.at_start,
     )
+
+
+# gateways
+
+
+def link_gateway(checked: CheckedGateway, counters: Counters) -> GatewayPlan:
+    """The plan of one gateway; opens its series in the counters."""
+    settings = checked.settings
+    _open_gateway_counters(counters, settings)
+    return GatewayPlan(settings, {entry.topic: _inbound(entry, settings.name, counters) for entry in checked.inbound})
+
+
+def _inbound(entry: CheckedInbound, gateway: str, counters: Counters) -> InboundPlan:
+    topic, inbound = entry.topic, entry.inbound
+    counters.index("messages_published", gateway, topic)
+    for reason in INBOUND_DROP_REASONS:
+        counters.index("messages_dropped", gateway, topic, reason)
+    for policy in QOS_POLICIES:
+        counters.index("qos_incompatible", gateway, topic, policy)
+    deadman = None
+    if inbound.deadman is not None and entry.stop is not None:
+        deadman = _client_deadman(f"{gateway}:{topic}", inbound.deadman, topic, entry.stop, counters)
+    return InboundPlan(
+        topic=topic,
+        name=inbound.topic.topic.value,
+        type=entry.type,
+        ttl=inbound.ttl.value if inbound.ttl else None,
+        max_rate=inbound.max_rate.value if inbound.max_rate else None,
+        deadman=deadman,
+    )
+
+
+def _client_deadman(name: str, deadman: InboundDeadman, topic: str, stop: bytes, counters: Counters) -> DeadmanPlan:
+    for metric in ("deadman_active", "deadman_trips"):
+        counters.index(metric, name)
+    for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
+        counters.index(metric, name, topic)
+    return DeadmanPlan(name, deadman.timeout.value, deadman.repeat.value, ((topic, stop),), deadman.at_start)
+
+
+def _open_gateway_counters(counters: Counters, gateway: Gateway) -> None:
+    name = gateway.name
+    for metric in ("datagrams_received", "received_bytes", "gateway_clients"):
+        counters.index(metric, name)
+    counters.index("route_last_message_timestamp_seconds", name)
+    for reason in GATEWAY_REJECT_REASONS:
+        counters.index("datagrams_rejected", name, reason)
+    for source in (ROS, CLIENTS):
+        counters.index("messages_received", name, source)
+    for metric in ("messages_sent", "messages_filtered"):
+        counters.index(metric, name, CLIENTS)
+    for reason in GATEWAY_DROP_REASONS:
+        counters.index("messages_dropped", name, CLIENTS, reason)
+    for metric in ("datagrams_sent", "sent_bytes"):
+        counters.index(metric, name, gateway.transport.value.value)
+    if gateway.zenoh is not None:
+        counters.index("gateway_key_conflicts", name)
+    for state in TOPIC_STATES:
+        counters.index("gateway_topics", name, state)
+    for reason in CLIENT_DROP_REASONS:
+        counters.index("client_messages_dropped", name, reason)

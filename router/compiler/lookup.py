@@ -1,22 +1,51 @@
-"""What routes name, looked up among the table's endpoints, the payload cases and the types.
-
-Collects what is wrong with it. Knows neither which way a route goes nor what becomes of the values.
-"""
+"""What a table refers to: `.proto` folders and ROS interfaces, and the names of its routes looked up in them."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
-from router.compiler.definitions import Definitions
-from router.compiler.expressions import Finding, Reads, Scope, Typed, check
-from router.compiler.kinds import BoolKind, Kind
+from router.compiler.expressions import ExpressionError, Reads, Scope, Typed, check
+from router.compiler.expressions.kinds import BoolKind, Kind
+from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, nearest
-from router.table.model import Endpoint, Expression, Located, RouteTable, Topic
+from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, Expression, Located, RouteTable, Topic
+from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
-from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
-from router.types.ros import definition
+from router.types.proto_folder import read_folder
+from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, load_protos, lock_path
+from router.types.ros import RosInterfaces, definition, ros_interfaces
+
+
+class Definitions:
+    """`known` are protos that were read before. They are what they were as long as the folder's files are."""
+
+    def __init__(self, known: ProtoSchema | None = None) -> None:
+        self._protos: dict[tuple[Path, str, Path], ProtoSchema] = {}
+        self._known = known
+
+    def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
+        """Raises TableError; a folder that is broken is read again, and reported, by every table."""
+        key = settings.protos.value, settings.message.value, lock_path(settings)
+        if key not in self._protos:
+            self._protos[key] = self._unchanged(settings) or load_protos(settings)
+        return self._protos[key]
+
+    def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
+        known = self._known
+        if known is None or (known.root, known.lock) != (settings.protos.value.resolve(), lock_path(settings)):
+            return None
+        if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
+            return None
+        return known if known.sha256 == read_folder(known.root, settings.protos.span).sha256 else None
+
+    @cached_property
+    def interfaces(self) -> RosInterfaces:
+        return ros_interfaces()
+
 
 NO_NAMES: Mapping[str, Typed] = {}
 
@@ -58,6 +87,18 @@ class Lookup:
                 self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
         return found
 
+    def recipient(self, case: PayloadCase, name: Located[str], sources: AbstractSet[str]) -> Endpoint | None:
+        """The endpoint `name`, which gets payloads of `case` that come from `sources`; None where there is none."""
+        endpoint = self.endpoint(name)
+        if endpoint is None:
+            return None
+        finding = loop_finding(self.table, endpoint, name.span, case.name, sources)
+        if finding and finding.message not in {earlier.message for earlier in self.findings}:
+            self.findings.append(finding)  # an endpoint that is the router itself is one mistake, not one per route
+        if endpoint.kind is EndpointKind.BOARD:
+            self.findings += board_findings(case, self.schema, self.board_limit, name.span)
+        return endpoint
+
     def ros_type(self, topic: Topic) -> MessageType | None:
         name = topic.type.value
         try:
@@ -88,9 +129,9 @@ class Lookup:
         try:
             typed = check(expression, scope)
             if not isinstance(typed.kind, kinds):
-                raise Finding(typed.span, Code.TYPE_MISMATCH, f"{wanted}, not {typed.kind}", hint)
-        except Finding as finding:
-            self.findings.append(finding.diagnostic)
+                raise ExpressionError(typed.span, Code.TYPE_MISMATCH, f"{wanted}, not {typed.kind}", hint)
+        except ExpressionError as error:
+            self.findings.append(error.diagnostic)
             return None
         return typed
 

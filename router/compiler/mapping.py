@@ -1,19 +1,17 @@
 """What fills a target: `fields:` and the target's type become a plan, one node for every field.
 
-Every entry that is wrong is a finding, and the rest of the mapping is still checked. Knows neither what an
-expression may be (`expressions`) nor what fits what (`conversion`).
+Every entry that is wrong is a finding, and the rest of the mapping is still checked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Union
 
 from router.compiler.conversion import convert, same_named, unset
-from router.compiler.expressions import Finding, Scope, Typed, check
-from router.compiler.plan import Plan, Record
-from router.compiler.presence import presence_findings
+from router.compiler.expressions import ExpressionError, Scope, Typed, check
+from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.types.model import Field, MessageType, Type
@@ -147,8 +145,8 @@ class _Builder:
         try:
             typed = check(entry.value, self.scope, member.type)
             plan = convert(typed, member.type, self.scope)
-        except Finding as finding:
-            self.findings.append(finding.diagnostic)
+        except ExpressionError as error:
+            self.findings.append(error.diagnostic)
             return unset(member, entry.value.span)
         self.rows.append(Row(path, str(member.type), _text(entry.value), str(typed.kind), automatic=False))
         return plan
@@ -156,8 +154,8 @@ class _Builder:
     def _automatic(self, member: Field, source: Typed, path: str) -> Plan:
         try:
             plan = convert(source, member.type, self.scope)
-        except Finding as finding:
-            found = finding.diagnostic
+        except ExpressionError as error:
+            found = error.diagnostic
             message = f"auto cannot fill '{path}': {found.message}"
             self.findings.append(Diagnostic(self.span, found.code, message, f"map '{path}' by hand: {found.hint}"))
             return unset(member, self.span)
@@ -170,3 +168,35 @@ def _text(expression: Expression) -> str:
     if expression.items is not None:
         return f"[{', '.join(map(_text, expression.items))}]"
     return " ".join(expression.text.split())
+
+
+def presence_findings(plan: Plan) -> Iterator[Diagnostic]:
+    match plan:
+        case Record():
+            yield from _oneof_findings(plan)
+            yield from _required_findings(plan)
+            for _, member in plan.members:
+                yield from presence_findings(member)
+        case Items():
+            for item in plan.items:
+                yield from presence_findings(item)
+        case Each():
+            yield from presence_findings(plan.element)
+
+
+def _oneof_findings(plan: Record) -> Iterator[Diagnostic]:
+    first: dict[str, str] = {}
+    for member, made in plan.members:
+        if member.oneof is None or isinstance(made, Unset):
+            continue
+        other = first.setdefault(member.oneof, member.name)
+        if other != member.name:
+            message = f"'{other}' and '{member.name}' are of one oneof, '{member.oneof}', and exclude each other"
+            yield Diagnostic(plan.span, Code.DUPLICATE_FIELD, message, "map one of them, by hand and without `auto`")
+
+
+def _required_findings(plan: Record) -> Iterator[Diagnostic]:
+    for member, made in plan.members:
+        if member.is_required and isinstance(made, Unset):
+            message = f"nothing fills '{member.name}', without which there is no {plan.type}"
+            yield Diagnostic(plan.span, Code.MISSING_KEY, message, "map it")

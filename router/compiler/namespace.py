@@ -1,14 +1,83 @@
-"""What generated code can call by name, beside what the engine binds for its targets."""
+"""The names that generated code can call, beside those that the engine binds for its targets.
+
+A value that a field cannot hold raises MappingError.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
+from typing import Any, NamedTuple, TypeVar
 
-from router.compiler.cdr.readers import cut_off, numbers, refuse, text, texts, wide_text, wide_texts
-from router.compiler.cdr.steps import CDR_LE, HEADER
-from router.compiler.cdr.writers import put_length, put_numbers, put_text, put_wide_text, want_length
-from router.compiler.functions import FUNCTIONS
-from router.compiler.implementations import entries, fit, fit_length, fit_text, fit_wide_text
+from router.compiler.cdr.primitives import (
+    CDR_LE,
+    HEADER,
+    cut_off,
+    numbers,
+    put_length,
+    put_numbers,
+    put_text,
+    put_wide_text,
+    refuse,
+    text,
+    texts,
+    want_length,
+    wide_text,
+    wide_texts,
+)
+from router.compiler.expressions.functions import FUNCTIONS
+from router.errors import MappingError
+
+Values = TypeVar("Values", bound=Sized)
+
+
+# what fields are read through
+
+
+class Entry(NamedTuple):
+    """One entry of a protobuf map, with the names that its declaration gives both parts."""
+
+    key: Any
+    value: Any
+
+
+def entries(values: Mapping[Any, object]) -> tuple[Entry, ...]:
+    """A protobuf map as the list that it is on the wire, in the order of its keys: its own differs from run to run."""
+    return tuple(Entry(key, values[key]) for key in sorted(values))
+
+
+# what fields ask of the values that fill them; tables cannot call these
+
+
+def fit(x: int, low: int, high: int) -> int:
+    """Passes an integer that the target can hold."""
+    if low <= x <= high:
+        return x
+    raise MappingError(f"{x} is outside {low}..{high}")
+
+
+def fit_text(x: str | bytes, bound: int) -> str | bytes:
+    """Passes text or bytes of at most `bound` bytes."""
+    length = len(x.encode() if isinstance(x, str) else x)
+    if length <= bound:
+        return x
+    raise MappingError(f"{length} bytes are more than {bound}")
+
+
+def fit_wide_text(x: str, bound: int) -> str:
+    """Passes text of at most `bound` UTF-16 code units."""
+    length = len(x.encode("utf-16-le")) // 2
+    if length <= bound:
+        return x
+    raise MappingError(f"{length} characters are more than {bound}")
+
+
+def fit_length(values: Values, least: int, most: int) -> Values:
+    """Passes a list of `least` to `most` elements."""
+    if least <= len(values) <= most:
+        return values
+    wanted = str(most) if least == most else f"at most {most}"
+    raise MappingError(f"{len(values)} elements where {wanted} fit")
+
 
 NAMESPACE: Mapping[str, object] = {
     **{name: function.implementation for name, function in FUNCTIONS.items()},

@@ -14,8 +14,7 @@ from typing import Any
 
 from router.compiler.namespace import NAMESPACE
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
-from router.compiler.source import Source
-from router.compiler.syntax import attribute, call, load, placed
+from router.compiler.source import Source, attribute, call, load, placed
 from router.errors import MappingError
 from router.types.model import Field, Float
 from router.types.protobuf import PayloadCase

@@ -1,79 +1,326 @@
-"""Checks routes against what exists: every name resolved, every mapping typed, all findings collected."""
+"""Check routes against what exists: every name resolved, every mapping typed, all findings collected."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
-from router.compiler.checked import CheckedRoute
-from router.compiler.deadmen import check_deadman
-from router.compiler.inbound import check_inbound
+from router.compiler.cdr.reading import CdrReads
+from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedRoute, CheckedTarget, Target
+from router.compiler.deadmen import check_deadman, feeding, keep, takes_over
+from router.compiler.expressions import ParsedReads, Reads, Scope, Typed
+from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.lookup import Lookup
-from router.compiler.outbound import check_outbound
-from router.compiler.topics import qos_findings, topic_name_finding
-from router.errors import Code, Diagnostic, nearest
-from router.table.model import ANY, ROS, Route
+from router.compiler.mapping import build
+from router.compiler.plan import Record
+from router.compiler.source import load
+from router.compiler.topics import qos_findings, resolved, topic_name_finding
+from router.errors import Code, Diagnostic, SourceSpan, nearest
+from router.table.model import (
+    ANY,
+    ROS,
+    Collect,
+    Destination,
+    Endpoint,
+    EndpointKind,
+    Expression,
+    Located,
+    Priority,
+    Route,
+    RouteTable,
+    Topic,
+)
+from router.types.model import MessageType
+from router.types.protobuf import PayloadCase
 
 _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Code.NO_DEADMAN})
 """What a route may seem to do wrong because a part of it, which has a finding of its own, was left out."""
 
 
-@dataclass(slots=True)
-class RouteChecker:
-    """Checks the routes of one table; findings fill up `lookup`, what several routes share once for each of them."""
+def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
+    _coverage(lookup)
+    return tuple(checked for route in lookup.table.routes if (checked := _checked(lookup, route)))
 
-    lookup: Lookup
 
-    def check_all(self) -> tuple[CheckedRoute, ...]:
-        self._coverage()
-        return tuple(checked for route in self.lookup.table.routes if (checked := self._checked(route)))
+def _coverage(lookup: Lookup) -> None:
+    table, cases = lookup.table, lookup.envelope.cases
+    names = [route.case.value for route in table.routes]
+    # a misspelt case is one finding, not two
+    covered = {name if name in cases else nearest(name, cases) for name in names}
+    covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
+    missing = [name for name in cases if name not in covered]
+    if missing and table.routes_span is not None:  # a table of gateways has no routes for any
+        plural = "payload case" if len(missing) == 1 else "payload cases"
+        message = f"no route for the {plural} {', '.join(missing)}"
+        hint = "route it, or say `ignore: reason`"
+        lookup.report(table.routes_span, Code.UNCOVERED_PAYLOAD_CASE, message, hint)
 
-    def _coverage(self) -> None:
-        table, cases = self.lookup.table, self.lookup.envelope.cases
-        names = [route.case.value for route in table.routes]
-        # a misspelt case is one finding, not two
-        covered = {name if name in cases else nearest(name, cases) for name in names}
-        covered |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
-        missing = [name for name in cases if name not in covered]
-        if missing and table.routes_span is not None:  # a table of gateways has no routes for any
-            plural = "payload case" if len(missing) == 1 else "payload cases"
-            message = f"no route for the {plural} {', '.join(missing)}"
-            hint = "route it, or say `ignore: reason`"
-            self.lookup.report(table.routes_span, Code.UNCOVERED_PAYLOAD_CASE, message, hint)
 
-    def _checked(self, route: Route) -> CheckedRoute | None:
-        findings = self.lookup.findings
-        before = len(findings)
-        checked = self._route(route)
-        if f"routes/{route.case.value}" in self.lookup.table.broken:
-            findings[before:] = [finding for finding in findings[before:] if finding.code not in _OF_GAPS]
-        return checked
+def _checked(lookup: Lookup, route: Route) -> CheckedRoute | None:
+    findings = lookup.findings
+    before = len(findings)
+    checked = _route(lookup, route)
+    if f"routes/{route.case.value}" in lookup.table.broken:
+        findings[before:] = [finding for finding in findings[before:] if finding.code not in _OF_GAPS]
+    return checked
 
-    def _route(self, route: Route) -> CheckedRoute | None:
-        case = self.lookup.case(route.case)
-        if case is None:
+
+def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
+    case = lookup.case(route.case)
+    if case is None:
+        return None
+    if route.ignore is not None:
+        return CheckedRoute(route, case)
+    _sources(lookup, route)
+    if not route.destinations and not route.topics:
+        message, hint = f"'{route.name}' goes nowhere", "name destinations or topics, or say `ignore: reason`"
+        lookup.report(route.span, Code.NO_TARGET, message, hint)
+    for topic in route.topics:
+        found = (topic_name_finding(topic), *qos_findings(topic, publishes=not route.is_outbound))
+        lookup.findings += [finding for finding in found if finding]
+    checked = (check_outbound if route.is_outbound else check_inbound)(lookup, route, case)
+    return replace(checked, deadman=check_deadman(lookup, route))
+
+
+def _sources(lookup: Lookup, route: Route) -> None:
+    for source in route.sources:
+        if source.value not in (ANY, ROS):
+            lookup.endpoint(source, (ANY, ROS))
+        elif len(route.sources) > 1:
+            message, hint = f"'{source.value}' stands alone", "name endpoints, or it, not both"
+            lookup.report(source.span, Code.BAD_VALUE, message, hint)
+
+
+def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:
+    """Those of a route, each with its endpoint, None where there is none; what is wrong with them is reported."""
+    sources = {source.value for source in route.sources}
+    seen: set[str] = set()
+    for destination in route.destinations:
+        name = destination.endpoint
+        if name.value in seen:
+            lookup.report(name.span, Code.BAD_VALUE, f"'{name.value}' is a destination twice", "name it once")
+        seen.add(name.value)
+    return [(each, lookup.recipient(case, each.endpoint, sources)) for each in route.destinations]
+
+
+def target_to(
+    lookup: Lookup,
+    route: Route,
+    destination: Destination,
+    endpoint: Endpoint | None,
+    when: Typed | None,
+    reads: Reads | None = None,
+    plan: Record | None = None,
+) -> Target:
+    """The target that a destination becomes. Whatever goes to a board is a command where the route says nothing."""
+    to_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
+    name = destination.endpoint.value
+    deadmen = [other.name for other in lookup.table.routes if takes_over(route, name, other)]
+    if route.deadman is not None and destination in feeding(route, route.deadman):
+        deadmen.insert(0, route.name)
+    return Target(
+        name=name,
+        span=destination.span,
+        is_topic=False,
+        reads=reads,
+        when=when,
+        max_rate=max_rate(destination),
+        keep=keep(destination),
+        priority=route.priority.value if route.priority else Priority.COMMAND if to_board else Priority.TELEMETRY,
+        has_budget=endpoint is not None and endpoint.budget is not None,
+        trim=endpoint is not None and endpoint.trim_trailing_zeros,
+        plan=plan,
+        deadmen=tuple(deadmen),
+    )
+
+
+def max_rate(limited: Destination | Topic) -> float | None:
+    return limited.max_rate.value if limited.max_rate else None
+
+
+# from UDP
+
+
+def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
+    if route.fields is not None:
+        message = "'fields' of a route belongs to `source: ros`"
+        lookup.report(route.fields.span, Code.UNKNOWN_KEY, message, "a topic has its own 'fields'")
+    targets = [_forward(lookup, route, case, to, endpoint) for to, endpoint in destinations(lookup, route, case)]
+    names = _frame_names(case, route.collect.span) if route.collect else {}
+    for topic in route.topics:
+        ros_type = lookup.ros_type(topic)
+        if ros_type is not None:
+            targets.append(_publish(lookup, case, topic, ros_type, names))
+    collect = _collect(lookup, route, case, route.collect) if route.collect else None
+    return CheckedRoute(route, case, tuple(targets), collect=collect)
+
+
+def _forward(
+    lookup: Lookup, route: Route, case: PayloadCase, destination: Destination, endpoint: Endpoint | None
+) -> CheckedTarget:
+    if destination.fields is not None:
+        hint = "'fields' of a destination belongs to `source: ros`"
+        lookup.report(destination.fields.span, Code.UNKNOWN_KEY, "a datagram is forwarded unchanged", hint)
+    reads = ParsedReads()
+    when = lookup.when(destination.when, lookup.scope(case.type, reads))
+    return CheckedTarget(target_to(lookup, route, destination, endpoint, when, reads))
+
+
+def _publish(
+    lookup: Lookup, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Typed]
+) -> CheckedTarget:
+    reads = ParsedReads()
+    scope = lookup.scope(case.type, reads, ros_type, names)
+    when = lookup.when(topic.when, scope)
+    mapping = build(topic.fields, ros_type, scope, topic.topic.span)
+    lookup.findings += mapping.findings
+    name, rate = topic.topic.value, max_rate(topic)
+    target = Target(name, topic.span, True, reads, when, rate, keep(topic), plan=mapping.plan)
+    return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
+
+
+def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Typed]:
+    """What the topics of a route that collects see beside the fields of the frame's first part."""
+    items = Typed.at(span, ListKind(MessageKind(case.type)), load("items"))
+    return {"items": items, "count": Typed.at(span, UINT32, load("count"))}
+
+
+def _collect(lookup: Lookup, route: Route, case: PayloadCase, collect: Collect) -> CheckedCollect | None:
+    if not route.topics and route.destinations:
+        message = "'collect' puts frames together for topics, and there are none"
+        lookup.report(collect.span, Code.UNKNOWN_KEY, message, "destinations get each datagram as it came")
+    reads = ParsedReads()
+    scope = lookup.scope(case.type, reads)
+    names = (IntKind, EnumKind, StringKind, BoolKind)
+    by = lookup.value(collect.by, scope, names, "'by' takes what can name a frame: an integer or a string")
+    count = lookup.value(collect.count, scope, (IntKind,), "'count' takes an integer")
+    order = lookup.value(collect.order, scope, (IntKind,), "'order' takes an integer")
+    if by is None or count is None or order is None:
+        return None
+    return CheckedCollect(collect.span, reads, by, count, order)
+
+
+# from ROS
+
+
+Destinations = Sequence[tuple[Destination, "Endpoint | None"]]
+HEADER = "std_msgs/msg/Header"
+
+
+def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
+    name = route.name
+    if not route.topics:
+        message = f"'{name}' comes from ROS, but from no topic"
+        lookup.report(route.span, Code.NO_TARGET, message, "name it under 'topics'")
+    if route.topics and not route.destinations:
+        message = f"'{name}' goes to no destination"
+        lookup.report(route.span, Code.NO_TARGET, message, "name it under 'destinations'")
+    found = destinations(lookup, route, case)
+    feeds = []
+    for topic in route.topics:
+        _subscribed(lookup, route, topic)
+        ros_type = lookup.ros_type(topic)
+        if ros_type is not None and (feed := _feed(lookup, route, case, topic, ros_type, found)):
+            feeds.append(feed)
+    return CheckedRoute(route, case, feeds=tuple(feeds))
+
+
+def _subscribed(lookup: Lookup, route: Route, topic: Topic) -> None:
+    """What a topic may say where it is published only, or once."""
+    if topic.fields is not None:
+        message = "with `source: ros` the fields to fill are the payload's"
+        lookup.report(topic.fields.span, Code.UNKNOWN_KEY, message, "move 'fields' up to the route")
+    if topic.max_rate is not None:
+        message = "with `source: ros` it is destinations that take a 'max_rate'"
+        lookup.report(topic.max_rate.span, Code.UNKNOWN_KEY, message, "move it to {endpoint: NAME, max_rate: ...}")
+    name = topic.topic.value
+    if next(other for other in route.topics if other.topic.value == name) is not topic:
+        lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{name}' is a topic twice", "name it once")
+
+
+def _feed(
+    lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
+) -> CheckedFeed | None:
+    """None where it is not known what `item` is: all that names it would only seem wrong."""
+    reads = CdrReads(ros_type)
+    scope = lookup.scope(ros_type, reads, ros_type)
+    stamp = _stamp(scope, topic.span) if route.ttl else None
+    for_each = None
+    if route.for_each is not None:
+        for_each = _elements(lookup, route.for_each, scope)
+        if for_each is None:
             return None
-        if route.ignore is not None:
-            return CheckedRoute(route, case)
-        self._sources(route)
-        if not route.destinations and not route.topics:
-            message, hint = f"'{route.name}' goes nowhere", "name destinations or topics, or say `ignore: reason`"
-            self.lookup.report(route.span, Code.NO_TARGET, message, hint)
-        for topic in route.topics:
-            found = (topic_name_finding(topic), *qos_findings(topic, publishes=not route.is_outbound))
-            self.lookup.findings += [finding for finding in found if finding]
-        checked = (check_outbound if route.is_outbound else check_inbound)(self.lookup, route, case)
-        return replace(checked, deadman=check_deadman(self.lookup, route))
-
-    def _sources(self, route: Route) -> None:
-        for source in route.sources:
-            if source.value not in (ANY, ROS):
-                self.lookup.endpoint(source, (ANY, ROS))
-            elif len(route.sources) > 1:
-                message, hint = f"'{source.value}' stands alone", "name endpoints, or it, not both"
-                self.lookup.report(source.span, Code.BAD_VALUE, message, hint)
+        scope = lookup.scope(ros_type, reads, ros_type, _element_names(for_each))
+    when = lookup.when(topic.when, scope)
+    own = any(destination.fields for destination, _ in found)  # then the route need not have any
+    targets = []
+    for destination, endpoint in found:
+        condition = lookup.when(destination.when, scope)
+        fields = destination.fields or route.fields or topic.fields  # the last are misplaced, but meant
+        whole = scope.variable("item", route.span) if for_each else None
+        mapping = build(fields, case.type, scope, destination.span if own else route.span, whole)
+        lookup.findings += mapping.findings
+        target = target_to(lookup, route, destination, endpoint, condition, plan=mapping.plan)
+        targets.append(CheckedTarget(target, rows=tuple(mapping.rows)))
+    return CheckedFeed(topic, ros_type, reads, when, for_each, stamp, tuple(targets))
 
 
-def sorted_findings(findings: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """Each once, in the order in which a person reads the files."""
-    return sorted(dict.fromkeys(findings), key=lambda finding: (finding.span, finding.code.value, finding.message))
+def _stamp(scope: Scope, span: SourceSpan) -> Typed | None:
+    """`header.stamp` of a message that has one."""
+    header = scope.message.field("header")
+    if header is None or not isinstance(header.type, MessageType) or header.type.name != HEADER:
+        return None
+    stamp = header.type.field("stamp")
+    return scope.read(("header",), stamp, span) if stamp else None
+
+
+def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Typed | None:
+    """The list of `for_each`. An empty literal is no list that anything could be of."""
+    typed = lookup.value(expression, scope, (ListKind,), "'for_each' takes a list")
+    if typed is not None and isinstance(typed.kind, ListKind) and typed.kind.element is None:
+        lookup.report(typed.span, Code.TYPE_MISMATCH, "'for_each' takes a list with elements, not an empty one")
+        return None
+    return typed
+
+
+def _element_names(elements: Typed) -> dict[str, Typed]:
+    """What expressions see beside the fields of the message that has the list."""
+    assert isinstance(elements.kind, ListKind)  # noqa: S101 - see _elements
+    assert elements.kind.element is not None  # noqa: S101
+    return {
+        "item": Typed.at(elements.span, elements.kind.element, load("item")),
+        "index": Typed.at(elements.span, UINT32, load("index")),
+        "count": Typed.at(elements.span, UINT32, load("count")),
+    }
+
+
+# across routes
+
+
+def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Routes of one payload case that take it from the same endpoint, or from the same topic."""
+    earlier: dict[str, dict[str, SourceSpan]] = {}
+    for route in table.routes:
+        taken = earlier.setdefault(route.case.value, {})
+        origins = _origins(route, table)
+        for key, origin in origins.items():
+            if (name := _taken(key, taken)) is not None:
+                message = f"another route takes '{route.case.value}' from '{name}'"
+                yield Diagnostic(origin.span, Code.SOURCE_CLASH, message, f"see {taken[name]}; let one have it")
+        taken.update((key, origin.span) for key, origin in origins.items())
+
+
+def _origins(route: Route, table: RouteTable) -> dict[str, Located[str]]:
+    """Where a route takes messages from: topics by their absolute names, which no endpoint has, or endpoints."""
+    if route.is_outbound:
+        return {resolved(topic.topic.value, table.node): topic.topic for topic in route.topics}
+    return {source.value: source for source in route.sources}
+
+
+def _taken(key: str, taken: Mapping[str, SourceSpan]) -> str | None:
+    """What of `taken` stands in the way. `any` overlaps with all endpoints."""
+    if key in taken:
+        return key
+    if key == ANY:
+        return next((name for name in taken if not name.startswith("/")), None)
+    return ANY if ANY in taken and not key.startswith("/") else None

@@ -1,6 +1,6 @@
 """Which topics a gateway sends, and how often: its patterns, over absolute topic names.
 
-Pure: knows no ROS graph. Patterns are expected to be sound; `pattern_problem` says whether one is.
+Patterns are expected to be valid; `pattern_problem` says what is wrong with one.
 """
 
 from __future__ import annotations
@@ -10,15 +10,11 @@ from collections.abc import Callable, Collection
 from functools import lru_cache
 from typing import NamedTuple
 
-from router.compiler.automaton import Automaton, UnsupportedError
 from router.table.model import Gateway, TopicPattern, TopicRate
 
 _WILDCARDS = re.compile(r"[*?]")
 _PART = re.compile(r"\*\*|(?:[A-Za-z0-9_?]|\*(?!\*))+")
 _ANY_PARTS = "**"
-_LONGEST_REGEX = 400
-"""Characters. In no more, groups cannot be nested so deeply that it would be trouble to the parser."""
-_SIMPLER = "say it in several patterns, and with 'exclude' what is not to be sent"
 _REMEMBERED = 4096
 """Topics whose answers are kept: they are asked for again whenever the gateway looks for topics."""
 
@@ -29,9 +25,14 @@ class PatternProblem(NamedTuple):
 
 
 def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
-    """Why a pattern is none."""
+    """Return why the pattern is invalid, or None."""
     if pattern.is_regex:
-        return _regex_problem(pattern.text)
+        try:
+            re.compile(pattern.text)
+        except (re.error, OverflowError, RecursionError) as error:
+            hint = "regular expressions are Python's, and match whole names"
+            return PatternProblem(f"'{pattern.text}' is not a regular expression: {error}", hint)
+        return None
     if not pattern.text.startswith("/"):
         hint = f"patterns are for absolute topic names; did you mean '/{pattern.text}' or '/**/{pattern.text}'?"
         return PatternProblem(f"'{pattern.text}' does not begin with '/'", hint)
@@ -39,25 +40,6 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
         what = f"'{wrong[0]}' is no part of a topic's name" if wrong[0] else "a part of it is empty"
         hint = "parts are letters, digits, '_', '*' and '?', or '**' alone; {regex: ...} can say more"
         return PatternProblem(f"'{pattern.text}' matches no topic: {what}", hint)
-    return _unsupported(_regex(pattern.text))
-
-
-def _regex_problem(text: str) -> PatternProblem | None:
-    if len(text) > _LONGEST_REGEX:
-        return PatternProblem(f"a regular expression cannot have more than {_LONGEST_REGEX} characters", _SIMPLER)
-    try:
-        return _unsupported(text)
-    except (re.error, OverflowError) as error:
-        hint = "regular expressions are Python's, and match whole names"
-        return PatternProblem(f"'{text}' is not a regular expression: {error}", hint)
-
-
-def _unsupported(regex: str) -> PatternProblem | None:
-    """Raises re.error and OverflowError."""
-    try:
-        Automaton(regex)
-    except UnsupportedError as error:
-        return PatternProblem(f"a pattern cannot have {error}", _SIMPLER)
     return None
 
 
@@ -128,10 +110,10 @@ def _parts(text: str) -> list[str]:
 
 
 def matcher(pattern: TopicPattern) -> Callable[[str], object]:
-    """Says something true of the names that a sound pattern matches."""
+    """Return a function that is true of the names that a valid pattern matches."""
     if is_name(pattern):
         return pattern.text.__eq__
-    return Automaton(pattern.text if pattern.is_regex else _regex(pattern.text)).matches
+    return re.compile(pattern.text if pattern.is_regex else _regex(pattern.text)).fullmatch
 
 
 def _regex(glob: str) -> str:

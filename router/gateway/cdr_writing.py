@@ -10,8 +10,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from router.compiler.cdr.steps import scalar_format
-from router.compiler.cdr.writers import put_length, put_text
+from router.compiler.cdr.primitives import put_length, put_text, scalar_format
 from router.gateway.invalid import InvalidMessageError, shown
 from router.types.model import Bool, Float, Int, List, String
 

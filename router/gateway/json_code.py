@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable
 from typing import NoReturn
 
-from router.compiler.cdr.steps import CDR_LE, scalar_format
+from router.compiler.cdr.primitives import CDR_LE, scalar_format
 from router.gateway.json_layout import CdrLines
 from router.gateway.json_lists import SHORT, SHORT_LISTS, STRINGS, WIDE_LISTS, WIDE_STRINGS, cut_off, joined, list_text
 from router.gateway.numbers import DOUBLES, FLOATS

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from router.compiler.cdr.steps import HEADER
+from router.compiler.cdr.primitives import HEADER
 
 _INDENT = "    "
 _ORIGIN = len(HEADER)

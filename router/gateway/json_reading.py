@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from router.compiler.cdr.steps import HEADER
+from router.compiler.cdr.primitives import HEADER
 from router.gateway.cdr_writing import Numbers, Put, put_size, text_writer
 from router.gateway.invalid import InvalidMessageError, shown
 from router.gateway.json_parsing import parse_json

@@ -12,8 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from router.clock import monotonic_ns, wall_ns
-from router.compiler.cdr.steps import HEADER
-from router.compiler.cdr.writers import put_length, put_text
+from router.compiler.cdr.primitives import HEADER, put_length, put_text
 from router.compiler.metrics import metric
 from router.log import logger
 from router.observe.diagnostics_findings import Status

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from router.compiler.implementations import NS_PER_SECOND
+from router.compiler.expressions.functions import NS_PER_SECOND
 from router.rehearsal.matching import Exactly, ListMatch, Match, MessageMatch, Moment, Moments
 from router.rehearsal.shown import default_of
 from router.types.model import List, MessageType, Type

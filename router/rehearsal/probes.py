@@ -17,7 +17,7 @@ from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedRoute, C
 from router.compiler.expressions import Typed
 from router.compiler.plan import Each, Items, Leaf, Plan, Record
 from router.compiler.program import Handler, Program
-from router.compiler.syntax import call, placed
+from router.compiler.source import call, placed
 from router.errors import SourceSpan
 
 PROBE = "touched_by_a_test"

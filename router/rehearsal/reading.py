@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from router.compiler import check_table
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 from router.rehearsal.expected import ExpectedReader
 from router.rehearsal.given import GivenReader

@@ -12,7 +12,8 @@ from typing import Any
 
 from google.protobuf.message import Message
 
-from router.compiler.implementations import NS_PER_SECOND, entries
+from router.compiler.expressions.functions import NS_PER_SECOND
+from router.compiler.namespace import entries
 from router.rehearsal.rehearsal import START
 from router.table.quantities import duration
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type

@@ -10,8 +10,8 @@ from typing import cast
 
 from google.protobuf.message import Message
 
-from router.compiler.expressions import Finding, ParsedReads, Scope, check
-from router.compiler.kinds import BoolKind
+from router.compiler.expressions import ExpressionError, ParsedReads, Scope, check
+from router.compiler.expressions.kinds import BoolKind
 from router.compiler.namespace import NAMESPACE
 from router.compiler.source import Source
 from router.engine.outcome import MAPPING_FAILURES
@@ -41,8 +41,8 @@ class Condition:
         for case in cases:
             try:
                 self._holds[case.name] = _compiled(text, case.type)
-            except Finding as finding:
-                findings[case.name] = finding.diagnostic
+            except ExpressionError as error:
+                findings[case.name] = error.diagnostic
         if not self._holds:
             likely = min(findings.values(), key=lambda each: not each.hint.startswith("did you mean"))
             raise UsageError(f"--where: {likely.message}" + (f"; {likely.hint}" if likely.hint else ""))
@@ -61,13 +61,15 @@ class Condition:
 
 
 def _compiled(text: str, message: MessageType) -> Holds:
-    """Raises Finding."""
+    """Raises ExpressionError."""
     span = SourceSpan("--where", 1, 1, len(text) + 1)
     reads = ParsedReads()
     place = TextPlace(span, ((0, span),))
     typed = check(Expression(text, place), Scope(message, tuple(_enums(message)), (), reads))
     if not isinstance(typed.kind, BoolKind):
-        raise Finding(span, Code.TYPE_MISMATCH, f"it is {typed.kind}, not a bool", "compare something, as in speed > 0")
+        raise ExpressionError(
+            span, Code.TYPE_MISMATCH, f"it is {typed.kind}, not a bool", "compare something, as in speed > 0"
+        )
     out = Source()
     with out.block(f"def {FUNCTION}(m, source, received_at):", span):
         reads.write(out, span)

@@ -13,7 +13,7 @@ import pytest
 from router.assets import asset
 from router.cli import BAD_TABLE, BAD_USAGE, OK, findings, main
 from router.cli.test import FAILED
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.rehearsal.reading import read_test_file
 from router.rehearsal.shape import SCHEMA
 from router.rehearsal.tests import prove

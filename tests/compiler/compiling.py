@@ -59,7 +59,7 @@ def context_of(
 
 
 def compiled(text: str, scope: Scope, expected: Type | None = None) -> tuple[Typed, Callable[[Any], Any]]:
-    """A checked expression, and as a function of the message. Raises Finding."""
+    """A checked expression, and as a function of the message. Raises ExpressionError."""
     typed = check(written(text), scope, expected)
     out = Source()
     with out.block("def evaluate(m, source, received_at):", SPAN):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from router.compiler import Checked, check_table
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from tests.tables import PROTOS, ROUTES
 

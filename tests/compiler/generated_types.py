@@ -9,7 +9,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from router.compiler.kinds import INT32
+from router.compiler.expressions.kinds import INT32
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 INTS = [Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (True, False)]

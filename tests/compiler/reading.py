@@ -8,10 +8,9 @@ from typing import Any
 from hypothesis import strategies as st
 
 from router.compiler.cdr.reading import CdrReads
-from router.compiler.kinds import TIME_TYPES
+from router.compiler.expressions.kinds import TIME_TYPES
 from router.compiler.namespace import NAMESPACE
-from router.compiler.source import Source
-from router.compiler.syntax import placed
+from router.compiler.source import Source, placed
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import SPAN
 from tests.compiler.generated_types import INTS

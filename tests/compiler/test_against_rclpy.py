@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.engine.outcome import MAPPING_FAILURES
 from router.types.model import MessageType
 from tests.compiler.comparing import assert_same_message, same

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.types.ros import ros_interfaces
 from tests.compiler.comparing import same
 from tests.compiler.generated_types import values

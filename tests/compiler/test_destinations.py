@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from router.compiler.target import Target
+from router.compiler.checked import Target
 from router.table.model import Keep, Priority
 from tests.compiler.conftest import CheckText
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.expressions import Finding
-from router.compiler.kinds import BoolKind, FloatKind, IntKind, Kind, StringKind
+from router.compiler.expressions import ExpressionError
+from router.compiler.expressions.kinds import BoolKind, FloatKind, IntKind, Kind, StringKind
 from router.compiler.mapping import build
 from router.compiler.source import Source
 from router.engine.outcome import MAPPING_FAILURES
@@ -130,8 +130,8 @@ MANY = settings(max_examples=300, suppress_health_check=list(HealthCheck))
 def test_compiled_and_reference_agree(text: str, message: Any) -> None:
     try:
         typed, run = compiled(text, scope_of(SOURCE, [MODE]))
-    except Finding as finding:
-        if finding.diagnostic.code not in REFUSED and "nan equals nothing" not in finding.diagnostic.message:
+    except ExpressionError as error:
+        if error.diagnostic.code not in REFUSED and "nan equals nothing" not in error.diagnostic.message:
             raise
         event("refused")
         return

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from router.compiler.functions import FUNCTIONS
-from router.compiler.kinds import FloatKind, IntKind, StringKind, TimeKind
+from router.compiler.expressions.functions import FUNCTIONS
+from router.compiler.expressions.kinds import FloatKind, IntKind, StringKind, TimeKind
 from router.types.model import MessageType
 from tests.compiler.compiling import compiled, context_of, scope_of, written
 from tests.oracles.reference_expressions import evaluate

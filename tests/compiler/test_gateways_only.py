@@ -8,7 +8,7 @@ import pytest
 
 from router.app.watching import watched_files
 from router.compiler import Checked, check_table
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.errors import Code, Diagnostic, Severity
 from router.observe.route_map import route_map
 from router.recording.mirrored import Known

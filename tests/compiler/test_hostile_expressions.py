@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from router.compiler.expressions import DEEPEST, Finding
+from router.compiler.expressions import DEEPEST, ExpressionError
 from router.compiler.source import Source
 from router.engine.outcome import MAPPING_FAILURES
 from router.errors import Code
@@ -77,14 +77,14 @@ class NamedConstants(ast.NodeTransformer):
         return ast.Name(str(node.value)) if is_named else node
 
 
-def check_ends_well(text: str) -> Finding | None:
+def check_ends_well(text: str) -> ExpressionError | None:
     """The finding, or None for an expression that is well-formed; then it also compiles and shows."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # a table says what is wrong with it in findings alone
         try:
             typed, _ = compiled(text, scope_of(SOURCE, [MODE]))
-        except Finding as finding:
-            return finding
+        except ExpressionError as error:
+            return error
         out = Source()
         out.line(f"it = {out.expression(typed.node)}", SPAN)
         assert ast.unparse(ast.parse(out.text())) == ast.unparse(NamedConstants().visit(out.tree()))
@@ -94,10 +94,10 @@ def check_ends_well(text: str) -> Finding | None:
 
 @pytest.mark.parametrize("text", FORBIDDEN)
 def test_forbidden_syntax_is_named_as_such(text: str) -> None:
-    finding = check_ends_well(text)
-    assert finding is not None
-    assert finding.diagnostic.code is Code.FORBIDDEN_EXPRESSION
-    assert "\n" not in str(finding.diagnostic)
+    error = check_ends_well(text)
+    assert error is not None
+    assert error.diagnostic.code is Code.FORBIDDEN_EXPRESSION
+    assert "\n" not in str(error.diagnostic)
 
 
 @pytest.mark.parametrize("text", OTHERS)

@@ -9,11 +9,10 @@ from typing import Any
 import pytest
 
 from router.compiler.cdr import CdrReads
-from router.compiler.expressions import Finding, Scope, Typed, check
-from router.compiler.kinds import MessageKind, TimeKind, kind_of
+from router.compiler.expressions import ExpressionError, Scope, Typed, check
+from router.compiler.expressions.kinds import MessageKind, TimeKind, kind_of
 from router.compiler.namespace import NAMESPACE
-from router.compiler.source import Source
-from router.compiler.syntax import load
+from router.compiler.source import Source, load
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String
 from tests.compiler.compiling import SPAN, written
 from tests.compiler.reading import TIMES
@@ -103,7 +102,7 @@ def test_element_has_fields_that_are_called_as_keywords_are() -> None:
 
 def test_misspelt_name_beside_the_fields_is_suggested() -> None:
     scope = scope_over(DECLARED, {"total_count": Typed.at(SPAN, kind_of(_UINT8), load("total_count"))})
-    with pytest.raises(Finding) as raised:
+    with pytest.raises(ExpressionError) as raised:
         check(written("total_cuont"), scope)
     assert "total_count" in raised.value.diagnostic.hint
 
@@ -111,7 +110,7 @@ def test_misspelt_name_beside_the_fields_is_suggested() -> None:
 @pytest.mark.parametrize("text", ["has(left)", "has(item)", "has(item.area)", "has(left.area)"])
 def test_has_finds_nothing_that_could_be_missing(text: str) -> None:
     scope = scope_over(DECLARED, {"item": Typed.at(SPAN, MessageKind(BOX), load("item"))})
-    with pytest.raises(Finding):
+    with pytest.raises(ExpressionError):
         check(written(text), scope)
 
 

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 from router.compiler.cdr import CdrReads
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.engine.outcome import MAPPING_FAILURES

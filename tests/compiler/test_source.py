@@ -9,8 +9,8 @@ import traceback
 import pytest
 
 from router.compiler import Checked, check_table
-from router.compiler.definitions import Definitions
 from router.compiler.handlers import HandlerSource
+from router.compiler.lookup import Definitions
 from router.compiler.metrics import Counters
 from router.compiler.source import Source
 from router.errors import SourceSpan

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 from router.compiler import check_table
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.compiler.program import Program
 from router.engine import Engine, OutboundEngine, Report
 from router.engine.binding import Guarded, Outlets

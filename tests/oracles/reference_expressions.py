@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from router.compiler.functions import FUNCTIONS, NOT_FINITE
-from router.compiler.kinds import TIME_TYPES
+from router.compiler.expressions.functions import FUNCTIONS, NOT_FINITE
+from router.compiler.expressions.kinds import TIME_TYPES
 from router.errors import MappingError
 from router.table.model import Expression
 from router.types.model import Enum, Int, List, MessageType, Type

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from router.app import Router
 from router.compiler import check_table
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.engine.wire import Wire
 from router.rehearsal.coverage import Coverage
 from router.rehearsal.events import Filtered, Rejected, Sent

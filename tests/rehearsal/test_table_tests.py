@@ -7,7 +7,7 @@ from textwrap import dedent, indent
 
 import pytest
 
-from router.compiler.definitions import Definitions
+from router.compiler.lookup import Definitions
 from router.errors import Code, Diagnostic, TableError
 from router.rehearsal.comparing import Failure
 from router.rehearsal.coverage import Coverage

@@ -7,8 +7,7 @@ unknown length all offsets are known when the code is made, so that whole stretc
 
 from __future__ import annotations
 
-from router.compiler.cdr.generation import write_message
 from router.compiler.cdr.reading import CdrReads
-from router.compiler.cdr.steps import message_size
+from router.compiler.cdr.writing import message_size, write_message
 
 __all__ = ["write_message", "message_size", "CdrReads"]

@@ -1,16 +1,375 @@
-"""ROS messages as expressions see them: code that reads the wanted fields, and only those, out of CDR bytes `cdr`."""
+"""Generate the code that reads wanted fields, and only those, out of the CDR bytes `cdr` of a ROS message.
+
+`steps` makes a message type the flat sequence of what is read or skipped, up to the last wanted field.
+`ReadingCode` writes it with as few `struct` calls as alignment allows: one for what comes before the first string or
+sequence, where all offsets are known; behind it the position `at` is known when the code runs, and its last three
+bits select one of eight unpackers.
+"""
 
 from __future__ import annotations
 
 import ast
+import struct
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Union
 
-from router.compiler.cdr.reading_code import ReadingCode
-from router.compiler.cdr.reading_steps import decoder, steps
-from router.compiler.expressions.reads import Path, Reads
-from router.compiler.source import Source
-from router.compiler.syntax import call, load
+from router.compiler.cdr.primitives import HEADER, object_class, scalar_format
+from router.compiler.expressions.kinds import OCTET, TIME_TYPES
+from router.compiler.expressions.scope import Path, Reads
+from router.compiler.source import Source, call, load
 from router.errors import SourceSpan
-from router.types.model import Field, MessageType
+from router.types.model import Field, List, MessageType, String, Type
+
+
+@dataclass(frozen=True, slots=True)
+class Take:
+    """Bytes of known size: `format` is what struct makes of them, `variable` where that goes, None for nowhere."""
+
+    format: str
+    alignment: int
+    variable: str | None
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize(f"<{self.format}")
+
+
+LENGTH = Take("I", 4, "length")
+"""What stands before a Stretch, before a Loop of no known count, and before a Leap."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A string or a sequence of scalars: `length` units of `size` bytes. `letter` where they become numbers."""
+
+    size: int
+    variable: str | None
+    letter: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """`body` again and again, `count` times or else `length`; it leaves in `element` what the list `variable` gets."""
+
+    count: int | None
+    body: tuple[Step, ...]
+    element: str
+    variable: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Leap:
+    """A sequence that nobody wants, of `length` messages of known size: no need to look at each."""
+
+    element: tuple[Take, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Object:
+    """An object of a message's class, of the expressions that are its fields."""
+
+    variable: str
+    type: MessageType
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A time or a duration, in ns, of its two fields."""
+
+    variable: str
+    seconds: str
+    nanoseconds: str
+
+
+@dataclass(frozen=True, slots=True)
+class Unpack:
+    """An array of scalars, of which a Take has left the bytes in `variable`."""
+
+    variable: str
+    letter: str
+    size: int
+
+
+Made = Union[Object, Moment, Unpack]
+"""What is made of others that were read before."""
+
+Step = Union[Take, Stretch, Loop, Leap, Made]
+
+
+def steps(message: MessageType, wanted: Collection[Path], variable: Callable[[Path], str]) -> Sequence[Step]:
+    """`wanted` are paths of fields, or of messages that become objects; `variable` names what is at a path."""
+    found = list(_Walk(wanted, variable).message(message, ()))
+    while found and not _is_wanted(found[-1]):
+        found.pop()
+    return found
+
+
+def _is_wanted(step: Step) -> bool:
+    match step:
+        case Take() | Stretch() | Loop():
+            return step.variable is not None and step is not LENGTH
+        case Leap():
+            return False
+        case Object() | Moment() | Unpack():
+            return True
+
+
+@dataclass(frozen=True, slots=True)
+class _Walk:
+    wanted: Collection[Path]
+    variable: Callable[[Path], str]
+
+    def value(self, declared: Type, path: Path) -> str:
+        """The expression that is a field's whole value, once its steps are done."""
+        variable = self.variable(path)
+        decode = decoder(declared)
+        return f"{decode}({variable})" if decode else variable
+
+    def steps(self, declared: Type, path: Path, whole: bool) -> Iterator[Step]:
+        """`whole` where all of a message around it is wanted."""
+        whole = whole or path in self.wanted
+        variable = self.variable(path) if whole else None
+        match declared:
+            case MessageType():
+                yield from self.message(declared, path, whole)
+            case List():
+                yield from self._list(declared, path, variable)
+            case String():
+                yield LENGTH
+                yield Stretch(4 if declared.wide else 1, variable)
+            case _:
+                letter = scalar_format(declared)
+                yield Take(letter, struct.calcsize(letter), variable)
+
+    def message(self, declared: MessageType, path: Path, whole: bool = False) -> Iterator[Step]:
+        whole = whole or path in self.wanted
+        for member in declared.fields:
+            yield from self.steps(member.type, (*path, member.name), whole)
+        if not declared.fields:
+            # Read where objects are made, so that a list cannot claim more of them than there are bytes.
+            yield Take("B", 1, self.variable((*path, "nothing")) if whole else None)
+        if whole:
+            fields = tuple(self.value(member.type, (*path, member.name)) for member in declared.fields)
+            is_moment = path != () and declared.name in TIME_TYPES  # a topic of times gives messages as others do
+            yield Moment(self.variable(path), *fields) if is_moment else Object(self.variable(path), declared, fields)
+
+    def _list(self, declared: List, path: Path, variable: str | None) -> Iterator[Step]:
+        if declared.length is None:
+            yield LENGTH
+        if isinstance(declared.element, (MessageType, String)):
+            yield from self._elements(declared, path, variable)
+            return
+        letter = scalar_format(declared.element)
+        size = struct.calcsize(letter)
+        are_bytes = declared.element == OCTET  # which bytes are already
+        if declared.length is None:
+            yield Stretch(size, variable, None if are_bytes else letter)
+            return
+        yield Take(f"{declared.length * size}s", size, variable)
+        if variable is not None and not are_bytes:
+            yield Unpack(variable, letter, size)
+
+    def _elements(self, declared: List, path: Path, variable: str | None) -> Iterator[Step]:
+        """Of a list whose elements are messages or strings."""
+        item = (*path, "item")
+        body = tuple(self.steps(declared.element, item, variable is not None))
+        fixed = tuple(step for step in body if isinstance(step, Take))
+        if variable is not None or fixed != body:
+            yield Loop(declared.length, body, self.variable(item), variable)
+        elif declared.length is None:
+            yield Leap(fixed)
+        else:
+            yield from fixed * declared.length
+
+
+def decoder(declared: Type) -> str | None:
+    """The function that makes text of what is read for a field; None where that is the value already."""
+    match declared:
+        case String():
+            return "wide_text" if declared.wide else "text"
+        case List(element=String(wide=wide)):
+            return "wide_texts" if wide else "texts"
+        case _:
+            return None
+
+
+_PHASES = range(8)
+_ORIGIN = len(HEADER)
+"""Where in the bytes alignment counts from."""
+_WIDEST = 80
+"""How many characters of names are put on one line."""
+
+
+def _layout(takes: Iterable[Take], start: int) -> tuple[str, int]:
+    """Struct format and size of what begins at `start`, where this many more bytes than it takes mean nothing."""
+    letters, skipped, at = ["<"], 0, start
+    for take in takes:
+        padding = (_ORIGIN - at) % take.alignment
+        at += padding + take.size
+        skipped += padding
+        if take.variable is None:
+            skipped += take.size
+            continue
+        letters += [f"{skipped}x"] * bool(skipped) + [take.format]
+        skipped = 0
+    letters += [f"{skipped}x"] * bool(skipped)
+    return "".join(letters), at - start
+
+
+def _leaps(element: Sequence[Take]) -> tuple[list[int], int]:
+    """The size of a first message of known size by the phase it begins at, and that of each one which follows.
+
+    Behind a scalar the phase is known modulo its size, so from the second message on all are of one size.
+    """
+    sizes = [_layout(element, phase)[1] for phase in _PHASES]
+    second = sizes[0] % 8
+    return sizes, sizes[second]
+
+
+class ReadingCode:
+    """Appends to a function the lines that read `cdr`. `at` is known now as long as that is possible."""
+
+    def __init__(self, out: Source, span: SourceSpan, at: int | None = _ORIGIN) -> None:
+        self.out = out
+        self.span = span
+        self.at = at
+        self.is_checked = True
+        """Whether `struct` has seen that the bytes reach as far as has been read."""
+        self._is_behind = False
+        self._together: list[Take] = []
+        self._made: list[Made] = []
+
+    def write(self, steps: Iterable[Step]) -> None:
+        for step in steps:
+            match step:
+                case Take():
+                    self._together.append(step)
+                case Object() | Moment() | Unpack():
+                    self._made.append(step)
+                case Stretch() | Loop() | Leap():
+                    self._flush()
+                    self._advance()
+                    self._vary(step)
+        self._flush()
+
+    def _vary(self, step: Stretch | Loop | Leap) -> None:
+        """What has its length in the message."""
+        match step:
+            case Stretch():
+                self._stretch(step)
+            case Loop():
+                self._loop(step)
+            case Leap():
+                self._leap(step)
+
+    def _advance(self) -> None:
+        """Brings `at` behind what was unpacked last; not needed where nothing follows."""
+        if self._is_behind:
+            self._line("at += size")
+            self._is_behind = False
+
+    def _line(self, text: str) -> None:
+        self.out.line(text, self.span)
+
+    def _spread(self, before: str, names: Sequence[str], after: str) -> None:
+        """A statement with a tuple in it, one name a line where they are too many for one."""
+        together = f"({names[0]},)" if len(names) == 1 else f"({', '.join(names)})"
+        if len(together) <= _WIDEST:
+            self._line(f"{before}{together}{after}")
+            return
+        self._line(f"{before}(")
+        with self.out.indented():
+            for name in names:
+                self._line(f"{name},")
+        self._line(f"){after}")
+
+    def _flush(self) -> None:
+        """Reads what has come together, and makes what waits for it."""
+        takes, made = self._together, self._made
+        self._together, self._made = [], []
+        if takes:
+            variables = [take.variable for take in takes if take.variable is not None]
+            if self.at is None:
+                self._floating(takes, variables)
+            else:
+                self._static(takes, variables, self.at)
+            self.is_checked = bool(variables)
+        for one in made:
+            self._make(one)
+
+    def _static(self, takes: Sequence[Take], variables: Sequence[str], at: int) -> None:
+        letters, size = _layout(takes, at)
+        self.at = at + size
+        if variables:
+            unpack = self.out.constant("unpack_message", struct.Struct(letters).unpack_from)
+            self._spread("", variables, f" = {unpack}(cdr, {at})")
+
+    def _floating(self, takes: Sequence[Take], variables: Sequence[str]) -> None:
+        layouts = [_layout(takes, phase) for phase in _PHASES]
+        if not variables:
+            sizes = self.out.constant("sizes_at", tuple(size for _, size in layouts))
+            self._line(f"at += {sizes}[at & 7]")
+            return
+        at = self.out.constant("unpack_at", tuple((struct.Struct(it).unpack_from, size) for it, size in layouts))
+        self._line(f"unpack, size = {at}[at & 7]")
+        self._spread("", variables, " = unpack(cdr, at)")
+        self._is_behind = True
+
+    def _make(self, made: Made) -> None:
+        match made:
+            case Unpack():
+                self._line(f"{made.variable} = numbers({made.letter!r}, {made.size}, {made.variable})")
+            case Moment():
+                self._line(f"{made.variable} = {made.seconds} * 1_000_000_000 + {made.nanoseconds}")
+            case Object():
+                make = self.out.constant(f"make_{made.type.short_name}", object_class(made.type))
+                self._spread(f"{made.variable} = {make}(", made.fields, ")")
+
+    def _float(self) -> None:
+        """From here on `at` is a variable."""
+        if self.at is not None:
+            self._line(f"at = {self.at}")
+            self.at = None
+
+    def _stretch(self, stretch: Stretch) -> None:
+        if stretch.size == 8:
+            self._float()
+            with self.out.block("if length:", self.span):
+                self._line(f"at += {_ORIGIN} - at & 7")
+        size = "length" if stretch.size == 1 else f"{stretch.size} * length"
+        end = f"at + {size}" if self.at is None else "at"
+        start = "at" if self.at is None else str(self.at)
+        data = f"cdr[{start} : {end}]"
+        if stretch.letter is not None:
+            data = f"numbers({stretch.letter!r}, {stretch.size}, {data})"
+        lines = [f"at += {size}" if self.at is None else f"at = {start} + {size}"]
+        if stretch.variable is not None:
+            lines.insert(0 if self.at is None else 1, f"{stretch.variable} = {data}")
+        for line in lines:
+            self._line(line)
+        self.at, self.is_checked = None, False
+
+    def _loop(self, loop: Loop) -> None:
+        self._float()
+        if loop.variable is not None:
+            self._line(f"{loop.variable} = []")
+        body = ReadingCode(self.out, self.span, None)
+        with self.out.block(f"for _ in range({'length' if loop.count is None else loop.count}):", self.span):
+            body.write(loop.body)
+            body._advance()
+            if loop.variable is not None:
+                self._line(f"{loop.variable}.append({loop.element})")
+        self.is_checked = body.is_checked
+
+    def _leap(self, leap: Leap) -> None:
+        self._float()
+        sizes, following = _leaps(leap.element)
+        with self.out.block("if length:", self.span):
+            first = str(sizes[0]) if len({*sizes}) == 1 else f"{self.out.constant('sizes_at', tuple(sizes))}[at & 7]"
+            self._line(f"at += {first} + (length - 1) * {following}")
+        self.is_checked = False
 
 
 class CdrReads(Reads):

@@ -7,8 +7,6 @@ expression fills, but for the bounds that clamp() and wrap() take from it: wheth
 from __future__ import annotations
 
 from router.compiler.expressions.checker import DEEPEST, check
-from router.compiler.expressions.reads import ParsedReads, Reads
-from router.compiler.expressions.scope import Scope
-from router.compiler.expressions.typed import Finding, Typed
+from router.compiler.expressions.scope import ExpressionError, ParsedReads, Reads, Scope, Typed
 
-__all__ = ["check", "Finding", "Typed", "Scope", "Reads", "ParsedReads", "DEEPEST"]
+__all__ = ["check", "ExpressionError", "Typed", "Scope", "Reads", "ParsedReads", "DEEPEST"]

@@ -1,29 +1,35 @@
-"""Walks an expression, innermost first, and lets the rules make checked Python of what the user wrote."""
+"""Check an expression, innermost node first, and make typed Python of it: names, fields, constants and calls."""
 
 from __future__ import annotations
 
 import ast
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from router.compiler.expressions import calls, literals, names, operators
-from router.compiler.expressions.forbidden import forbidden
-from router.compiler.expressions.parsing import Parsed
-from router.compiler.expressions.scope import Scope
-from router.compiler.expressions.typed import Finding, Typed
-from router.compiler.functions import HAS
-from router.errors import Code, SourceSpan
+from router.compiler.expressions import operators
+from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE, Function
+from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, MessageKind, StringKind, TimeKind
+from router.compiler.expressions.operators import constant
+from router.compiler.expressions.scope import MESSAGE, SOURCE, ExpressionError, Scope, Typed
+from router.compiler.expressions.syntax import Parsed, dotted, forbidden
+from router.compiler.source import attribute, call, load
+from router.errors import Code, SourceSpan, did_you_mean, nearest
 from router.table.model import Expression
-from router.types.model import List, Type
+from router.types.model import Enum, Int, List, MessageType, String, Type
 
 DEEPEST = 60
 """How deep an expression may nest: what handles syntax trees, ours and Python's own, does so recursively."""
 
 
 def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Typed:
-    """Raises Finding. `expected` is the field to be filled: clamp() and wrap() take bounds of it, bare names values."""
+    """The typed Python of an expression. Raises ExpressionError.
+
+    `expected` is the type of the field to be filled: clamp() and wrap() take their bounds from it, bare names are
+    looked up among the values of an enum.
+    """
     if expression.items is not None:
         items = [check(item, scope, _element(expected)) for item in expression.items]
-        typed = literals.list_of(items, expression.span)
+        typed = operators.list_of(items, expression.span)
     else:
         text = Parsed(expression)
         typed = _Checker(text, scope).check(text.tree, expected)
@@ -48,7 +54,7 @@ class _Checker:
         span = self.text.span(node)
         self.depth += 1
         if self.depth > DEEPEST:
-            raise Finding(span, Code.EXPRESSION_SYNTAX, "not an expression: nested too deeply")
+            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, "not an expression: nested too deeply")
         typed = self._rule(node, span, expected)
         self.depth -= 1
         return typed
@@ -58,17 +64,17 @@ class _Checker:
     ) -> Typed:
         match node:
             case ast.Constant():
-                return literals.constant(node.value, span)
+                return operators.constant(node.value, span)
             case ast.List():
-                return literals.list_of([self.check(item, _element(expected)) for item in node.elts], span)
+                return operators.list_of([self.check(item, _element(expected)) for item in node.elts], span)
             case ast.Name():
-                return names.named(node.id, span, self.scope, expected)
-            case ast.Attribute() if path := names.constant_path(node, self.scope):
-                return names.constant_of(path, node, self.text, self.scope)
+                return named(node.id, span, self.scope, expected)
+            case ast.Attribute() if path := constant_path(node, self.scope):
+                return constant_of(path, node, self.text, self.scope)
             case ast.Attribute():
-                return names.field_of(self.check(node.value), node, self.text, self.scope)
+                return field_of(self.check(node.value), node, self.text, self.scope)
             case ast.Subscript():
-                return literals.element_of(self.check(node.value), self.check(node.slice), span)
+                return operators.element_of(self.check(node.value), self.check(node.slice), span)
             case ast.UnaryOp():
                 return operators.unary(node.op, self.check(node.operand), span)
             case ast.BinOp():
@@ -89,16 +95,190 @@ class _Checker:
                 raise forbidden(node, span)
 
     def _call(self, node: ast.Call, span: SourceSpan, expected: Type | None) -> Typed:
-        name = calls.called_name(node, self.text)
+        name = called_name(node, self.text)
         if name == HAS:
             return self._has(node, span)
-        function = calls.function_named(name, self.text.span(node.func))
-        return calls.call_of(function, [self.check(argument) for argument in node.args], span, expected)
+        function = function_named(name, self.text.span(node.func))
+        return call_of(function, [self.check(argument) for argument in node.args], span, expected)
 
     def _has(self, node: ast.Call, span: SourceSpan) -> Typed:
         """Looks at a field rather than at its value, so the argument's path counts; checked it is all the same."""
-        path = names.field_path(node.args[0], self.scope) if len(node.args) == 1 else None
+        path = field_path(node.args[0], self.scope) if len(node.args) == 1 else None
         if not path:
-            raise Finding(span, Code.WRONG_ARGUMENTS, "has() takes one field")
+            raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes one field")
         argument = self.check(node.args[0])
-        return names.presence(path, argument.span, span, self.scope)
+        return presence(path, argument.span, span, self.scope)
+
+
+def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Typed:
+    """A name that stands alone. `expected` is what it is to fill."""
+    if text in scope.names:
+        return scope.variable(text, span)
+    if member := scope.message.field(text):
+        return scope.read((), member, span)
+    if text in scope.given:
+        return _given(text, span, scope)
+    if text in ("true", "false"):  # as YAML spells them
+        return constant(text == "true", span)
+    values = dict(expected.values) if isinstance(expected, Enum) else {}
+    if isinstance(expected, Enum) and text in values:
+        return Typed.at(span, EnumKind(expected), ast.Constant(values[text]))
+    if text in NOT_FINITE:
+        return Typed.at(span, FloatKind(32), ast.Constant(NOT_FINITE[text]))
+    raise _unknown(text, span, scope, expected)
+
+
+def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> ExpressionError:
+    if text in FUNCTIONS or text == HAS:
+        return ExpressionError(span, Code.WRONG_ARGUMENTS, f"'{text}' is a function", f"call it: {text}(...)")
+    if scope.holders(text):
+        return ExpressionError(span, Code.TYPE_MISMATCH, f"'{text}' is an enum, not a value", f"name one: {text}.VALUE")
+    values = dict(expected.values) if isinstance(expected, Enum) else {}
+    known = [*scope.field_names(), *scope.given, *values]
+    if text.lower() in NOT_FINITE:
+        known = [text.lower()]
+    hint = _of_an_enum(text, scope) or did_you_mean(text, known) or "only constants can stand here"
+    if isinstance(expected, String) and not nearest(text, known):
+        hint = f"text has quotes of its own: \"'{text}'\""
+    return ExpressionError(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
+
+
+def _of_an_enum(text: str, scope: Scope) -> str:
+    """A hint for an enum's value that stands without its enum; one of the message's own fields comes first."""
+    homes = [enum for enum in scope.enums if text in dict(enum.values)]
+    types = [member.type for member in scope.message.fields]
+    own = [home for home in homes if home in types] or homes
+    return f"did you mean '{own[0]}.{text}'?" if own else ""
+
+
+def _given(text: str, span: SourceSpan, scope: Scope) -> Typed:
+    if text == MESSAGE:
+        return scope.whole_message(span)
+    return Typed.at(span, StringKind() if text == SOURCE else TimeKind(), load(text))
+
+
+def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
+    """The parts of `a.b.C` when it is to be looked up among enums and ROS types: no field or variable is `a`."""
+    path = dotted(node)
+    if path is None or path[0] in (*scope.given, *scope.field_names()):
+        return None
+    return path
+
+
+def field_of(holder: Typed, node: ast.Attribute, text: Parsed, scope: Scope) -> Typed:
+    """`holder.name`."""
+    span = text.span(node)
+    if not isinstance(holder.kind, MessageKind):
+        hint = "only messages have fields"
+        raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"'.{node.attr}' of a {holder.kind}", hint)
+    member = holder.kind.type.field(node.attr)
+    if member is None:
+        hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
+        message = f"{holder.kind.type} has no field '{node.attr}'"
+        raise ExpressionError(text.last_span(node), Code.UNKNOWN_FIELD, message, hint)
+    return scope.field_of(holder, member, span)
+
+
+def constant_of(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope: Scope) -> Typed:
+    """`SensorState.SENSOR_ERROR`: an enum's value or a ROS type's constant, at `path`."""
+    holder_name = ".".join(path[:-1])
+    holders = scope.holders(holder_name)
+    if not holders:
+        message = f"{scope.message} has no field or enum '{holder_name}'"
+        hint = did_you_mean(holder_name, scope.holder_names() | set(scope.field_names()))
+        raise ExpressionError(text.span(node.value), Code.UNKNOWN_FIELD, message, hint)
+    found = [(holder, constants[node.attr]) for holder in holders if node.attr in (constants := _constants(holder))]
+    if not found:
+        known = {value for holder in holders for value in _constants(holder)}
+        message = f"'{holder_name}' has no value '{node.attr}'"
+        raise ExpressionError(text.last_span(node), Code.UNKNOWN_ENUM_VALUE, message, did_you_mean(node.attr, known))
+    if len({value for _, value in found}) > 1:
+        names = ", ".join(sorted(holder.name for holder, _ in found))
+        message = f"'{holder_name}.{node.attr}' may be of {names}"
+        raise ExpressionError(text.span(node), Code.UNKNOWN_ENUM_VALUE, message, "write the enum's full name")
+    holder, value = found[0]
+    literal = constant(value, text.span(node))
+    return Typed(EnumKind(holder), literal.node, literal.span) if isinstance(holder, Enum) else literal
+
+
+def _constants(holder: Enum | MessageType) -> Mapping[str, object]:
+    return dict(holder.values) if isinstance(holder, Enum) else holder.constants
+
+
+def field_path(node: ast.expr, scope: Scope) -> tuple[str, ...] | None:
+    """The names that lead from the source message to what `node` looks like; None when it is no chain of names."""
+    path = dotted(node)
+    if path is None or path[0] in scope.names:
+        return None
+    return path[1:] if path[0] == MESSAGE and scope.message.field(MESSAGE) is None else path
+
+
+def presence(path: tuple[str, ...], field_span: SourceSpan, span: SourceSpan, scope: Scope) -> Typed:
+    """`has(path)`. Raises ExpressionError for a path that is no field which can be missing."""
+    holder = scope.message
+    for part in path[:-1]:
+        inner = holder.field(part)
+        if inner is None or not isinstance(inner.type, MessageType):
+            raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes a field of the message")
+        holder = inner.type
+    member = holder.field(path[-1])
+    if member is None or not member.has_presence:
+        hint = "has() is for a payload's submessages and optional fields"
+        raise ExpressionError(field_span, Code.WRONG_ARGUMENTS, f"'{path[-1]}' is always there", hint)
+    has_field = attribute(scope.reads.message(path[:-1]), "HasField")
+    return Typed.at(span, BoolKind(), ast.Call(has_field, [ast.Constant(path[-1])], []))
+
+
+def called_name(node: ast.Call, text: Parsed) -> str:
+    """The name in front of the brackets. Raises ExpressionError for calls of another shape than `name(a, b)`."""
+    if not isinstance(node.func, ast.Name):
+        hint = did_you_mean("", FUNCTIONS)
+        raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only listed functions are called", hint)
+    if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
+        message = f"{node.func.id}() takes its arguments by position"
+        raise ExpressionError(text.span(node), Code.WRONG_ARGUMENTS, message)
+    return node.func.id
+
+
+def function_named(name: str, span: SourceSpan) -> Function:
+    function = FUNCTIONS.get(name)
+    if function is None:
+        hint = did_you_mean(name, [*FUNCTIONS, HAS])
+        raise ExpressionError(span, Code.UNKNOWN_FUNCTION, f"there is no function '{name}'", hint)
+    return function
+
+
+def call_of(function: Function, arguments: Sequence[Typed], span: SourceSpan, expected: Type | None) -> Typed:
+    """The call as a checked expression; bounds that it leaves out are those of the field `expected`."""
+    if function.optional and len(arguments) == len(function.parameters) - function.optional:
+        arguments = [*arguments, *_bounds(function, span, expected)]
+    _want_count(function, len(arguments), span)
+    _want_accepted(function, arguments)
+    try:
+        kind = function.result([argument.kind for argument in arguments])
+    except ValueError as error:
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, f"{function.name}(): {error}") from None
+    return Typed.at(span, kind, call(function.name, *[argument.node for argument in arguments]))
+
+
+def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list[Typed]:
+    if not isinstance(expected, Int):
+        message = f"{function.name}() needs bounds here, where no integer field is filled"
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.name}(x, low, high)")
+    return [Typed.at(span, IntKind(bound, bound), ast.Constant(bound)) for bound in (expected.low, expected.high)]
+
+
+def _want_count(function: Function, count: int, span: SourceSpan) -> None:
+    takes = len(function.parameters)
+    if count < takes or (count > takes and not function.variadic):
+        wanted = f"{takes} argument{'s' * (takes != 1)}" + " or more" * function.variadic
+        message = f"{function.name}() takes {wanted}, not {count}"
+        raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.signature}")
+
+
+def _want_accepted(function: Function, arguments: Sequence[Typed]) -> None:
+    repeated = [function.parameters[-1]] * (len(arguments) - len(function.parameters))
+    for parameter, argument in zip([*function.parameters, *repeated], arguments, strict=True):
+        if not isinstance(argument.kind, parameter.accepts):
+            message = f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}"
+            raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message)

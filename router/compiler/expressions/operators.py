@@ -1,6 +1,6 @@
-"""Operators: what they take, of which kind the result is, and between which bounds an integer result lies.
+"""Literals, lists and operators: what they take, the kind of the result, and the bounds of an integer result.
 
-Operands come here checked. Knows no names and no text.
+Operands are checked before.
 """
 
 from __future__ import annotations
@@ -11,10 +11,7 @@ import operator
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 
-from router.compiler.expressions.forbidden import forbidden
-from router.compiler.expressions.literals import folded, within_bounds
-from router.compiler.expressions.typed import Finding, Typed
-from router.compiler.kinds import (
+from router.compiler.expressions.kinds import (
     ANY_INT,
     BoolKind,
     EnumKind,
@@ -30,7 +27,72 @@ from router.compiler.kinds import (
     float_bits,
     join,
 )
+from router.compiler.expressions.scope import ExpressionError, Typed
+from router.compiler.expressions.syntax import forbidden
 from router.errors import Code, SourceSpan
+
+WIDEST = 512
+"""How many bits an integer may have on the way to a field."""
+
+
+def constant(value: object, span: SourceSpan) -> Typed:
+    match value:
+        case bool():
+            return Typed.at(span, BoolKind(), ast.Constant(value))
+        case int():
+            return Typed.at(span, within_bounds(IntKind(value, value), span), ast.Constant(value))
+        case float():
+            if not math.isfinite(value):
+                raise ExpressionError(span, Code.OUT_OF_RANGE, "a literal this large is infinite")
+            return Typed.at(span, FloatKind(32), ast.Constant(value))
+        case str():
+            return Typed.at(span, StringKind(), ast.Constant(value))
+        case _:
+            raise forbidden(ast.Constant(None), span)
+
+
+def within_bounds(kind: Kind, span: SourceSpan) -> Kind:
+    """Keeps powers of powers from taking all memory, here and at run time."""
+    if isinstance(kind, IntKind) and kind.bounds and max(bound.bit_length() for bound in kind.bounds) > WIDEST:
+        raise ExpressionError(span, Code.OUT_OF_RANGE, f"an integer has at most {WIDEST} bits")
+    return kind
+
+
+def folded(result: Typed) -> Typed:
+    """Arithmetic of two literals is done here, so that what it comes to is checked against the target."""
+    try:
+        value = eval(compile(ast.Expression(result.node), "<literal>", "eval"), {})  # noqa: S307 - two literals
+    except ArithmeticError as error:
+        raise ExpressionError(result.span, Code.OUT_OF_RANGE, str(error)) from None
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ExpressionError(
+            result.span, Code.OUT_OF_RANGE, f"this is always {value}", f"write {value} if that is meant"
+        )
+    kind = IntKind(value, value) if isinstance(value, int) else result.kind
+    return Typed.at(result.span, kind, ast.Constant(value))
+
+
+def list_of(items: Sequence[Typed], span: SourceSpan) -> Typed:
+    element: Kind | None = items[0].kind if items else None
+    for item in items[1:]:
+        element = join(element, item.kind) if element else None
+        if element is None:
+            raise ExpressionError(item.span, Code.TYPE_MISMATCH, f"a list of {items[0].kind} cannot hold {item.kind}")
+    made = ast.List([item.node for item in items], ast.Load())
+    return Typed.at(span, ListKind(element, len(items)), made, items=tuple(items))
+
+
+def element_of(holder: Typed, index: Typed, span: SourceSpan) -> Typed:
+    """`holder[index]`."""
+    kind, position = holder.kind, index.constant
+    if not isinstance(kind, ListKind) or kind.element is None:
+        raise ExpressionError(span, Code.TYPE_MISMATCH, f"a {kind} has no elements", "only lists are indexed")
+    if not isinstance(position, int) or isinstance(position, bool) or position < 0:
+        raise ExpressionError(index.span, Code.FORBIDDEN_EXPRESSION, "an index is a literal integer from 0")
+    if kind.length is not None and position >= kind.length:
+        raise ExpressionError(index.span, Code.OUT_OF_RANGE, f"index {position} of {kind.length} elements")
+    return Typed.at(span, kind.element, ast.Subscript(holder.node, index.node, ast.Load()))
+
 
 LARGEST_EXPONENT = 8
 
@@ -65,7 +127,7 @@ def unary(op: ast.unaryop, operand: Typed, span: SourceSpan) -> Typed:
 
 
 def want_binary(op: ast.operator, span: SourceSpan) -> None:
-    """Raises Finding for an operator that the language does not have."""
+    """Raises ExpressionError for an operator that the language does not have."""
     if not isinstance(op, (*_MONOTONE, *_DIVISIONS, ast.Pow)):
         raise forbidden(op, span)
 
@@ -75,7 +137,7 @@ def binary(op: ast.operator, left: Typed, right: Typed, span: SourceSpan) -> Typ
     if isinstance(op, ast.Add) and isinstance(left.kind, StringKind) and isinstance(right.kind, StringKind):
         return Typed.at(span, StringKind(), made)
     if isinstance(left.kind, TimeKind) or isinstance(right.kind, TimeKind):
-        raise Finding(span, Code.TYPE_MISMATCH, "times are not computed with", "use seconds(time) and back")
+        raise ExpressionError(span, Code.TYPE_MISMATCH, "times are not computed with", "use seconds(time) and back")
     _want_number(left)
     _want_number(right)
     if isinstance(op, _DIVISIONS) and right.constant == 0:
@@ -112,7 +174,7 @@ def _power(base: Kind, exponent: Typed) -> Kind:
     value = exponent.constant
     if not isinstance(value, int) or not 0 <= value <= LARGEST_EXPONENT:
         message = f"an exponent is a literal integer from 0 to {LARGEST_EXPONENT}"
-        raise Finding(exponent.span, Code.FORBIDDEN_EXPRESSION, message, "use sqrt() for roots")
+        raise ExpressionError(exponent.span, Code.FORBIDDEN_EXPRESSION, message, "use sqrt() for roots")
     number = as_int(base)
     if number is None:
         return FloatKind(float_bits(base))
@@ -123,14 +185,14 @@ def _power(base: Kind, exponent: Typed) -> Kind:
     return IntKind(min(extremes), max(extremes))
 
 
-def _division_by_zero(span: SourceSpan) -> Finding:
-    return Finding(span, Code.OUT_OF_RANGE, "division by zero")
+def _division_by_zero(span: SourceSpan) -> ExpressionError:
+    return ExpressionError(span, Code.OUT_OF_RANGE, "division by zero")
 
 
 def _want_number(operand: Typed) -> None:
     if not isinstance(operand.kind, Number):
         hint = {BoolKind: "int() makes a number of a bool", StringKind: "str() makes text of a number"}
-        raise Finding(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
+        raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"arithmetic takes numbers, not {operand.kind}",
                       hint.get(type(operand.kind), ""))  # fmt: skip
 
 
@@ -163,18 +225,20 @@ def _want_comparable(op: ast.cmpop, left: Typed, right: Typed, span: SourceSpan)
     if isinstance(op, (ast.Is, ast.IsNot)):
         raise forbidden(op, span)
     if any(isinstance(operand.constant, float) and math.isnan(operand.constant) for operand in (left, right)):
-        raise Finding(span, Code.TYPE_MISMATCH, "nan equals nothing, not even nan", "x != x is true where x is NaN")
+        raise ExpressionError(
+            span, Code.TYPE_MISMATCH, "nan equals nothing, not even nan", "x != x is true where x is NaN"
+        )
     other: Kind | None = right.kind
     if isinstance(op, (ast.In, ast.NotIn)):
         if not isinstance(right.kind, ListKind):
-            raise Finding(right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}")
+            raise ExpressionError(right.span, Code.TYPE_MISMATCH, f"'in' looks into a list, not into {right.kind}")
         other = right.kind.element
     if other is None or isinstance(left.kind, (MessageKind, ListKind)) or join(left.kind, other) is None:
         message = f"{left.kind} cannot be compared with {right.kind}"
         hint = _comparable_value(left, right) or _comparable_value(right, left)
-        raise Finding(span, Code.TYPE_MISMATCH, message, hint)
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message, hint)
     if isinstance(op, (ast.Lt, ast.LtE, ast.Gt, ast.GtE)) and isinstance(left.kind, BoolKind):
-        raise Finding(span, Code.TYPE_MISMATCH, "bools have no order", "use == or !=")
+        raise ExpressionError(span, Code.TYPE_MISMATCH, "bools have no order", "use == or !=")
 
 
 def choice(test: Typed, body: Typed, orelse: Typed, span: SourceSpan) -> Typed:
@@ -182,11 +246,11 @@ def choice(test: Typed, body: Typed, orelse: Typed, span: SourceSpan) -> Typed:
     kind = join(body.kind, orelse.kind)
     if kind is None:
         message = f"this is {body.kind} or {orelse.kind}, which no field holds"
-        raise Finding(span, Code.TYPE_MISMATCH, message)
+        raise ExpressionError(span, Code.TYPE_MISMATCH, message)
     return Typed.at(span, kind, ast.IfExp(test.node, body.node, orelse.node))
 
 
 def want_bool(operand: Typed, word: str) -> None:
     if not isinstance(operand.kind, BoolKind):
         hint = "compare it, as in x != 0" if isinstance(operand.kind, Number) else ""
-        raise Finding(operand.span, Code.TYPE_MISMATCH, f"'{word}' takes a bool, not {operand.kind}", hint)
+        raise ExpressionError(operand.span, Code.TYPE_MISMATCH, f"'{word}' takes a bool, not {operand.kind}", hint)

@@ -1,21 +1,132 @@
-"""What names mean in the expressions of one target.
+"""What the names of an expression mean, and what the check of an expression gives: a typed value or an error.
 
-Knows the source message's type and the constants in sight; not the syntax that names stand in.
+`Scope` has the type of the source message and the constants in sight, `Reads` the variables through which generated
+code accesses the message.
 """
 
 from __future__ import annotations
 
 import ast
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
-from router.compiler.expressions.reads import Path, Reads, value_of
-from router.compiler.expressions.typed import Typed
-from router.compiler.kinds import MessageKind, kind_of
-from router.compiler.syntax import place
-from router.errors import SourceSpan
-from router.types.model import Enum, Field, MessageType
+from router.compiler.expressions.kinds import Kind, MessageKind, kind_of
+from router.compiler.source import Source, attribute, call, load, place, placed
+from router.errors import Code, Diagnostic, SourceSpan
+from router.types.model import Enum, Field, List, MessageType
+
+
+class ExpressionError(Exception):
+    """Ends the check of one expression with the first thing that is wrong in it."""
+
+    def __init__(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.diagnostic = Diagnostic(span, code, message, hint)
+
+
+@dataclass(frozen=True, slots=True)
+class Typed:
+    """A checked expression: what it is, as Python, and which stretch of the table says so.
+
+    `items` are the elements of a list literal; `path` leads to a submessage of the source message.
+    """
+
+    kind: Kind
+    node: ast.expr
+    span: SourceSpan
+    items: tuple[Typed, ...] | None = None
+    path: tuple[str, ...] | None = None
+
+    @classmethod
+    def at(
+        cls,
+        span: SourceSpan,
+        kind: Kind,
+        node: ast.expr,
+        *,
+        items: tuple[Typed, ...] | None = None,
+        path: tuple[str, ...] | None = None,
+    ) -> Typed:
+        """The same for syntax that was just made: what of it has no place yet is placed at `span`."""
+        return cls(kind, placed(node, span), span, items, path)
+
+    @property
+    def constant(self) -> object:
+        """The value of a literal, None for everything else (there is no None in the language)."""
+        return self.node.value if isinstance(self.node, ast.Constant) else None
+
+
+Path = tuple[str, ...]
+"""The names that lead from the source message to a field of it; the empty path is the message."""
+
+
+def value_of(message: ast.expr, member: Field) -> ast.expr:
+    """A field of a message that is there as an object. A protobuf map is read as the list of its entries."""
+    value = attribute(message, member.name)
+    element = member.type.element if isinstance(member.type, List) else None
+    return call("entries", value) if isinstance(element, MessageType) and element.is_map_entry else value
+
+
+class Reads(ABC):
+    """The source message as the expressions of one or several targets see it. Remembers what they ask for."""
+
+    def __init__(self) -> None:
+        self.variables: dict[Path, str] = {(): "m"}
+        self._loops = 0
+
+    @abstractmethod
+    def field(self, holder: Path, member: Field) -> ast.expr:
+        """The value of a field, not a message, of the submessage at path `holder`."""
+
+    @abstractmethod
+    def message(self, path: Path) -> ast.expr:
+        """The submessage at a path."""
+
+    @abstractmethod
+    def need_objects(self, node: ast.expr) -> None:
+        """Told of each expression that is more than a path: a message in it must be there as an object."""
+
+    @abstractmethod
+    def write(self, out: Source, span: SourceSpan) -> None:
+        """Appends the statements that make what the expressions use; to be called when all of them are checked."""
+
+    def loop(self) -> str:
+        """A variable for the elements of a list, another one each time."""
+        self._loops += 1
+        return f"item_{self._loops}"
+
+    def _variable(self, path: Path) -> str:
+        """The variable for what is at a path, the same each time."""
+        if path not in self.variables:
+            variable = "_".join((self.variables[()], *path))
+            while variable in self.variables.values():  # a.b_c and a_b.c
+                variable += "_"
+            self.variables[path] = variable
+        return self.variables[path]
+
+
+class ParsedReads(Reads):
+    """A parsed protobuf message `m`: each submessage that expressions look into is bound once."""
+
+    def field(self, holder: Path, member: Field) -> ast.expr:
+        return value_of(self.message(holder), member)
+
+    def message(self, path: Path) -> ast.expr:
+        if path:
+            self.message(path[:-1])  # a submessage's own holder comes before it
+        return load(self._variable(path))
+
+    def need_objects(self, node: ast.expr) -> None:
+        """They always are."""
+
+    def write(self, out: Source, span: SourceSpan) -> None:
+        for path, variable in self.variables.items():
+            if path:
+                made = placed(attribute(load(self.variables[path[:-1]]), path[-1]), span)
+                out.line(f"{variable} = {out.expression(made)}", span)
+
 
 MESSAGE, SOURCE, RECEIVED_AT = "message", "source", "received_at"
 """What every expression can name beside the fields; a field of the same name wins."""

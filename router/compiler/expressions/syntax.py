@@ -1,6 +1,6 @@
-"""From the text of an expression to Python's syntax tree, whose nodes know where in the table they stand.
+"""From the text of an expression to Python's syntax tree, whose nodes know their place in the table.
 
-Whatever Python can parse is fine here; what the language has of it is the checker's business.
+Anything that Python can parse passes here; `forbidden` words the finding for what the language does not have.
 """
 
 from __future__ import annotations
@@ -8,13 +8,13 @@ from __future__ import annotations
 import ast
 import warnings
 
-from router.compiler.expressions.typed import Finding
+from router.compiler.expressions.scope import ExpressionError
 from router.errors import Code, SourceSpan
 from router.table.model import Expression
 
 
 class Parsed:
-    """`tree` is the syntax as the user wrote it. Raises Finding for what is no expression of Python's."""
+    """`tree` is the syntax as the user wrote it. Raises ExpressionError for what is no expression of Python's."""
 
     def __init__(self, expression: Expression) -> None:
         text = expression.text.replace("\n", " ")
@@ -35,9 +35,11 @@ class Parsed:
             hint = "quote the expression: inside {} a comma ends it" if may_be_cut else ""
             if text.lower().lstrip("+-") in (".nan", ".inf"):  # YAML's
                 hint = f"write {text.lower().replace('.', '')}"
-            raise Finding(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
+            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
         except (ValueError, RecursionError, MemoryError) as error:
-            raise Finding(self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}") from None
+            raise ExpressionError(
+                self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}"
+            ) from None
 
     def _blamed(self, error: SyntaxError) -> SourceSpan:
         """Syntax errors count characters, from 1; some have no place, and some end on another line."""
@@ -67,3 +69,36 @@ def dotted(node: ast.expr) -> tuple[str, ...] | None:
         parts.append(node.attr)
         node = node.value
     return (node.id, *reversed(parts)) if isinstance(node, ast.Name) else None
+
+
+ALLOWED = "allowed: fields, literals, arithmetic, comparison, and/or/not, if/else, functions"
+
+
+def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
+    """The finding for an expression, or an operator, that is not part of the language."""
+    hint = _HINTS.get(type(node), ALLOWED if isinstance(node, ast.expr) else "")
+    word = _WORDS.get(type(node), type(node).__name__)
+    return ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{word} is not part of the language", hint)
+
+
+_HINTS: dict[type[ast.AST], str] = {
+    ast.Constant: "literals are numbers, strings, True and False",
+    ast.Lambda: "expressions have no lambda",
+    ast.ListComp: "expressions have no loops",
+    ast.GeneratorExp: "expressions have no loops",
+    ast.SetComp: "expressions have no loops",
+    ast.DictComp: "expressions have no loops",
+    ast.NamedExpr: "expressions assign nothing",
+    ast.JoinedStr: "join strings with + and str()",
+    ast.Tuple: "write a list, [a, b]",
+    ast.Is: "use ==",
+    ast.IsNot: "use ==",
+}
+_WORDS: dict[type[ast.AST], str] = {
+    ast.Constant: "this literal", ast.JoinedStr: "an f-string", ast.NamedExpr: "':='", ast.ListComp: "a comprehension",
+    ast.SetComp: "a comprehension", ast.DictComp: "a comprehension", ast.GeneratorExp: "a comprehension",
+    ast.Tuple: "a tuple", ast.Dict: "a dictionary", ast.Set: "a set", ast.Lambda: "lambda", ast.Starred: "'*'",
+    ast.BitAnd: "'&'", ast.BitOr: "'|'", ast.BitXor: "'^'", ast.LShift: "'<<'", ast.RShift: "'>>'", ast.Invert: "'~'",
+    ast.MatMult: "'@'", ast.Is: "'is'", ast.IsNot: "'is not'", ast.Await: "await", ast.Yield: "yield",
+    ast.Slice: "a slice",
+}  # fmt: skip

@@ -1,0 +1,276 @@
+"""The functions of the expression language: each declared once, with documentation, examples and implementation.
+
+The examples are tests (tests/compiler/test_functions.py) and the reference page is generated from them. Each function
+has a rule that gives the kind of a call from the kinds of its arguments, in order, once their number and kinds are
+checked; it raises ValueError with a sentence when no call with such arguments works. An implementation raises
+MappingError for a value without a result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from router.compiler.expressions.kinds import (
+    ANY_INT,
+    BoolKind,
+    BytesKind,
+    EnumKind,
+    FloatKind,
+    IntKind,
+    Kind,
+    ListKind,
+    Number,
+    StringKind,
+    TimeKind,
+    as_int,
+    float_bits,
+    join,
+)
+from router.errors import MappingError, NonFiniteError
+
+NS_PER_SECOND = 1_000_000_000
+NS_PER_MILLISECOND = 1_000_000
+FLOAT32_END = 3.4028235677973366e38
+"""The smallest magnitude that does not round to a finite float32."""
+
+# implementations
+
+
+def round_half_even(x: float) -> int:
+    return _to_int(round, x)
+
+
+def truncate(x: float) -> int:
+    return _to_int(math.trunc, x)
+
+
+def floor(x: float) -> int:
+    return _to_int(math.floor, x)
+
+
+def ceil(x: float) -> int:
+    return _to_int(math.ceil, x)
+
+
+def _to_int(convert: Callable[[float], int], x: float) -> int:
+    try:
+        return convert(x)
+    except (ValueError, OverflowError):
+        raise NonFiniteError(f"{x} is no integer") from None
+
+
+def clamp(x: float, low: float, high: float) -> float:
+    return low if x < low else high if x > high else x  # noqa: FURB136 - min() takes three times as long
+
+
+def wrap(x: int, low: int, high: int) -> int:
+    return (x - low) % (high - low + 1) + low
+
+
+def to_float32(x: float) -> float:
+    if math.isinf(x) or abs(x) < FLOAT32_END or math.isnan(x):
+        return x
+    raise MappingError(f"{x} is too large for a float32")
+
+
+def seconds(time: int) -> float:
+    return time / NS_PER_SECOND
+
+
+def time_from_seconds(x: float) -> int:
+    return _to_int(round, x * NS_PER_SECOND)
+
+
+def time_from_milliseconds(x: float) -> int:
+    return _to_int(round, x * NS_PER_MILLISECOND)
+
+
+# kinds of results
+
+Rule = Callable[[Sequence[Kind]], Kind]
+"""Gives the kind of a call from the kinds of its arguments."""
+
+
+def _always(kind: Kind) -> Rule:
+    return lambda _: kind
+
+
+def _common(kinds: Sequence[Kind]) -> Kind:
+    """The kind that holds all arguments."""
+    joined = kinds[0]
+    for kind in kinds[1:]:
+        joined = join(joined, kind) or joined
+    return joined
+
+
+def _double(kinds: Sequence[Kind]) -> Kind:
+    return FloatKind(max(map(float_bits, kinds)))
+
+
+def _integer(kinds: Sequence[Kind]) -> Kind:
+    """Integers stay what they are; of a float only the value at run time tells."""
+    return as_int(kinds[0]) or ANY_INT
+
+
+def _integer_or_bool(kinds: Sequence[Kind]) -> Kind:
+    return IntKind(0, 1) if isinstance(kinds[0], BoolKind) else _integer(kinds)
+
+
+def _absolute(kinds: Sequence[Kind]) -> Kind:
+    bounds = _bounds(kinds[0])
+    if bounds is None:
+        return kinds[0]
+    low, high = bounds
+    magnitudes = (abs(low), abs(high))
+    return IntKind(0 if low <= 0 <= high else min(magnitudes), max(magnitudes))
+
+
+def _extreme(pick: Callable[[list[int]], int]) -> Rule:
+    """For min() and max(): the picked one of the low bounds to the picked one of the high bounds."""
+
+    def result(kinds: Sequence[Kind]) -> Kind:
+        known = [bounds for kind in kinds if (bounds := _bounds(kind))]
+        if len(known) != len(kinds):
+            return _common(kinds)
+        return IntKind(pick([low for low, _ in known]), pick([high for _, high in known]))
+
+    return result
+
+
+def _clamped(kinds: Sequence[Kind]) -> Kind:
+    low, high = _bounds(kinds[1]), _bounds(kinds[2])
+    if low and high:
+        _want_ordered(low[0], high[1])
+    if any(as_int(kind) is None for kind in kinds):
+        return _common(kinds)
+    if low is None or high is None:
+        return ANY_INT
+    return IntKind(min(low[0], high[0]), max(low[1], high[1]))
+
+
+def _wrapped(kinds: Sequence[Kind]) -> Kind:
+    low, high = _bounds(kinds[1]), _bounds(kinds[2])
+    if low is None or high is None:
+        return ANY_INT
+    _want_ordered(low[0], high[1])
+    # Only the value tells where the bounds may be the wrong way round.
+    return IntKind(low[0], high[1]) if low[1] <= high[0] else ANY_INT
+
+
+def _bounds(kind: Kind) -> tuple[int, int] | None:
+    number = as_int(kind)
+    return number.bounds if number else None
+
+
+def _want_ordered(low: int, high: int) -> None:
+    if low > high:
+        raise ValueError(f"the low bound {low} is above the high bound {high}")
+
+
+# declarations
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """`accepts` are the kinds that may be passed, `wanted` how a finding calls them."""
+
+    name: str
+    accepts: tuple[type, ...]
+    wanted: str
+
+
+@dataclass(frozen=True, slots=True)
+class Function:
+    """One function. `result` tells the kind of a call from the kinds of its arguments.
+
+    The last parameter may be repeated when `variadic`; `optional` of the last ones may be left out.
+    A function with optional bounds takes them from the integer field that it fills (see expressions).
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    result: Rule
+    implementation: Callable[..., object]
+    summary: str
+    examples: tuple[tuple[str, object], ...]
+    variadic: bool = False
+    optional: int = 0
+
+    @property
+    def signature(self) -> str:
+        names = [parameter.name for parameter in self.parameters]
+        required = len(names) - self.optional
+        shown = names[:required] + [f"{name}=..." for name in names[required:]] + ["..."] * self.variadic
+        return f"{self.name}({', '.join(shown)})"
+
+
+def _number(name: str = "x") -> Parameter:
+    return Parameter(name, Number, "a number")
+
+
+def _whole(name: str = "x") -> Parameter:
+    return Parameter(name, (IntKind, EnumKind), "an integer")
+
+
+def _math(name: str, summary: str, *examples: tuple[str, object], parameters: tuple[str, ...] = ("x",)) -> Function:
+    return Function(name, tuple(map(_number, parameters)), _double, getattr(math, name), summary, examples)
+
+
+_SIZED = (StringKind, BytesKind, ListKind)
+_DECLARED = (
+    Function("abs", (_number(),), _absolute, abs, "The magnitude of a number.", (("abs(-3)", 3),)),
+    Function("min", (_number("a"), _number("b")), _extreme(min), min, "The smallest argument.",
+             (("min(2, 1.5)", 1.5),), variadic=True),
+    Function("max", (_number("a"), _number("b")), _extreme(max), max, "The largest argument.",
+             (("max(2, 3, 1)", 3),), variadic=True),
+    Function("round", (_number(),), _integer, round_half_even,
+             "The nearest integer, the even one of two. NaN and infinities drop the target.",
+             (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
+    Function("trunc", (_number(),), _integer, truncate, "The integer towards zero.", (("trunc(-2.7)", -2),)),
+    Function("floor", (_number(),), _integer, floor, "The integer at or below.", (("floor(-2.5)", -3),)),
+    Function("ceil", (_number(),), _integer, ceil, "The integer at or above.", (("ceil(2.1)", 3),)),
+    Function("clamp", (_number(), _number("low"), _number("high")), _clamped, clamp,
+             "The number, held between two bounds; without bounds, those of the integer field that it fills.",
+             (("clamp(300, 0, 255)", 255), ("clamp(-1.5, -1.0, 1.0)", -1.0)), optional=2),
+    Function("wrap", (_whole(), _whole("low"), _whole("high")), _wrapped, wrap,
+             "The integer, counted on from the low bound when it passes the high one; without bounds, those of "
+             "the integer field that it fills.",
+             (("wrap(256, 0, 255)", 0), ("wrap(-1, 0, 255)", 255), ("wrap(190, -180, 179)", -170)), optional=2),
+    _math("radians", "Degrees to radians.", ("radians(180)", math.pi)),
+    _math("degrees", "Radians to degrees.", ("degrees(0.0)", 0.0)),
+    _math("sqrt", "The square root; of a negative number there is none, and the target is dropped.",
+          ("sqrt(9)", 3.0)),
+    _math("sin", "The sine of an angle in radians.", ("sin(0)", 0.0)),
+    _math("cos", "The cosine of an angle in radians.", ("cos(0)", 1.0)),
+    _math("tan", "The tangent of an angle in radians.", ("tan(0)", 0.0)),
+    _math("atan2", "The angle of the point (x, y) in radians, -pi to pi.", ("atan2(0, 1)", 0.0),
+          parameters=("y", "x")),
+    _math("hypot", "The length of the vector (x, y).", ("hypot(3, 4)", 5.0), parameters=("x", "y")),
+    Function("float32", (_number(),), _always(FloatKind(32)), to_float32,
+             "Says that a double, or a large integer, may lose digits in a float32.", (("float32(0.5)", 0.5),)),
+    Function("float64", (_number(),), _always(FloatKind(64)), float,
+             "Says that a large integer may lose digits in a double.", (("float64(3)", 3.0),)),
+    Function("int", (Parameter("x", (BoolKind, IntKind, EnumKind), "a bool, an integer or an enum"),),
+             _integer_or_bool, int, "A bool as 0 or 1, an enum as its number.", (("int(True)", 1),)),
+    Function("str", (Parameter("x", (BoolKind, IntKind, FloatKind, EnumKind, StringKind), "a scalar"),),
+             _always(StringKind()), str, "A scalar as text.", (("'wheel_' + str(3)", "wheel_3"),)),
+    Function("len", (Parameter("x", _SIZED, "a list, a string or bytes"),), _always(IntKind(0, (1 << 32) - 1)),
+             len, "How many elements a list has, or characters a string.", (("len([1, 2])", 2),)),
+    Function("seconds", (Parameter("time", (TimeKind,), "a time"),), _always(FloatKind(64)), seconds,
+             "A time as seconds since 1970.", (("seconds(time_from_seconds(1.5))", 1.5),)),
+    Function("time_from_seconds", (_number(),), _always(TimeKind()), time_from_seconds,
+             "Seconds since 1970 as a time.", (("time_from_seconds(2)", 2_000_000_000),)),
+    Function("time_from_milliseconds", (_number(),), _always(TimeKind()), time_from_milliseconds,
+             "Milliseconds since 1970 as a time.", (("time_from_milliseconds(1500)", 1_500_000_000),)),
+)  # fmt: skip
+
+FUNCTIONS: Mapping[str, Function] = {function.name: function for function in _DECLARED}
+"""By name, without `has`."""
+
+NOT_FINITE: Mapping[str, float] = {"nan": math.nan, "inf": math.inf}
+"""What no literal gives, by the name that it has in expressions; a field of that name wins."""
+
+HAS = "has"
+"""`has(field)` looks at a field rather than at its value, and so is part of the syntax."""
