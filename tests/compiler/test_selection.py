@@ -191,7 +191,12 @@ def test_answers_are_remembered_but_not_for_any_number_of_topics(monkeypatch: py
 
     def watched(pattern: TopicPattern) -> Callable[[str], object]:
         matches = matcher(pattern)
-        return lambda topic: asked.append(topic) or matches(topic)
+
+        def asking(topic: str) -> object:
+            asked.append(topic)
+            return matches(topic)
+
+        return asking
 
     monkeypatch.setattr(selection, "matcher", watched)
     chosen = selector(["/a*"], rates={"/*": 5})
