@@ -21,8 +21,7 @@ from router.errors import StartError
 from router.log import logger
 from router.net.port_holder import port_holder
 from router.observe.running import Running
-from router.recording.mirror import Shown
-from router.recording.mirrored import Known, first_field
+from router.recording.mirror import Classifier, Mirrored, first_field
 from router.recording.schemas import descriptor_set
 from router.table.model import Address, Located
 from router.threads.background import background_threads
@@ -51,7 +50,7 @@ class _View(NamedTuple):
     """What is shown of which program. `channels` by payload case."""
 
     program: Program
-    known: Known
+    known: Classifier
     channels: Mapping[str, Channel]
 
 
@@ -133,13 +132,13 @@ class FoxgloveServer(ServerListener):
             if kind not in self._open:
                 self._open[kind] = self._channel(kind)
         channels = {name: self._open[kind] for name, kind in kinds.items()}
-        return _View(program, Known(program.envelope, program.table), channels)
+        return _View(program, Classifier(program.envelope, program.table), channels)
 
     def _channel(self, kind: _Kind) -> Channel:
         schema = Schema(name=kind.message, encoding="protobuf", data=kind.descriptors)
         return Channel(kind.case, message_encoding="protobuf", schema=schema, context=self._context)
 
-    def _show(self, batch: Sequence[Shown]) -> None:
+    def _show(self, batch: Sequence[Mirrored]) -> None:
         """Called by the mirror's thread. What is no payload for the router is not shown."""
         program, known, channels = self._view
         wanted = {case.number for name, case in program.envelope.cases.items() if channels[name].has_sinks()}

@@ -13,15 +13,14 @@ from collections.abc import Callable, Iterator, Sequence
 from router.compiler.program import Program
 from router.errors import RouterError, did_you_mean
 from router.observe.tap_stream import MAGIC, encode, encode_alive, encode_lost
-from router.recording.mirror import Mirror, Shown
-from router.recording.mirrored import Known, first_field
+from router.recording.mirror import Classifier, Mirror, Mirrored, first_field
 
 MOST_WAITING = 4 << 20
 """Bytes that wait for a slow reader."""
 
 ALIVE_SECONDS = 1.0
 
-Wanted = Callable[[Shown], bool]
+Wanted = Callable[[Mirrored], bool]
 
 
 class TapRequestError(RouterError):
@@ -47,7 +46,7 @@ def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
         raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
     unwanted = frozenset(case.number for name, case in known.items() if name not in cases)
 
-    def is_wanted(shown: Shown) -> bool:
+    def is_wanted(shown: Mirrored) -> bool:
         _, _, _, data = shown
         return first_field(data) not in unwanted
 
@@ -58,9 +57,9 @@ def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
     endpoints = program.table.endpoints
     if unknown := [name for name in sources if name not in endpoints and not name[:1].isdigit()]:
         raise TapRequestError(f"the router has no endpoint '{unknown[0]}'; {did_you_mean(unknown[0], endpoints)}")
-    sender, names = Known(program.envelope, program.table).sender, frozenset(sources)
+    sender, names = Classifier(program.envelope, program.table).sender, frozenset(sources)
 
-    def is_wanted(shown: Shown) -> bool:
+    def is_wanted(shown: Mirrored) -> bool:
         _, listener, peer, _ = shown
         return peer[0] in names or sender(listener, peer) in names
 
@@ -98,7 +97,7 @@ class Tap:
             self._is_closed = True
             self._changed.notify()
 
-    def _take(self, batch: Sequence[Shown]) -> None:
+    def _take(self, batch: Sequence[Mirrored]) -> None:
         """Called by the mirror's thread."""
         shown = batch if self._wants is None else list(filter(self._wants, batch))
         piece = encode(shown)

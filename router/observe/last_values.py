@@ -14,8 +14,7 @@ from google.protobuf.json_format import MessageToDict
 
 from router.compiler.program import Program
 from router.observe.running import Running
-from router.recording.mirror import Shown
-from router.recording.mirrored import Known, first_field
+from router.recording.mirror import Classifier, Mirrored, first_field
 
 LOOKED_AT_SECONDS = 5.0
 """For so long after it was asked last it watches on; a page asks every second."""
@@ -31,7 +30,7 @@ class LastValues:
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._fresh: dict[int, Shown] = {}
+        self._fresh: dict[int, Mirrored] = {}
         self._values: dict[str, Value] = {}
         self._detach: Callable[[], None] | None = None
         self._until = 0.0
@@ -49,7 +48,7 @@ class LastValues:
                 threading.Thread(target=self._end_when_idle, name="last values", daemon=True).start()
             with self._taking:
                 fresh, self._fresh = self._fresh, {}
-            known = Known(program.envelope, program.table)
+            known = Classifier(program.envelope, program.table)
             for shown in fresh.values():
                 self._keep(shown, known)
             return dict(self._values)
@@ -59,14 +58,14 @@ class LastValues:
         with self._lock:
             self._end()
 
-    def _take(self, batch: Sequence[Shown]) -> None:
+    def _take(self, batch: Sequence[Mirrored]) -> None:
         """Called by the mirror's thread."""
         with self._taking:
             for shown in batch:
                 _, _, _, data = shown
                 self._fresh[first_field(data)] = shown
 
-    def _keep(self, shown: Shown, known: Known) -> None:
+    def _keep(self, shown: Mirrored, known: Classifier) -> None:
         at, listener, (host, port), data = shown
         if (found := known.payload(listener, data)) is None:
             return  # the page shows it among what was rejected

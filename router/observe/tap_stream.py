@@ -18,7 +18,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from router.errors import TransportError
-from router.recording.mirror import Seen, Shown
+from router.recording.mirror import Mirrored, MirroredDatagram
 
 MAGIC = b"router tap 1\n"
 CONTENT_TYPE = "application/x-router-tap"
@@ -38,7 +38,7 @@ class Lost(NamedTuple):
     number: int
 
 
-def encode(batch: Iterable[Shown]) -> bytes:
+def encode(batch: Iterable[Mirrored]) -> bytes:
     """One record for each."""
     pieces: list[bytes] = []
     for at, listener, peer, data in batch:
@@ -68,7 +68,7 @@ class StreamReader:
         self._waiting = bytearray()
         self._has_begun = False
 
-    def take(self, piece: bytes) -> Iterator[Seen | Lost]:
+    def take(self, piece: bytes) -> Iterator[MirroredDatagram | Lost]:
         """What is complete with this piece. Raises TransportError for what is no stream of a tap."""
         waiting = self._waiting
         waiting += piece
@@ -92,7 +92,7 @@ class StreamReader:
         del waiting[:start]
 
 
-def _record(record: bytes) -> Iterator[Seen | Lost]:
+def _record(record: bytes) -> Iterator[MirroredDatagram | Lost]:
     """Kinds that are not known are left out: a newer router may have more to say."""
     if record[0] == LOST:
         yield Lost(int.from_bytes(record[1:9], "little"))
@@ -100,4 +100,6 @@ def _record(record: bytes) -> Iterator[Seen | Lost]:
         host, port, length = _SENDER.unpack_from(record, 9)
         data = 9 + _SENDER.size + length
         listener = record[9 + _SENDER.size : data].decode()
-        yield Seen(int.from_bytes(record[1:9], "little"), listener, (socket.inet_ntoa(host), port), record[data:])
+        yield MirroredDatagram(
+            int.from_bytes(record[1:9], "little"), listener, (socket.inet_ntoa(host), port), record[data:]
+        )

@@ -1,6 +1,6 @@
 """From datagrams to chunks of a recording, many at a time: what recording costs is spent here.
 
-Knows how datagrams are encoded, and no file and no thread; payloads and senders are as `Known` says.
+Knows how datagrams are encoded, and no file and no thread; payloads and senders are as `Classifier` says.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from router.engine import MAX_DATAGRAM
 from router.engine.framing import LEN
 from router.recording.channels import Channels, Peer, varint
 from router.recording.chunk import BEHIND_LENGTH, HEAD, Chunk, ChunkBuilder
-from router.recording.mirror import Shown
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier, Mirrored
 from router.recording.schemas import Datagram
 from router.types.protobuf import PayloadCase
 
@@ -68,14 +67,14 @@ class Encoder:
         """Bytes that the next chunk has so far, not compressed."""
         return self._chunk.offset
 
-    def know(self, known: Known) -> None:
+    def know(self, known: Classifier) -> None:
         """To be called first, and again when it is another."""
         self._known = known
         self._tags = {varint(case.number << 3 | LEN): case for case in known.envelope.cases.values()}
         self._shapes.clear()
         self._payload_channels.clear()
 
-    def add(self, batch: Sequence[Shown], wall: int, monotonic: int) -> None:
+    def add(self, batch: Sequence[Mirrored], wall: int, monotonic: int) -> None:
         """`wall` and `monotonic` are what the two clocks said when the batch was seen (ns)."""
         if not batch:
             return
@@ -188,7 +187,7 @@ class Encoder:
             self._payload_channels[sender] = self._channels.payload(case, listener, peer, endpoint)
         return self._payload_channels[sender]
 
-    def _add_unusual(self, shown: Shown, steady: int) -> None:
+    def _add_unusual(self, shown: Mirrored, steady: int) -> None:
         """The datagram as it is, and its payload where there is one, so that people see that as well."""
         at, listener, peer, data = shown
         self._sequence += 1

@@ -1,6 +1,6 @@
 """Datagrams in memory, many in few pieces: small, soon made, and nothing to do for who looks for garbage.
 
-Knows no file and no payload; `Known` is what was to be known of payloads and senders when they came.
+Knows no file and no payload; `Classifier` is what was to be known of payloads and senders when they came.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
-from router.recording.mirror import Shown
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier, Mirrored
 
 _BESIDE_DATA = 14
 """Bytes that are kept of a datagram beside its data."""
@@ -25,7 +24,7 @@ class Packed(NamedTuple):
     """A batch as the mirror showed it. `wall` and `monotonic` are what the clocks said then (ns); `before`: how many
     datagrams came before it."""
 
-    known: Known
+    known: Classifier
     before: int
     wall: int
     monotonic: int
@@ -40,9 +39,9 @@ class Packed(NamedTuple):
         """Bytes of memory, about."""
         return len(self.data) + _BESIDE_DATA * len(self.times) + _BESIDE_BATCH
 
-    def unpacked(self) -> list[Shown]:
+    def unpacked(self) -> list[Mirrored]:
         data, senders = self.data, self.senders
-        found: list[Shown] = []
+        found: list[Mirrored] = []
         for at, number, length, end in zip(
             self.times, self.numbers, self.lengths, accumulate(self.lengths), strict=True
         ):
@@ -59,7 +58,7 @@ class Packer:
         self._numbers: dict[Sender, int] = {}
         self._packed = 0
 
-    def pack(self, batch: Sequence[Shown], known: Known, wall: int, monotonic: int) -> Packed:
+    def pack(self, batch: Sequence[Mirrored], known: Classifier, wall: int, monotonic: int) -> Packed:
         times, listeners, peers, data = zip(*batch, strict=True)
         try:
             numbers = array("H", map(self._numbers.__getitem__, zip(listeners, peers, strict=True)))

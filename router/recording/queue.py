@@ -13,8 +13,7 @@ from router.clock import monotonic_ns
 from router.log import logger
 from router.recording.continuous import Continuous
 from router.recording.encoding import Encoder
-from router.recording.mirror import Shown
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier, Mirrored
 from router.recording.saving import LONGEST_CHUNK
 
 PERIOD = 500_000_000
@@ -28,8 +27,8 @@ _BESIDE_DATA = 256
 
 
 class _Batch(NamedTuple):
-    datagrams: Sequence[Shown]
-    known: Known
+    datagrams: Sequence[Mirrored]
+    known: Classifier
     wall: int
     monotonic: int
     size: int
@@ -44,12 +43,12 @@ class Intake:
         """When `write` is to be called next."""
         self._continuous = continuous
         self._encoder = encoder
-        self._known: Known | None = None
+        self._known: Classifier | None = None
         self._waiting: deque[_Batch] = deque()
         self._taken_in = self._taken_out = 0  # bytes, each written by one thread
         self._is_well = True
 
-    def add(self, datagrams: Sequence[Shown], known: Known, wall: int, monotonic: int) -> None:
+    def add(self, datagrams: Sequence[Mirrored], known: Classifier, wall: int, monotonic: int) -> None:
         size = sum([len(data) for _, _, _, data in datagrams]) + _BESIDE_DATA * len(datagrams)
         if self._taken_in - self._taken_out + size > MOST_WAITING:
             self.overflow += len(datagrams)

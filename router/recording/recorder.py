@@ -21,8 +21,7 @@ from router.recording.channels import Channels
 from router.recording.continuous import Continuous
 from router.recording.directory import open_directory
 from router.recording.encoding import Encoder
-from router.recording.mirror import Shown
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier, Mirrored
 from router.recording.packed import Packer
 from router.recording.queue import PERIOD, Intake
 from router.recording.saving import RecordError, Saving
@@ -42,7 +41,7 @@ class Recorder:
         self._running = running
         self._channels = Channels()
         self._program = running.program
-        self._known = Known(self._program.envelope, self._program.table)
+        self._known = Classifier(self._program.envelope, self._program.table)
         directory = open_directory(settings, running.program.table.path.stem)
         self._continuous = Continuous(settings, directory, self._channels, self._about) if settings.continuous else None
         self._saving = (
@@ -111,7 +110,7 @@ class Recorder:
         with suppress(ValueError):  # it has ended
             self._alarm.ring()
 
-    def _take(self, batch: Sequence[Shown]) -> None:
+    def _take(self, batch: Sequence[Mirrored]) -> None:
         """Called by the mirror's thread."""
         known, wall, monotonic = self._known_now(), wall_ns(), monotonic_ns()
         if self._intake is not None:
@@ -119,11 +118,11 @@ class Recorder:
         if self._saving is not None:
             self._saving.add(self._packer.pack(batch, known, wall, monotonic))
 
-    def _known_now(self) -> Known:
+    def _known_now(self) -> Classifier:
         """A reload may have changed it."""
         program = self._running.program
         if program is not self._program:
-            self._program, self._known = program, Known(program.envelope, program.table)
+            self._program, self._known = program, Classifier(program.envelope, program.table)
         return self._known
 
     def _run(self) -> None:

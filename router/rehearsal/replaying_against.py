@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 
 from router.compiler.program import Program
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier
 from router.recording.reader_mcap import Peer, Recorded
 from router.rehearsal.events import Dropped, Event, Filtered, Published, Rejected, Sent
 from router.rehearsal.rehearsal import Rehearsal
@@ -91,7 +91,7 @@ class Against:
     @property
     def is_among_strangers(self) -> bool:
         """Whether neither table knows anybody who sent."""
-        tables = [Known(program.envelope, program.table) for program in self._programs]
+        tables = [Classifier(program.envelope, program.table) for program in self._programs]
         places = {(listener, peer) for _, listener, peer in self.senders}
         return bool(places) and not any(table.sender(*place) for table in tables for place in places)
 

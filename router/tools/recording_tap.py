@@ -11,8 +11,7 @@ from router.observe.tap_stream import Lost
 from router.recording.channels import Channels
 from router.recording.encoding import Encoder
 from router.recording.file import RecordingFile
-from router.recording.mirror import Seen
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier, MirroredDatagram
 from router.recording.queue import PERIOD
 from router.table.model import RouteTable
 from router.types.protobuf import Envelope
@@ -26,7 +25,7 @@ class TapRecording:
         self.datagrams = self.missed = 0
         channels = Channels()
         self._encoder = Encoder(channels)
-        self._encoder.know(Known(envelope, table))
+        self._encoder.know(Classifier(envelope, table))
         self._written_at = monotonic_ns()
         try:
             self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})
@@ -40,9 +39,9 @@ class TapRecording:
         """Bytes of the file so far."""
         return self._file.size
 
-    def take(self, batch: Iterable[Seen | Lost]) -> None:
+    def take(self, batch: Iterable[MirroredDatagram | Lost]) -> None:
         """Batches have to come once a second, be they empty, so that what came before is written."""
-        seen: list[Seen] = []
+        seen: list[MirroredDatagram] = []
         for each in batch:
             if isinstance(each, Lost):
                 self.missed += each.number
@@ -60,7 +59,7 @@ class TapRecording:
         except OSError as error:
             raise UsageError(f"{self.path} could not be finished: {error.strerror}") from error
 
-    def _add(self, seen: Sequence[Seen]) -> None:
+    def _add(self, seen: Sequence[MirroredDatagram]) -> None:
         self.datagrams += len(seen)
         self._encoder.add(seen, time_ns(), monotonic_ns())
 

@@ -17,7 +17,7 @@ from urllib.parse import urlencode, urlsplit
 from router.errors import TransportError, UsageError
 from router.observe.http_callers import COLLECTED_AT
 from router.observe.tap_stream import Lost, StreamReader
-from router.recording.mirror import Seen
+from router.recording.mirror import MirroredDatagram
 from router.table.model import RouteTable
 from router.tools.places import reachable
 
@@ -67,7 +67,9 @@ def metrics(url: str) -> tuple[str, float]:
 
 
 @contextmanager
-def tap(url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()) -> Iterator[Iterator[list[Seen | Lost]]]:
+def tap(
+    url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()
+) -> Iterator[Iterator[list[MirroredDatagram | Lost]]]:
     """What a running router receives from now on: of these payload cases, from these endpoints; none means all.
 
     It comes in batches, of which there is an empty one each second while nothing comes. What is of no known payload
@@ -82,7 +84,7 @@ def tap(url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()) -> Ite
         yield _stream(response, url)
 
 
-def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[Seen | Lost]]:
+def _stream(response: http.client.HTTPResponse, url: str) -> Iterator[list[MirroredDatagram | Lost]]:
     reader = StreamReader()
     while True:
         try:

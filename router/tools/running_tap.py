@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from router.engine.wire import Wire
 from router.errors import DecodeError
 from router.observe.tap_stream import Lost
-from router.recording.mirror import Seen
+from router.recording.mirror import MirroredDatagram
 from router.tools.conditions import Condition
 from router.tools.tapping import Heard
 
@@ -35,7 +35,7 @@ class RunningTap:
         self._cases = cases
         self._condition = condition
 
-    def take(self, batches: Iterable[list[Seen | Lost]]) -> Iterator[list[Heard]]:
+    def take(self, batches: Iterable[list[MirroredDatagram | Lost]]) -> Iterator[list[Heard]]:
         """For each batch what is to be shown of it, which may be nothing."""
         for batch in batches:
             shown = []
@@ -46,7 +46,7 @@ class RunningTap:
                     shown.append(heard)
             yield shown
 
-    def _heard(self, seen: Seen) -> Heard | None:
+    def _heard(self, seen: MirroredDatagram) -> Heard | None:
         """None where it is not wanted."""
         peer = self._name_of(seen.peer, seen.listener)
         try:
@@ -62,5 +62,5 @@ class RunningTap:
         return Heard(_time(seen), peer, seen.data, decoded)
 
 
-def _time(seen: Seen) -> dt.datetime:
+def _time(seen: MirroredDatagram) -> dt.datetime:
     return dt.datetime.fromtimestamp(seen.at / 1e9).astimezone()

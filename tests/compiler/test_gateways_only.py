@@ -11,7 +11,7 @@ from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
 from router.errors import Code, Diagnostic, Severity
 from router.observe.route_map import route_map
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier
 from router.tools.differences import differences
 from tests.tables import PROTOS
 
@@ -121,7 +121,7 @@ def test_a_reload_reads_no_protos_for_it_and_those_of_the_next_table(tmp_path: P
 def test_a_datagram_from_before_the_reload_has_no_payload(tmp_path: Path) -> None:
     program = checked(tmp_path, ONLY).program
     assert program is not None
-    assert Known(program.envelope, program.table).payload("rover", b"\xca\x01\x02\x08\x01") is None
+    assert Classifier(program.envelope, program.table).payload("rover", b"\xca\x01\x02\x08\x01") is None
 
 
 def test_what_it_does_otherwise_than_another_is_told(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from router.errors import SourceSpan, StartError
 from router.observe import foxglove
 from router.observe.foxglove import FoxgloveServer
 from router.observe.running import Running
-from router.recording.mirror import Consumer, Seen
+from router.recording.mirror import Consumer, MirroredDatagram
 from router.table.model import Address, Located
 from tests.observe.foxglove_client import PATIENCE, FoxgloveClient
 from tests.tables import PROTOS, ROUTES
@@ -57,7 +57,9 @@ class Showing:
             assert self._changed.wait_for(lambda: len(self.attached) == consumers, PATIENCE)
 
     def show(self, *datagrams: bytes, at: int = 1, listener: str = "rover") -> None:
-        batch: Sequence[Seen] = [Seen(at + number, listener, PEER, data) for number, data in enumerate(datagrams)]
+        batch: Sequence[MirroredDatagram] = [
+            MirroredDatagram(at + number, listener, PEER, data) for number, data in enumerate(datagrams)
+        ]
         for consumer in list(self.attached):
             consumer(batch)
 

@@ -11,7 +11,7 @@ import pytest
 from router.observe import http_tap
 from router.observe.http_tap import Tap, TapRequestError, wanted
 from router.observe.tap_stream import MAGIC, Lost, StreamReader
-from router.recording.mirror import Seen
+from router.recording.mirror import MirroredDatagram
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import FakeRunning, sim_program
 
@@ -35,9 +35,9 @@ def running() -> Iterator[FakeRunning]:
     assert opened.failures == []
 
 
-def read(stream: Iterator[bytes], count: int) -> list[Seen | Lost]:
+def read(stream: Iterator[bytes], count: int) -> list[MirroredDatagram | Lost]:
     """So many from the stream, or more if they came together."""
-    reader, found = StreamReader(), list[Seen | Lost]()
+    reader, found = StreamReader(), list[MirroredDatagram | Lost]()
     while len(found) < count:
         found += reader.take(next(stream))
     return found
@@ -48,7 +48,7 @@ def test_all_that_is_received_is_shown_as_it_came(running: FakeRunning) -> None:
         for data in (IMU, b"junk", b""):
             running.receive(data, BOARD)
         shown = read(tap.stream(), 3)
-    assert [(each.listener, each.peer, each.data) for each in shown if isinstance(each, Seen)] == [
+    assert [(each.listener, each.peer, each.data) for each in shown if isinstance(each, MirroredDatagram)] == [
         ("rover", BOARD, IMU),
         ("rover", BOARD, b"junk"),
         ("rover", BOARD, b""),
@@ -69,11 +69,11 @@ def test_a_tap_shows_some_cases_or_senders_only(
     cases: tuple[str, ...], sources: tuple[str, ...], shown: list[str]
 ) -> None:
     seen = {
-        "board imu": Seen(0, "rover", BOARD, IMU),
-        "board gps": Seen(0, "rover", BOARD, GPS),
-        "station imu": Seen(0, "rover", STATION, IMU),
-        "stranger imu": Seen(0, "rover", STRANGER, IMU),
-        "board junk": Seen(0, "rover", BOARD, b"\xff\xff\xff"),
+        "board imu": MirroredDatagram(0, "rover", BOARD, IMU),
+        "board gps": MirroredDatagram(0, "rover", BOARD, GPS),
+        "station imu": MirroredDatagram(0, "rover", STATION, IMU),
+        "stranger imu": MirroredDatagram(0, "rover", STRANGER, IMU),
+        "board junk": MirroredDatagram(0, "rover", BOARD, b"\xff\xff\xff"),
     }
     wants = wanted(PROGRAM, cases, sources)
     assert [name for name, each in seen.items() if wants is None or wants(each)] == shown

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from router.errors import TransportError
 from router.observe.tap_stream import MAGIC, Lost, StreamReader, encode, encode_alive, encode_lost
-from router.recording.mirror import Seen
+from router.recording.mirror import MirroredDatagram
 
 HOSTS = st.tuples(*[st.integers(0, 255)] * 4).map(lambda parts: ".".join(map(str, parts)))
 SEEN = st.builds(
-    Seen,
+    MirroredDatagram,
     st.integers(0, 2**64 - 1),
     st.text(min_size=1, max_size=60).filter(lambda name: len(name.encode()) < 256),
     st.tuples(HOSTS, st.integers(0, 65535)),
@@ -25,7 +25,7 @@ LOST = st.builds(Lost, st.integers(0, 2**64 - 1))
 
 @given(st.lists(st.one_of(SEEN, LOST, st.none()), max_size=8), st.data())
 def test_a_stream_reads_as_what_was_written_however_it_is_cut(
-    said: list[Seen | Lost | None], data: st.DataObject
+    said: list[MirroredDatagram | Lost | None], data: st.DataObject
 ) -> None:
     stream = MAGIC
     for each in said:
@@ -39,7 +39,7 @@ def test_a_stream_reads_as_what_was_written_however_it_is_cut(
 
 
 def test_a_batch_is_one_record_after_the_other() -> None:
-    batch = [Seen(1, "rover", ("10.0.0.1", 8), b"a"), Seen(2, "rover", ("10.0.0.2", 9), b"")]
+    batch = [MirroredDatagram(1, "rover", ("10.0.0.1", 8), b"a"), MirroredDatagram(2, "rover", ("10.0.0.2", 9), b"")]
     assert list(StreamReader().take(MAGIC + encode(batch))) == batch
 
 

@@ -17,8 +17,7 @@ from router.recording.channels import Channels
 from router.recording.chunk import Chunk
 from router.recording.encoding import Encoder
 from router.recording.file import RecordingFile
-from router.recording.mirror import Seen
-from router.recording.mirrored import Known
+from router.recording.mirror import Classifier, MirroredDatagram
 from router.recording.reader_mcap import Recorded, Recording
 from router.table.model import Address, Endpoint, EndpointKind, Framing, Located, RecordSettings, RouteTable
 from tests.tables import PROTOS
@@ -54,8 +53,8 @@ def table(**changed: Any) -> RouteTable:
     return cast("RouteTable", SimpleNamespace(**told))
 
 
-def known() -> Known:
-    return Known(wire().envelope, table())
+def known() -> Classifier:
+    return Classifier(wire().envelope, table())
 
 
 def encoder(channels: Channels) -> Encoder:
@@ -64,12 +63,12 @@ def encoder(channels: Channels) -> Encoder:
     return made
 
 
-def seen(*datagrams: bytes, at: int = START, peer: tuple[str, int] = SENSOR_BOARD) -> list[Seen]:
+def seen(*datagrams: bytes, at: int = START, peer: tuple[str, int] = SENSOR_BOARD) -> list[MirroredDatagram]:
     """One each millisecond."""
-    return [Seen(at + number * MILLISECOND, "rover", peer, data) for number, data in enumerate(datagrams)]
+    return [MirroredDatagram(at + number * MILLISECOND, "rover", peer, data) for number, data in enumerate(datagrams)]
 
 
-def recorded(path: Path, *batches: Sequence[Seen], finish: bool = True) -> Path:
+def recorded(path: Path, *batches: Sequence[MirroredDatagram], finish: bool = True) -> Path:
     """A file with a chunk of each batch, on a clock that nobody sets."""
     channels = Channels()
     made = encoder(channels)
@@ -102,18 +101,18 @@ def read(path: Path) -> list[Recorded]:
         return list(recording.datagrams())
 
 
-def again(found: Recorded) -> Seen:
+def again(found: Recorded) -> MirroredDatagram:
     """What was recorded, as it was seen."""
-    return Seen(found.at, found.listener, found.peer, found.data)
+    return MirroredDatagram(found.at, found.listener, found.peer, found.data)
 
 
 class FakeMirror:
     """Shows what the test says, at once."""
 
     def __init__(self) -> None:
-        self.show: Callable[[Sequence[Seen]], None] = print
+        self.show: Callable[[Sequence[MirroredDatagram]], None] = print
 
-    def attach(self, consumer: Callable[[Sequence[Seen]], None]) -> Callable[[], None]:
+    def attach(self, consumer: Callable[[Sequence[MirroredDatagram]], None]) -> Callable[[], None]:
         self.show = consumer
         return lambda: None
 

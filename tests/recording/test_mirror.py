@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from router.recording.mirror import MOST, Consumer, Mirror, Receive, Seen, Shown
+from router.recording.mirror import MOST_WAITING, Consumer, Mirror, Mirrored, MirroredDatagram, Receive
 
 PEER = ("127.0.0.2", 8)
 LIMIT = 100
@@ -32,10 +32,10 @@ class Source:
         self.receive = self.mirror.tee("rover", self._route)
 
 
-def into(got: queue.SimpleQueue[Seen]) -> Consumer:
-    def consume(batch: Sequence[Shown]) -> None:
+def into(got: queue.SimpleQueue[MirroredDatagram]) -> Consumer:
+    def consume(batch: Sequence[Mirrored]) -> None:
         for shown in batch:
-            got.put(Seen(*shown))
+            got.put(MirroredDatagram(*shown))
 
     return consume
 
@@ -50,7 +50,7 @@ def test_nothing_is_between_while_nobody_watches(source: Source) -> None:
 
 
 def test_consumers_see_what_is_routed_with_peer_and_listener(source: Source) -> None:
-    got: queue.SimpleQueue[Seen] = queue.SimpleQueue()
+    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
     detach = source.mirror.attach(into(got))
     for number in range(3):
         source.receive(b"%d" % number, PEER)
@@ -73,7 +73,7 @@ def test_the_first_comes_and_the_last_goes_with_a_rewiring(source: Source) -> No
 
 
 def test_one_who_left_sees_no_more_and_one_who_comes_again_does(source: Source) -> None:
-    got: queue.SimpleQueue[Seen] = queue.SimpleQueue()
+    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
     source.mirror.attach(into(got))()
     source.receive(b"unseen", PEER)
     detach = source.mirror.attach(into(got))
@@ -84,7 +84,7 @@ def test_one_who_left_sees_no_more_and_one_who_comes_again_does(source: Source) 
 
 
 def test_closing_shows_what_waits(source: Source) -> None:
-    got: queue.SimpleQueue[Seen] = queue.SimpleQueue()
+    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
     source.mirror.attach(into(got))
     source.receive(b"last", PEER)
     source.mirror.close()
@@ -92,7 +92,7 @@ def test_closing_shows_what_waits(source: Source) -> None:
 
 
 def test_what_is_too_long_is_cut_one_byte_behind_the_limit(source: Source) -> None:
-    got: queue.SimpleQueue[Seen] = queue.SimpleQueue()
+    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
     source.mirror.attach(into(got))
     source.receive(bytes(1000), PEER)
     assert len(got.get(timeout=5).data) == LIMIT + 1
@@ -104,7 +104,7 @@ def test_a_slow_consumer_costs_datagrams_that_are_counted_and_no_routing(source:
     held, entered = threading.Event(), threading.Event()
     seen: list[int] = []
 
-    def slow(batch: Sequence[Shown]) -> None:
+    def slow(batch: Sequence[Mirrored]) -> None:
         entered.set()
         held.wait(20)
         seen.append(len(batch))
@@ -112,19 +112,19 @@ def test_a_slow_consumer_costs_datagrams_that_are_counted_and_no_routing(source:
     source.mirror.attach(slow)
     source.receive(b"first", PEER)
     assert entered.wait(5)
-    for _ in range(MOST + 10):
+    for _ in range(MOST_WAITING + 10):
         source.receive(b"more", PEER)
-    assert len(source.routed) == MOST + 11
+    assert len(source.routed) == MOST_WAITING + 11
     assert source.mirror.lost == 10
     held.set()
     source.mirror.close()
-    assert sum(seen) == MOST + 1
+    assert sum(seen) == MOST_WAITING + 1
 
 
 def test_a_consumer_that_fails_is_told_of_and_spares_the_others(source: Source) -> None:
-    got: queue.SimpleQueue[Seen] = queue.SimpleQueue()
+    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
 
-    def failing(batch: Sequence[Shown]) -> None:
+    def failing(batch: Sequence[Mirrored]) -> None:
         raise LookupError("a bug")
 
     source.mirror.attach(failing)

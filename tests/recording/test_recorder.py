@@ -22,7 +22,7 @@ from router.recording import recorder as recorder_module
 from router.recording import saving as recorder_saving
 from router.recording.encoding import Encoder
 from router.recording.file import RecordingFile
-from router.recording.mirror import Seen
+from router.recording.mirror import MirroredDatagram
 from router.recording.reader_mcap import Recording
 from router.recording.recorder import Recorder, RecordError
 from router.recording.saving import Saving
@@ -48,7 +48,7 @@ def counted(made: Recorder) -> dict[str, float]:
     return {" ".join((name, *labels)): value for name, asked in made.asked().items() for labels, value in asked()}
 
 
-def show(made: Recorder, mirror: FakeMirror, batch: list[Seen]) -> None:
+def show(made: Recorder, mirror: FakeMirror, batch: list[MirroredDatagram]) -> None:
     """Shows it, and waits until it was written."""
     before = counted(made)["recorded_datagrams"] + counted(made)["record_dropped write_error"]
     mirror.show(batch)
@@ -62,7 +62,7 @@ def files(directory: Path) -> list[Path]:
     return sorted(directory.iterdir())
 
 
-def now(*datagrams: bytes) -> list[Seen]:
+def now(*datagrams: bytes) -> list[MirroredDatagram]:
     return seen(*datagrams, at=time_ns())
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from router.engine import MAX_DATAGRAM
 from router.recording.channels import MOST, Channels, varint
-from router.recording.mirror import Seen
+from router.recording.mirror import MirroredDatagram
 from tests.recording.recorder_rig import (
     MILLISECOND,
     SENSOR_BOARD,
@@ -56,7 +56,7 @@ def datagrams(draw: st.DrawFn) -> bytes:
 @given(st.lists(st.lists(st.builds(lambda data, peer: (data, peer), datagrams(), PEERS), min_size=1), min_size=1))
 def test_every_datagram_is_read_as_it_was_seen(batches: list[list[tuple[bytes, tuple[str, int]]]]) -> None:
     at = iter(range(START, START + 10**12, MILLISECOND))
-    shown = [[Seen(next(at), "rover", peer, data) for data, peer in batch] for batch in batches]
+    shown = [[MirroredDatagram(next(at), "rover", peer, data) for data, peer in batch] for batch in batches]
     with tempfile.TemporaryDirectory() as folder:
         found = read(recorded(Path(folder) / "it.mcap", *shown))
     assert [again(each) for each in found] == [each for batch in shown for each in batch]
@@ -76,7 +76,10 @@ def test_datagrams_of_all_lengths_come_back(size: int, tmp_path: Path) -> None:
 def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: Path) -> None:
     """Of a listener that repairs nothing; zeros at the end are repaired by the other."""
     padded = imu() + bytes(5)
-    batch = [Seen(START, "rover", SENSOR_BOARD, padded), Seen(START, "exact", SENSOR_BOARD, padded)]
+    batch = [
+        MirroredDatagram(START, "rover", SENSOR_BOARD, padded),
+        MirroredDatagram(START, "exact", SENSOR_BOARD, padded),
+    ]
     channels = Channels()
     made = encoder(channels)
     made.add(batch, START, 0)
@@ -88,7 +91,10 @@ def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: 
 def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
     channels = Channels()
     made = encoder(channels)
-    many = [Seen(START + n, "rover", (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1), imu()) for n in range(MOST + 10)]
+    many = [
+        MirroredDatagram(START + n, "rover", (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1), imu())
+        for n in range(MOST + 10)
+    ]
     made.add(many, START, 0)
     assert taken(made).datagrams == len(many)
     assert len(channels.channels) == MOST + 2  # the raw datagrams, and their payloads to look at

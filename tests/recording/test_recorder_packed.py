@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.engine import MAX_DATAGRAM
-from router.recording.mirror import Shown
+from router.recording.mirror import Mirrored
 from router.recording.packed import Packer
 from router.recording.ring import Ring
 from tests.recording.recorder_rig import known, seen
 
 KNOWN = known()
-SHOWN: st.SearchStrategy[Shown] = st.tuples(
+SHOWN: st.SearchStrategy[Mirrored] = st.tuples(
     st.integers(0, 2**63),
     st.sampled_from(["rover", "rövër"]),
     st.tuples(st.sampled_from(["10.0.0.3", "10.0.0.4"]), st.integers(0, 65535)),
@@ -23,7 +23,7 @@ SHOWN: st.SearchStrategy[Shown] = st.tuples(
 
 
 @given(st.lists(st.lists(SHOWN, min_size=1)))
-def test_what_was_packed_comes_out_as_it_was(batches: Sequence[Sequence[Shown]]) -> None:
+def test_what_was_packed_comes_out_as_it_was(batches: Sequence[Sequence[Mirrored]]) -> None:
     packer = Packer()
     packed = [packer.pack(batch, KNOWN, 0, 0) for batch in batches]
     assert [each.unpacked() for each in packed] == batches
@@ -38,7 +38,7 @@ def test_the_longest_datagram_can_be_packed() -> None:
 def test_senders_without_end_are_not_remembered_without_end() -> None:
     packer, most = Packer(), 0
     for first in range(0, 20_000, 100):
-        batch: list[Shown] = [(0, "rover", ("10.0.0.3", first + number), b"") for number in range(100)]
+        batch: list[Mirrored] = [(0, "rover", ("10.0.0.3", first + number), b"") for number in range(100)]
         packed = packer.pack(batch, KNOWN, 0, 0)
         most = max(most, len(packed.senders))
         assert packed.unpacked() == batch

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from router.cli import main
-from router.recording.mirror import Seen
+from router.recording.mirror import MirroredDatagram
 from router.recording.reader_mcap import Recording
 from router.rehearsal.replaying_against import Against
 from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, program
@@ -34,7 +34,7 @@ def brake() -> bytes:
     return wire().encode(case, case.message_class(brake=True))
 
 
-def batches() -> list[list[Seen]]:
+def batches() -> list[list[MirroredDatagram]]:
     return [
         [each._replace(listener=LISTENER) for each in seen(*datagrams, at=at, peer=peer)]
         for datagrams, at, peer in (

@@ -8,17 +8,17 @@ import pytest
 
 from router.compiler import check_table
 from router.engine import MAX_DATAGRAM
-from router.recording.mirrored import Known, first_field
+from router.recording.mirror import Classifier, first_field
 from router.types.protobuf import PayloadCase
 from tests.observe.fake_running import sim_program
 from tests.tables import ROUTES
 
 PROGRAM = sim_program()
-KNOWN = Known(PROGRAM.envelope, PROGRAM.table)
+KNOWN = Classifier(PROGRAM.envelope, PROGRAM.table)
 BRAKE = PROGRAM.envelope.message_class(manual_brake={"brake": True}).SerializeToString()
 
 
-def case_in(data: bytes, known: Known = KNOWN, listener: str = "rover") -> str | None:
+def case_in(data: bytes, known: Classifier = KNOWN, listener: str = "rover") -> str | None:
     found = known.payload(listener, data)
     return found[0].name if found is not None else None
 
@@ -47,7 +47,7 @@ def test_zeros_are_repaired_where_the_listener_does_that(tmp_path: Path) -> None
     table.write_text(f"version: 1\nextends: {ROUTES}/sim.yaml\nlisten: {{rover: {{framing: exact}}}}\n")
     program = check_table(table).program
     assert program is not None
-    exact = Known(program.envelope, program.table)
+    exact = Classifier(program.envelope, program.table)
     padded = BRAKE + bytes(5)
     assert [case_in(padded), case_in(padded, exact), case_in(BRAKE, exact)] == ["manual_brake", None, "manual_brake"]
     assert case_in(padded, listener="another") is None
@@ -67,6 +67,6 @@ def test_a_sender_is_called_what_the_listener_takes_it_for(tmp_path: Path) -> No
     )
     program = check_table(table).program
     assert program is not None
-    known, station = Known(program.envelope, program.table), ("127.0.0.10", 29000)
+    known, station = Classifier(program.envelope, program.table), ("127.0.0.10", 29000)
     assert [known.sender(listener, station) for listener in ("rover", "radio", "gone")] == ["", "basestation", ""]
     assert known.sender("rover", ("127.0.0.30", 25008)) == "sensor_board"
