@@ -32,7 +32,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 
 _ROOT = Path(__file__).parents[1]
-TEAMS = (f"{_ROOT}/routes/", f"{_ROOT}/protos/", f"{_ROOT}/deploy/grafana/rover.json")
+TEAMS = (f"{_ROOT}/routes/", f"{_ROOT}/protos/")
 """What a team edits. A test that reads it would fail with the next basestation: tests/tables.py has other tables."""
 
 

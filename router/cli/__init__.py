@@ -42,7 +42,6 @@ VERBS = {
     "reload": "have a running router take its changed table",
     "sim": "play the boards and the basestation",
     "doctor": "look for what keeps a router from working here",
-    "dashboard": "make a Grafana dashboard of a table",
     "new": "add a message: proto, lock, ROS message, route and test",
     "schema": "keep the field numbers of the wire types",
 }

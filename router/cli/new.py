@@ -114,5 +114,4 @@ def _report(message: NewMessage, written: Written, unrouted: Sequence[Path], bef
     if after.envelope.max_size > before.envelope.max_size:
         print(f"The largest envelope grew from {before.envelope.max_size} to {after.envelope.max_size} bytes:")
         print("flash all boards, because those that decode it have to have room for that.")
-    print("Next: `make setup` builds the ROS message; `router validate --strict` and `router test` prove the table;")
-    print("`router dashboard > deploy/grafana/rover.json` gives it a panel.")
+    print("Next: `make setup` builds the ROS message; `router validate --strict` and `router test` prove the table.")

@@ -37,11 +37,6 @@ def test_explain_and_graph_show_the_gateway(capsys: pytest.CaptureFixture[str]) 
         assert "headset" in Path(name).read_text()
 
 
-def test_a_dashboard_has_a_row_for_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["dashboard", "only.yaml"]) == OK
-    assert '"title": "gateway headset"' in capsys.readouterr().out
-
-
 def test_the_doctor_says_nothing_of_what_it_does_not_have(capsys: pytest.CaptureFixture[str]) -> None:
     main(["doctor", "only.yaml"])
     said = capsys.readouterr().out

@@ -64,6 +64,16 @@ def selectors(expression: str) -> list[Selector]:
     return found
 
 
+def grouping_labels(expression: str) -> set[str]:
+    """The labels in `by (...)`, `on (...)` and the like, wherever they stand."""
+    tokens, found = list(_tokens(expression)), set()
+    for index, (_, text) in enumerate(tokens):
+        if text in _LABEL_LISTS:
+            end = tokens.index(("sign", ")"), index)
+            found |= {word for kind, word in tokens[index + 1 : end] if kind == "name"}
+    return found
+
+
 def _tokens(expression: str) -> Iterable[tuple[str, str]]:
     position = 0
     while position < len(expression):

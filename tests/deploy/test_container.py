@@ -91,9 +91,9 @@ def test_grafana_is_provisioned_with_our_prometheus_and_our_dashboard() -> None:
     assert source["type"] == "prometheus"
     assert listening == f"--web.listen-address={source['url'].removeprefix('http://')}"
     grafana = COMPOSE["services"]["grafana"]
-    home = f"{provider['options']['path']}/rover.json"
+    home = f"{provider['options']['path']}/rover-router.json"
     assert grafana["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"] == home
-    assert f"../grafana/rover.json:{home}:ro" in grafana["volumes"]
+    assert f"../grafana/rover-router.json:{home}:ro" in grafana["volumes"]
     assert "../grafana/provisioning:/etc/grafana/provisioning:ro" in grafana["volumes"]
 
 

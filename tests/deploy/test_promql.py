@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.deploy.promql import NotUnderstoodError, Selector, selectors
+from tests.deploy.promql import NotUnderstoodError, Selector, grouping_labels, selectors
 
 ASKED = {
     "router_deadman_active == 1": [Selector("router_deadman_active")],
@@ -22,6 +22,11 @@ ASKED = {
 @pytest.mark.parametrize("expression", ASKED)
 def test_the_series_that_an_expression_asks_for_are_found(expression: str) -> None:
     assert selectors(expression) == ASKED[expression]
+
+
+def test_labels_by_which_is_grouped_are_found() -> None:
+    expression = "sum by (le, route) (rate(a[1m])) / on (job) group_left (x) b"
+    assert grouping_labels(expression) == {"le", "route", "job", "x"}
 
 
 @pytest.mark.parametrize("expression", ['{job="a"}', "a{b}", "a{b=c}", "a{b=1}", 'a{b=="c"}', "a § b"])
