@@ -34,7 +34,7 @@ from router.table.model import Address
 from router.threads.background import background_threads
 
 if TYPE_CHECKING:
-    from router.gateway.subscriber import Subscriber
+    from router.gateway.subscribers import Subscriber
 
 __all__ = ["Router", "tune_interpreter"]
 

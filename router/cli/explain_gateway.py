@@ -88,7 +88,8 @@ def _transport(gateway: Gateway) -> str:
         return ", ".join([f"zenoh {gateway.zenoh.mode} under {gateway.zenoh.key.value}", *places])
     assert gateway.address is not None  # noqa: S101 - only Zenoh has none
     if gateway.transport.value is not Transport.UDP:
-        return f"{gateway.transport.value.value} on {gateway.address.value}, {gateway.max_clients} clients at most"
+        most = f"{gateway.max_clients} clients at most, {gateway.max_clients_per_host} from one host"
+        return f"{gateway.transport.value.value} on {gateway.address.value}, {most}"
     heard = f"on {gateway.receive.value}" if gateway.receive else "from any port"
     return f"udp to {gateway.address.value} {heard}"
 

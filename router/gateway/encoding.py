@@ -94,8 +94,7 @@ class BatchEncoding(PacketEncoding):
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
         packets = (frame.data for frame in frames)
         return [
-            Frame(datagram, "", "", is_schema=False, born=frames[0].born)
-            for datagram in datagrams(packets, self._datagram, time, self._ids)
+            Frame(datagram, "", "", is_schema=False) for datagram in datagrams(packets, self._datagram, time, self._ids)
         ]
 
 

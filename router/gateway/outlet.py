@@ -153,14 +153,14 @@ class Outlet:
     def _frame(self, sample: Sample) -> Frame:
         """Raises UnreadableError."""
         data = self._encoding.data(sample, self._around.wall_s())
-        return Frame(data, sample.topic, sample.type_name, is_schema=False, born=self._around.clock_ns())
+        return Frame(data, sample.topic, sample.type_name, is_schema=False)
 
     # -- for who asks --------------------------------------------------------------------------------------------
 
     def schema(self, served: Served) -> Frame:
         feed = served.feed
         data = self._encoding.schema(feed.topic, feed.type_name, feed.schema, self._around.wall_s())
-        return Frame(data, feed.topic, feed.type_name, is_schema=True, born=self._around.clock_ns())
+        return Frame(data, feed.topic, feed.type_name, is_schema=True)
 
     def show(self, served: Served, frames: list[Frame]) -> None:
         """Adds schema and latest value. Leaves `served` as it is: what one client is shown, others are still to get.

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 
 from router.compiler.program import GatewayPlan
-from router.gateway.audience import Audience
 from router.gateway.documents import (
     InboundRow,
     SchemaRequest,
@@ -22,19 +21,20 @@ from router.gateway.outlet import Outlet
 from router.gateway.reader import Reader, Understood
 from router.gateway.schema_text import schema_text
 from router.gateway.style import Style
+from router.gateway.subscribers import Subscribers
 from router.gateway.surroundings import Surroundings
 from router.gateway.tasks import Tasks
 from router.gateway.topics import Topics
 from router.gateway.transport.base import Client, Frame, Transport
 from router.table.model import Transport as Way
 
-_TELL_S = _SETTLE_S = 1.0
+_TELL_S = _LOG_S = 1.0
 _ANSWER_NS = 100_000_000
 """How often schemas are sent because a client asks for them: a small question has a large answer."""
 
 
 class GatewayService:
-    """Implements Ears, for its transport."""
+    """Implements Events, for its transport."""
 
     def __init__(
         self,
@@ -53,9 +53,9 @@ class GatewayService:
         self._inlet = inlet
         self._encoding = ENCODINGS[settings.format](settings)
         self._tasks = Tasks(around.failed)
-        self.audience = Audience(self.name, self._encoding, ledger, self._tasks, around.clock_ns, around.wall_s)
+        self.subscribers = Subscribers(self.name, self._encoding, ledger, around.clock_ns, around.wall_s)
         outlet = Outlet(
-            settings, around, self._encoding, ledger, self._tasks, lambda: bool(self.audience), self._deliver
+            settings, around, self._encoding, ledger, self._tasks, lambda: bool(self.subscribers), self._deliver
         )
         self._topics = Topics(plan, around, outlet, ledger, self._tasks, self._deliver)
         self._new_transport = transport
@@ -76,7 +76,7 @@ class GatewayService:
     def start(self) -> None:
         """Looks for topics and serves them from now on."""
         self._topics.start()
-        self._tasks.each(_SETTLE_S, self.audience.settle)
+        self._tasks.each(_LOG_S, self.subscribers.flush_log)
         if self._has_page:
             self._tasks.each(_TELL_S, self._tell_topics)
 
@@ -86,28 +86,28 @@ class GatewayService:
             return
         self.is_closed = True
         async with AsyncExitStack() as closing:  # in the opposite order: who comes or sends something begins tasks
-            closing.callback(self.audience.close)
+            closing.callback(self.subscribers.close)
             closing.push_async_callback(self._tasks.close)
             closing.callback(self._topics.close)
             closing.push_async_callback(self._transport.close)
 
     def _deliver(self, frames: Sequence[Frame]) -> None:
-        self.audience.send(frames, self._transport)
+        self.subscribers.send(frames, self._transport)
 
-    # -- Ears ----------------------------------------------------------------------------------------------------
+    # -- Events --------------------------------------------------------------------------------------------------
 
     def joined(self, client: Client) -> None:
-        subscriber = self.audience.joined(client)
-        is_alone = len(self.audience.subscribers) == 1
-        self.audience.send_to(subscriber, self._hello() + self._topics.snapshot(is_for_all=is_alone))
+        subscriber = self.subscribers.joined(client)
+        is_alone = len(self.subscribers.by_client) == 1
+        self.subscribers.send_to(subscriber, self._hello() + self._topics.snapshot(is_for_all=is_alone))
         if is_alone:
             self._topics.look_again()
 
     def left(self, client: Client) -> None:
-        self.audience.left(client)
+        self.subscribers.left(client)
 
     def drained(self, client: Client) -> None:
-        self.audience.drained(client)
+        self.subscribers.drained(client)
 
     def failed(self, client: Client | None, error: Exception, lost: int) -> None:
         self._ledger.send_error(error, lost)
@@ -145,19 +145,19 @@ class GatewayService:
         self._tell(client, refused)
 
     def _tell(self, client: Client, refused: RefusedError) -> None:
-        subscriber = self.audience.subscribers.get(client)
+        subscriber = self.subscribers.by_client.get(client)
         if self._explains and subscriber is not None:
             document = rejected_document(refused.reason, str(refused), refused.topic)
-            self.audience.send_to(subscriber, [self._document("rejected", document)])
+            self.subscribers.send_to(subscriber, [self._document("rejected", document)])
 
     def _show_schemas(self, client: Client, type_name: str | None) -> None:
         now = self._around.clock_ns()
-        subscriber = self.audience.subscribers.get(client)
+        subscriber = self.subscribers.by_client.get(client)
         if subscriber is None or now - self._answered < _ANSWER_NS:
             self._refuse(client, RefusedError("rate_limited", "schemas are sent 10 times per second at most"))
             return
         self._answered = now
-        self.audience.send_to(subscriber, self._topics.snapshot(type_name))
+        self.subscribers.send_to(subscriber, self._topics.snapshot(type_name))
 
     def _hello(self) -> list[Frame]:
         """What a client may send, for one that can show that to a person."""
@@ -175,4 +175,4 @@ class GatewayService:
 
     def _document(self, kind: str, data: bytes) -> Frame:
         """One that belongs to no topic; with a slow client, a newer one of its kind takes its place."""
-        return Frame(data, kind, "", is_schema=False, born=self._around.clock_ns())
+        return Frame(data, kind, "", is_schema=False)

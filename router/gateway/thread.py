@@ -20,9 +20,9 @@ from router.gateway.hub import Hub
 from router.gateway.inlet import Inlet, InletOutlets
 from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
-from router.gateway.subscriber import Subscriber
+from router.gateway.subscribers import Subscriber
 from router.gateway.surroundings import Surroundings
-from router.gateway.transport.base import Ears, Transport
+from router.gateway.transport.base import Events, Transport
 from router.gateway.transport.udp import UdpTransport
 from router.gateway.transports import new_transport
 from router.table.model import Gateway
@@ -148,7 +148,7 @@ class GatewayThread:
         settings = plan.settings
         ledger = Ledger(settings, counters, self._counts, outlets.report, wall_ns)
         inlet = Inlet(plan, ENCODINGS[settings.format].style, counters, self._counts, outlets)
-        service = GatewayService(plan, self._around, ledger, inlet, lambda ears: self._transport(settings, ears))
+        service = GatewayService(plan, self._around, ledger, inlet, lambda events: self._transport(settings, events))
         try:
             await service.open()
         except StartError as error:
@@ -157,8 +157,8 @@ class GatewayThread:
             ) from error
         return service
 
-    def _transport(self, settings: Gateway, ears: Ears) -> Transport:
-        transport = new_transport(settings, ears)
+    def _transport(self, settings: Gateway, events: Events) -> Transport:
+        transport = new_transport(settings, events)
         if isinstance(transport, UdpTransport) and settings.receive is not None:
             self.kernel_drops[settings.name] = transport.kernel_drops
         return transport
@@ -166,7 +166,7 @@ class GatewayThread:
     def clients(self, value: Callable[[Subscriber], float]) -> Iterator[tuple[tuple[str, str], float]]:
         """Gateway and number of each client, and what `value` makes of it. For any thread."""
         for service in list(self._services.values()):
-            for each in list(service.audience.subscribers.values()):
+            for each in list(service.subscribers.by_client.values()):
                 yield (service.name, str(each.number)), value(each)
 
     def stop(self) -> None:

@@ -63,6 +63,7 @@ DEFAULT_MODE = "peer"
 DEFAULT_MAX_DATAGRAM = 1400
 DEFAULT_MAX_MESSAGE = 16 << 20
 DEFAULT_MAX_CLIENTS = 1024
+DEFAULT_MAX_CLIENTS_PER_HOST = 16
 
 
 def build_gateway(entry: Entry) -> Gateway | IgnoredGateway:
@@ -74,6 +75,7 @@ def build_gateway(entry: Entry) -> Gateway | IgnoredGateway:
     topics = settings.get("topics")
     patterns = mapping(topics) if topics else None
     max_clients = integer(settings, "max_clients")
+    max_per_host = integer(settings, "max_clients_per_host")
     return Gateway(
         name=entry.key.text,
         span=entry.key.span,
@@ -92,6 +94,7 @@ def build_gateway(entry: Entry) -> Gateway | IgnoredGateway:
         max_datagram=_parsed(settings, "max_datagram", parse_datagram_size, DEFAULT_MAX_DATAGRAM),
         max_message=_parsed(settings, "max_message", parse_message_size, DEFAULT_MAX_MESSAGE),
         max_clients=max_clients.value if max_clients else DEFAULT_MAX_CLIENTS,
+        max_clients_per_host=max_per_host.value if max_per_host else DEFAULT_MAX_CLIENTS_PER_HOST,
         inbound=tuple(map(_inbound, items(settings, "inbound"))),
     )
 

@@ -438,6 +438,7 @@ class Gateway:
     max_datagram: int
     max_message: int
     max_clients: int
+    max_clients_per_host: int
     inbound: tuple[Inbound, ...]
 
 

@@ -92,7 +92,8 @@ def test_without_patterns_all_topics_of_the_table_are_matched_also_those_of_othe
     table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert explained(capsys, table, "dashboard") == (
-        f"dashboard: gateway, websocket on 127.0.0.1:8765, 1024 clients at most, json  ({table}:17:3)\n"
+        "dashboard: gateway, websocket on 127.0.0.1:8765, 1024 clients at most, 16 from one host, json"
+        f"  ({table}:17:3)\n"
         "  every message; looks for topics every 5 s\n"
         "  messages of up to 16777216 bytes\n"
         "  sends every topic that is not hidden\n"

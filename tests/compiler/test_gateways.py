@@ -18,7 +18,7 @@ from router.compiler.metrics import (
     TOPIC_STATES,
 )
 from router.errors import Code
-from router.gateway.transport.zenoh_config import session_config
+from router.gateway.transport.zenoh_session import session_config
 from tests.compiler.conftest import CheckText
 
 UDP = "transport: {udp: 127.0.0.9:8502}, receive: 127.0.0.1:8500"

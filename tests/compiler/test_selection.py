@@ -20,7 +20,8 @@ SPAN = SourceSpan("table.yaml", 1, 1, 2)
 GATEWAY = Gateway(
     name="it", span=SPAN, transport=Located(Transport.UDP, SPAN), address=None, zenoh=None, receive=None,
     format=GatewayFormat.GATEWAY_V1, include=(), exclude=(), publish_period=DEFAULT_PUBLISH_PERIOD, schema_period=1,
-    discovery_period=1, compression=0, rates=(), max_datagram=1400, max_message=1000, max_clients=1, inbound=(),
+    discovery_period=1, compression=0, rates=(), max_datagram=1400, max_message=1000, max_clients=1,
+    max_clients_per_host=1, inbound=(),
 )  # fmt: skip
 
 

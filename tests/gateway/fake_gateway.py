@@ -17,7 +17,7 @@ from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
 import router.gateway
-from router.gateway.transport.http import Page
+from router.gateway.transport.websocket import Page
 
 PAGE = Path(router.gateway.__file__).with_name("page.html")
 

@@ -23,7 +23,7 @@ from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
 from router.gateway.style import Style
 from router.gateway.surroundings import Surroundings
-from router.gateway.transport.base import Client, Ears, Frame
+from router.gateway.transport.base import Client, Events, Frame
 from router.ros.topics import RosTopics, SeenPublisher
 from router.table.model import Address
 from router.types.model import MessageType
@@ -133,10 +133,10 @@ class PlayedTransport:
     is_ready = True
     address: Address | None = None
 
-    def __init__(self, ears: Ears) -> None:
+    def __init__(self, events: Events) -> None:
         self.client = PlayedClient()
         self.last_words: list[bytes] = []
-        self._ears = ears
+        self._ears = events
 
     async def open(self) -> None:
         self._ears.joined(self.client)
@@ -210,8 +210,8 @@ class Played:
         self.service = GatewayService(plan, stage.around, stage.ledger(plan), stage.inlet(plan), self._transport)
         self._is_open = False
 
-    def _transport(self, ears: Ears) -> PlayedTransport:
-        self.transport = PlayedTransport(ears)
+    def _transport(self, events: Events) -> PlayedTransport:
+        self.transport = PlayedTransport(events)
         return self.transport
 
     @property

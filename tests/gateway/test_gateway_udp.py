@@ -17,7 +17,7 @@ from router.gateway.transport import udp as gateway_udp
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER
 from router.gateway.transport.udp import UdpTransport
 from router.table.model import Address
-from tests.gateway.gateway_ears import Ears, data, opened, until
+from tests.gateway.transport_events import Events, data, opened, until
 from tests.ports import free_port
 
 
@@ -44,16 +44,16 @@ async def hear(peer: socket.socket) -> tuple[bytes, tuple[str, int]]:
 
 def test_each_frame_is_a_datagram_from_the_local_address(headset: socket.socket) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), local(), ears)
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(), events)
         async with opened(transport):
-            [client] = ears.clients
+            [client] = events.clients
             assert client.label == str(address_of(headset))
             transport.write_all([client], [data(b"one"), data(b"x" * 65507)])
             assert headset.recvfrom(65536) == (b"one", transport.address)
             assert headset.recvfrom(65536) == (b"x" * 65507, transport.address)
             assert client.backlog() == 0
-        assert ears.gone == [client]
+        assert events.gone == [client]
         client.write([data(b"too late")])
         assert client.backlog() == 0
 
@@ -62,8 +62,8 @@ def test_each_frame_is_a_datagram_from_the_local_address(headset: socket.socket)
 
 def test_the_clients_host_is_heard_from_any_port_and_nobody_else(headset: socket.socket) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), local(), ears, most=10)
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(), events, most=10)
         async with opened(transport):
             assert transport.address is not None
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as restarted:
@@ -74,23 +74,23 @@ def test_the_clients_host_is_heard_from_any_port_and_nobody_else(headset: socket
             headset.sendto(b"x" * 11, transport.address)
             headset.sendto(b"x" * 10, transport.address)
             headset.sendto(b"", transport.address)
-            await until(lambda: len(ears.said) == 3)
-            assert ears.said == [b"hello", b"x" * 10, b""]
-            assert ears.refusals == ["source_mismatch", "too_large"]
+            await until(lambda: len(events.said) == 3)
+            assert events.said == [b"hello", b"x" * 10, b""]
+            assert events.refusals == ["source_mismatch", "too_large"]
 
     asyncio.run(story())
 
 
 def test_without_a_local_address_it_sends_from_any_port_and_hears_nothing(headset: socket.socket) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), None, ears)
+        events = Events()
+        transport = UdpTransport(address_of(headset), None, events)
         async with opened(transport):
-            ears.clients[0].write([data(b"one")])
+            events.clients[0].write([data(b"one")])
             _, sender = await hear(headset)
             headset.sendto(b"hello", sender)
             await asyncio.sleep(0.05)
-            assert ears.said == []
+            assert events.said == []
 
     asyncio.run(story())
 
@@ -99,16 +99,16 @@ def test_what_was_said_counts_from_when_the_kernel_got_it(headset: socket.socket
     """Which begins to stamp a little after it was asked to."""
 
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), local(), ears)
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(), events)
         async with opened(transport):
             assert transport.address is not None
             for number in range(1, 100):
                 headset.sendto(b"go", transport.address)
                 sent = wall_ns()
                 time.sleep(0.01)
-                await until(lambda number=number: len(ears.said) == number)  # type: ignore[misc]
-                if ears.arrivals[-1] <= sent:
+                await until(lambda number=number: len(events.said) == number)  # type: ignore[misc]
+                if events.arrivals[-1] <= sent:
                     return
         raise AssertionError("the kernel stamps nothing")
 
@@ -117,8 +117,8 @@ def test_what_was_said_counts_from_when_the_kernel_got_it(headset: socket.socket
 
 def test_what_the_kernel_drops_is_known_and_a_burst_is_kept(headset: socket.socket) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), local(), ears)
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(), events)
         assert transport.kernel_drops() == 0
         async with opened(transport):
             assert transport.address is not None
@@ -126,7 +126,7 @@ def test_what_the_kernel_drops_is_known_and_a_burst_is_kept(headset: socket.sock
                 headset.sendto(b"x" * 1400, transport.address)
             dropped = transport.kernel_drops()
             assert dropped > 0
-            await until(lambda: len(ears.said) == 5000 - dropped)
+            await until(lambda: len(events.said) == 5000 - dropped)
         assert transport.kernel_drops() == dropped
 
     asyncio.run(story())
@@ -134,26 +134,26 @@ def test_what_the_kernel_drops_is_known_and_a_burst_is_kept(headset: socket.sock
 
 def test_a_client_that_is_not_there_costs_nothing() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(local(), local(), ears)
+        events = Events()
+        transport = UdpTransport(local(), local(), events)
         async with opened(transport):
             for _ in range(5):
-                ears.clients[0].write([data(b"one")])
+                events.clients[0].write([data(b"one")])
                 await asyncio.sleep(0.01)
-            assert ears.failures == []
+            assert events.failures == []
 
     asyncio.run(story())
 
 
 def test_what_cannot_be_sent_is_told_once_for_all_of_a_burst(headset: socket.socket) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), local(), ears)
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(), events)
         async with opened(transport):
-            [client] = ears.clients
+            [client] = events.clients
             client.write([data(b"x" * 65508), data(b"fits"), data(b"x" * 65508)])
             assert (await hear(headset))[0] == b"fits"
-            [(failed, error, lost)] = ears.failures
+            [(failed, error, lost)] = events.failures
             assert (failed, lost) == (client, 2)
             assert isinstance(error, OSError)
 
@@ -164,10 +164,10 @@ def test_a_burst_is_paced_and_goes_out_in_order(headset: socket.socket) -> None:
     headset.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)  # what is late here is this test's own thread
 
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), local(), ears)
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(), events)
         async with opened(transport):
-            [client] = ears.clients
+            [client] = events.clients
             frames = [data(b"%06d" % number + b"x" * 1394) for number in range(1000)]
             reading = asyncio.get_running_loop().run_in_executor(None, lambda: [headset.recv(2000) for _ in frames])
             await asyncio.sleep(0.05)
@@ -175,29 +175,29 @@ def test_a_burst_is_paced_and_goes_out_in_order(headset: socket.socket) -> None:
             assert client.backlog() == (500 - gateway_udp.BURST) * 1400
             client.write(frames[500:])
             assert client.backlog() == (1000 - gateway_udp.BURST) * 1400 > HIGH_WATER
-            await until(lambda: ears.eased)
+            await until(lambda: events.eased)
             assert client.backlog() < LOW_WATER
             assert await reading == [frame.data for frame in frames]
-            assert ears.eased == [client]
-            assert ears.failures == []
+            assert events.eased == [client]
+            assert events.failures == []
 
     asyncio.run(story())
 
 
 def test_large_datagrams_are_paced_by_their_bytes(headset: socket.socket) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(address_of(headset), local(), ears)
+        events = Events()
+        transport = UdpTransport(address_of(headset), local(), events)
         async with opened(transport):
-            ears.clients[0].write([data(b"x" * 60_000)] * 10)
-            assert ears.clients[0].backlog() == 7 * 60_000
+            events.clients[0].write([data(b"x" * 60_000)] * 10)
+            assert events.clients[0].backlog() == 7 * 60_000
 
     asyncio.run(story())
 
 
 def test_a_port_that_is_taken_is_refused_with_who_has_it(headset: socket.socket) -> None:
     async def story() -> None:
-        transport = UdpTransport(Address("127.0.0.1", 9), address_of(headset), Ears())
+        transport = UdpTransport(Address("127.0.0.1", 9), address_of(headset), Events())
         with pytest.raises(StartError, match=r"127\.0\.0\.1:\d+ cannot be used: .*\(pid \d+\) has the port"):
             await transport.open()
         await transport.close()
@@ -209,16 +209,16 @@ def test_an_address_that_this_machine_does_not_have_yet_is_waited_for(monkeypatc
     monkeypatch.setattr(gateway_binding, "RETRY_SECONDS", 0.01)
 
     async def story() -> None:
-        ears = Ears()
-        transport = UdpTransport(Address("127.0.0.1", 9), Address("192.0.2.1", 8500), ears)
+        events = Events()
+        transport = UdpTransport(Address("127.0.0.1", 9), Address("192.0.2.1", 8500), events)
         with capture_logs() as logs:
             async with opened(transport):
                 assert not transport.is_ready
                 await asyncio.sleep(0.1)
-                assert ears.clients == []
+                assert events.clients == []
                 monkeypatch.setattr(transport, "_local", local())  # the interface comes up
                 await until(lambda: transport.is_ready)
-                assert len(ears.clients) == 1
+                assert len(events.clients) == 1
         assert [log["log_level"] for log in logs] == ["warning", "info"]
 
     asyncio.run(story())

@@ -15,25 +15,25 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from router.errors import StartError
-from router.gateway.transport import outflow as gateway_outflow
 from router.gateway.transport import stream as gateway_stream
 from router.gateway.transport import websocket as gateway_websocket
 from router.gateway.transport.base import HIGH_WATER, Client
+from router.gateway.transport.stream import Limits
 from router.gateway.transport.websocket import WebsocketTransport
 from router.table.model import Address
-from tests.gateway.gateway_ears import Ears, close_while_clients_come, data, opened, resident_kib, until
+from tests.gateway.transport_events import Events, close_while_clients_come, data, opened, resident_kib, until
 
 ANY = Address("127.0.0.1", 0)
 MOST = 1000
 PAGE = b"<!doctype html><style>a{}</style><p>\xc3\xa4</p><script>let a;</script><script>let b;</script>"
 
 
-def documents(ears: Ears, max_clients: int = 10) -> WebsocketTransport:
-    return WebsocketTransport(ANY, ears, text=True, max_clients=max_clients, most=MOST, page=PAGE)
+def documents(events: Events, max_clients: int = 10) -> WebsocketTransport:
+    return WebsocketTransport(ANY, events, Limits(max_clients, max_clients, MOST), text=True, page=PAGE)
 
 
-def packets(ears: Ears) -> WebsocketTransport:
-    return WebsocketTransport(ANY, ears, text=False, max_clients=10, most=MOST, page=PAGE)
+def packets(events: Events) -> WebsocketTransport:
+    return WebsocketTransport(ANY, events, Limits(10, 10, MOST), text=False, page=PAGE)
 
 
 def dial(transport: WebsocketTransport, path: str = "/", host: str = "", **settings: str) -> connect:
@@ -77,32 +77,32 @@ async def fetch(transport: WebsocketTransport, path: str, *headers: str) -> tupl
 
 def test_frames_of_one_writing_are_one_text_message_joined_by_newlines() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport), dial(transport) as one, dial(transport, "/any/path?x=1") as other:
-            await until(lambda: len(ears.clients) == 2)
-            assert ears.clients[0].label == "{}:{}".format(*one.local_address)
-            transport.write_all(ears.clients, [data(b'{"a":1}'), data('{"b":"ä"}'.encode())])
-            ears.clients[1].write([data(b"{}")])
+            await until(lambda: len(events.clients) == 2)
+            assert events.clients[0].label == "{}:{}".format(*one.local_address)
+            transport.write_all(events.clients, [data(b'{"a":1}'), data('{"b":"ä"}'.encode())])
+            events.clients[1].write([data(b"{}")])
             for end in (one, other):
                 assert await end.recv() == '{"a":1}\n{"b":"ä"}'
             assert await other.recv() == "{}"
             await one.send('{"op":"schema"}')
             await one.send(b"\x00")
-            await until(lambda: len(ears.said) == 2)
-            assert ears.said == [b'{"op":"schema"}', b"\x00"]
-            assert ears.said_by == [ears.clients[0]] * 2
+            await until(lambda: len(events.said) == 2)
+            assert events.said == [b'{"op":"schema"}', b"\x00"]
+            assert events.said_by == [events.clients[0]] * 2
 
     asyncio.run(story())
 
 
 def test_packets_are_binary_messages_of_their_own() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = packets(ears)
+        events = Events()
+        transport = packets(events)
         async with opened(transport), dial(transport) as end:
-            await until(lambda: ears.clients)
-            ears.clients[0].write([data(b"one"), data(b""), data(b"x" * 200_000)])
+            await until(lambda: events.clients)
+            events.clients[0].write([data(b"one"), data(b""), data(b"x" * 200_000)])
             assert [await end.recv() for _ in range(3)] == [b"one", b"", b"x" * 200_000]
 
     asyncio.run(story())
@@ -110,8 +110,8 @@ def test_packets_are_binary_messages_of_their_own() -> None:
 
 def test_nothing_is_compressed() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport), dial(transport) as end:
             assert end.protocol.extensions == []
 
@@ -122,11 +122,11 @@ def test_a_large_message_is_cut_so_that_pings_pass_and_arrives_whole() -> None:
     large = "ä€" * 1_400_000
 
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport), dial(transport) as end:
-            await until(lambda: ears.clients)
-            [client] = ears.clients
+            await until(lambda: events.clients)
+            [client] = events.clients
             client.write([data(large.encode())])
             client.write([data(b"next")])
             assert client.backlog() > 6_000_000
@@ -136,26 +136,26 @@ def test_a_large_message_is_cut_so_that_pings_pass_and_arrives_whole() -> None:
             assert len(parts) > 100
             await answered
             assert await end.recv() == "next"
-            await until(lambda: ears.eased == [client])
+            await until(lambda: events.eased == [client])
 
     asyncio.run(story())
 
 
 def test_clients_that_stand_still_hold_up_nobody_and_cost_no_memory_of_their_own() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears, max_clients=51)
+        events = Events()
+        transport = documents(events, max_clients=51)
         async with opened(transport):
             still = [await dial_and_stand_still(transport) for _ in range(50)]
-            await until(lambda: len(ears.clients) == 50)
+            await until(lambda: len(events.clients) == 50)
             async with dial(transport) as end:
-                await until(lambda: len(ears.clients) == 51)
+                await until(lambda: len(events.clients) == 51)
                 before = resident_kib()
-                transport.write_all(ears.clients, [data(b"x" * 7_000_000)])
+                transport.write_all(events.clients, [data(b"x" * 7_000_000)])
                 assert len(await end.recv()) == 7_000_000
                 assert resident_kib() - before < 100_000
-                assert all(client.backlog() > 6_000_000 for client in ears.clients[:50])
-                ears.clients[50].write([data(b"next")])
+                assert all(client.backlog() > 6_000_000 for client in events.clients[:50])
+                events.clients[50].write([data(b"next")])
                 assert await end.recv() == "next"
             await transport.close()  # at once, though they will not say goodbye
             for peer in still:
@@ -168,8 +168,8 @@ def test_a_slow_client_is_told_when_it_has_drained_and_gets_all_in_order() -> No
     wanted = 400
 
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         sent = 0
 
         def send(client: Client) -> None:
@@ -178,10 +178,10 @@ def test_a_slow_client_is_told_when_it_has_drained_and_gets_all_in_order() -> No
                 client.write([data(b"%04d" % sent + b"x" * 10_000)])
                 sent += 1
 
-        ears.on_drained = send
+        events.on_drained = send
         async with opened(transport), dial(transport) as end:
-            await until(lambda: ears.clients)
-            send(ears.clients[0])
+            await until(lambda: events.clients)
+            send(events.clients[0])
             assert sent < wanted
             for number in range(wanted):
                 message = await end.recv()
@@ -191,19 +191,18 @@ def test_a_slow_client_is_told_when_it_has_drained_and_gets_all_in_order() -> No
 
 
 def test_a_client_that_takes_nothing_for_long_is_closed_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway_stream, "LOOK_SECONDS", 0.05)
-    monkeypatch.setattr(gateway_outflow, "STALLED_SECONDS", 0.3)
+    monkeypatch.setattr(gateway_stream, "STALLED_SECONDS", 0.3)
 
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         with capture_logs() as logs:
             async with opened(transport):
                 peer = await dial_and_stand_still(transport)
-                await until(lambda: ears.clients)
-                [client] = ears.clients
+                await until(lambda: events.clients)
+                [client] = events.clients
                 client.write([data(b"x" * 10_000_000)])
-                await until(lambda: ears.gone == [client])
+                await until(lambda: events.gone == [client])
                 peer.close()
         assert ["send stalled" in log["event"] for log in logs if log["log_level"] == "warning"] == [True]
 
@@ -215,11 +214,11 @@ def test_a_client_that_does_not_answer_pings_is_closed(monkeypatch: pytest.Monke
     monkeypatch.setattr(gateway_websocket, "CLOSING_SECONDS", 0.1)
 
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport):
             peer = await dial_and_stand_still(transport)
-            await until(lambda: len(ears.gone) == 1)
+            await until(lambda: len(events.gone) == 1)
             peer.close()
 
     asyncio.run(story())
@@ -229,14 +228,14 @@ def test_a_client_that_pings_without_end_and_reads_nothing_is_closed() -> None:
     pings = (b"\x89\xfdmask" + b"x" * 125) * 100
 
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport):
             peer = await dial_and_stand_still(transport)
             with suppress(ConnectionError):
-                while not ears.gone:
+                while not events.gone:
                     await asyncio.get_running_loop().sock_sendall(peer, pings)
-            await until(lambda: len(ears.gone) == 1)
+            await until(lambda: len(events.gone) == 1)
             peer.close()
 
     asyncio.run(story())
@@ -244,36 +243,36 @@ def test_a_client_that_pings_without_end_and_reads_nothing_is_closed() -> None:
 
 def test_clients_that_leave_in_either_way_are_gone() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport):
             async with dial(transport) as end:
-                await until(lambda: len(ears.clients) == 1)
+                await until(lambda: len(events.clients) == 1)
                 end.transport.abort()
-                await until(lambda: len(ears.gone) == 1)
+                await until(lambda: len(events.gone) == 1)
             async with dial(transport):
-                await until(lambda: len(ears.clients) == 1)
-            await until(lambda: len(ears.gone) == 2)
+                await until(lambda: len(events.clients) == 1)
+            await until(lambda: len(events.gone) == 2)
             async with dial(transport) as end:
-                await until(lambda: len(ears.clients) == 1)
-                ears.clients[0].close()
+                await until(lambda: len(events.clients) == 1)
+                events.clients[0].close()
                 with pytest.raises(ConnectionClosed):
                     await end.recv()
-                assert len(ears.gone) == 3
-            ears.gone[0].write([data(b"too late")])
+                assert len(events.gone) == 3
+            events.gone[0].write([data(b"too late")])
 
     asyncio.run(story())
 
 
 def test_a_message_that_is_too_long_is_refused_and_its_sender_closed() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport), dial(transport) as end:
             await end.send("x" * MOST)
             await end.send("x" * (MOST + 1))
-            await until(lambda: ears.gone)
-            assert ([len(said) for said in ears.said], ears.refusals) == ([MOST], ["too_large"])
+            await until(lambda: events.gone)
+            assert ([len(said) for said in events.said], events.refusals) == ([MOST], ["too_large"])
             with pytest.raises(ConnectionClosed, match="1009"):
                 await end.recv()
 
@@ -282,7 +281,7 @@ def test_a_message_that_is_too_long_is_refused_and_its_sender_closed() -> None:
 
 def test_the_page_is_given_with_a_policy_that_lets_it_nothing_from_outside() -> None:
     async def story() -> None:
-        transport = documents(Ears())
+        transport = documents(Events())
         async with opened(transport):
             status, head, body = await fetch(transport, "/")
             assert (status, body) == (200, PAGE)
@@ -322,34 +321,34 @@ def test_the_page_is_given_with_a_policy_that_lets_it_nothing_from_outside() -> 
 )
 def test_a_page_of_another_host_may_not_connect(host: str, origin: str, welcome: bool) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with opened(transport):
             if welcome:
                 async with dial(transport, host=host, additional_headers={"Origin": origin}):  # type: ignore[arg-type]
-                    await until(lambda: ears.clients)
+                    await until(lambda: events.clients)
                 return
             with pytest.raises(InvalidStatus, match="403"):
                 await dial(transport, host=host, additional_headers={"Origin": origin})  # type: ignore[arg-type]
-            assert not ears.clients
+            assert not events.clients
 
     asyncio.run(story())
 
 
 def test_a_client_beyond_the_most_is_sent_away_and_told_but_may_see_the_page() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears, max_clients=1)
+        events = Events()
+        transport = documents(events, max_clients=1)
         with capture_logs() as logs:
             async with opened(transport), dial(transport):
-                await until(lambda: ears.clients)
+                await until(lambda: events.clients)
                 async with dial(transport) as second:
                     with pytest.raises(ConnectionClosed, match="1013"):
                         await second.recv()
                 assert (await fetch(transport, "/"))[0] == 200
         [warning] = [log for log in logs if log["log_level"] == "warning"]
         assert "too many" in warning["event"]
-        assert len(ears.gone) == 1
+        assert len(events.gone) == 1
 
     asyncio.run(story())
 
@@ -359,8 +358,8 @@ def test_a_client_beyond_the_most_is_sent_away_and_told_but_may_see_the_page() -
 )
 def test_who_does_not_speak_http_does_not_hold_up_closing(greeting: bytes) -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         with capture_logs() as logs:
             async with opened(transport):
                 assert transport.address is not None
@@ -371,7 +370,7 @@ def test_who_does_not_speak_http_does_not_hold_up_closing(greeting: bytes) -> No
                 await transport.close()
                 assert asyncio.get_running_loop().time() - before < 5
                 writer.close()
-        assert ears.clients == ears.gone == []
+        assert events.clients == events.gone == []
         assert {log["log_level"] for log in logs} <= {"debug"}
 
     asyncio.run(story())
@@ -379,26 +378,26 @@ def test_who_does_not_speak_http_does_not_hold_up_closing(greeting: bytes) -> No
 
 def test_clients_that_say_goodbye_hear_that_the_gateway_goes_away() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears)
+        events = Events()
+        transport = documents(events)
         async with AsyncExitStack() as stack, opened(transport):
             ends: list[ClientConnection] = [await stack.enter_async_context(dial(transport)) for _ in range(3)]
-            await until(lambda: len(ears.clients) == 3)
+            await until(lambda: len(events.clients) == 3)
             await transport.close()
             for end in ends:
                 with pytest.raises(ConnectionClosed, match="1001"):
                     await end.recv()
-            assert len(ears.gone) == 3
+            assert len(events.gone) == 3
 
     asyncio.run(story())
 
 
 def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
     async def story() -> None:
-        first = documents(Ears())
+        first = documents(Events())
         async with opened(first):
             assert first.address is not None
-            second = WebsocketTransport(first.address, Ears(), text=True, max_clients=1, most=MOST, page=PAGE)
+            second = WebsocketTransport(first.address, Events(), Limits(1, 1, MOST), text=True, page=PAGE)
             with pytest.raises(StartError, match=r"127\.0\.0\.1:\d+ cannot be used: .*\(pid \d+\) has the port"):
                 await second.open()
             await second.close()
@@ -408,21 +407,21 @@ def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
 
 def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
     async def story() -> None:
-        ears = Ears()
+        events = Events()
         faults: list[Exception] = []
         asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
-        transport = documents(ears)
+        transport = documents(events)
 
         def stumble(client: Client, data: bytes, arrived_ns: int) -> None:
             raise ZeroDivisionError
 
-        ears.received = stumble  # type: ignore[method-assign]
+        events.received = stumble  # type: ignore[method-assign]
         async with opened(transport), dial(transport) as one, dial(transport):
-            await until(lambda: len(ears.clients) == 2)
+            await until(lambda: len(events.clients) == 2)
             with suppress(ConnectionClosed):
                 await one.send("x")
                 await one.recv()
-            await until(lambda: len(ears.gone) == 1)
+            await until(lambda: len(events.gone) == 1)
         assert [type(fault) for fault in faults] == [ZeroDivisionError]
 
     asyncio.run(story())
@@ -430,12 +429,12 @@ def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
 
 def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
     async def story() -> None:
-        ears = Ears()
-        transport = documents(ears, max_clients=100)
+        events = Events()
+        transport = documents(events, max_clients=100)
         async with opened(transport), AsyncExitStack() as stack:
             ends = await asyncio.gather(*(stack.enter_async_context(dial(transport)) for _ in range(100)))
-            await until(lambda: len(ears.clients) == 100)
-            transport.write_all(ears.clients, [data(b"hello")])
+            await until(lambda: len(events.clients) == 100)
+            transport.write_all(events.clients, [data(b"hello")])
             assert await asyncio.gather(*(end.recv() for end in ends)) == ["hello"] * 100
 
     asyncio.run(story())
@@ -443,4 +442,4 @@ def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
 
 @pytest.mark.parametrize("turns", range(4))
 def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
-    asyncio.run(close_while_clients_come(documents(Ears()), turns))
+    asyncio.run(close_while_clients_come(documents(Events()), turns))

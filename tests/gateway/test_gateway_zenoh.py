@@ -15,12 +15,11 @@ from structlog.testing import capture_logs
 
 from router.errors import SourceSpan, StartError
 from router.gateway.transport import zenoh as gateway_zenoh
-from router.gateway.transport import zenoh_inbox as gateway_zenoh_inbox
 from router.gateway.transport.base import HIGH_WATER, Client, Frame
 from router.gateway.transport.zenoh import ZenohTransport
-from router.gateway.transport.zenoh_config import session_config
+from router.gateway.transport.zenoh_session import session_config
 from router.table.model import Located, ZenohConfig, ZenohSettings
-from tests.gateway.gateway_ears import Ears, data, opened, until
+from tests.gateway.transport_events import Events, data, opened, until
 from tests.ports import free_port
 
 KEY = "rovers/loki_1"
@@ -74,16 +73,16 @@ class Listener:
 
 
 def schema(type_name: str) -> Frame:
-    return Frame(b"a schema", "", type_name, is_schema=True, born=0)
+    return Frame(b"a schema", "", type_name, is_schema=True)
 
 
 def test_data_is_found_by_topic_and_schemas_by_type() -> None:
     async def story() -> None:
-        ears, where = Ears(), locator()
-        transport = ZenohTransport(settings(listen=(where,)), ears)
+        events, where = Events(), locator()
+        transport = ZenohTransport(settings(listen=(where,)), events)
         async with serving(transport):
             assert transport.is_ready
-            [client] = ears.clients
+            [client] = events.clients
             assert client.label == f"zenoh {KEY}"
             with session("client", connect=where) as far:
                 listener = Listener(far, f"{KEY}/**")
@@ -98,8 +97,8 @@ def test_data_is_found_by_topic_and_schemas_by_type() -> None:
                     (f"{KEY}/data/loki_1/imu", b"two"),
                 ]
                 await until(lambda: not client.backlog())
-        assert ears.gone == [client]
-        assert ears.failures == []
+        assert events.gone == [client]
+        assert events.failures == []
         client.write([data(b"too late")])
         assert client.backlog() == 0
 
@@ -117,25 +116,25 @@ async def _heard_by(client: Client, listener: Listener) -> None:
     await asyncio.sleep(0.1)
 
 
-async def _hears(ears: Ears, far: zenoh.Session) -> None:
+async def _hears(events: Events, far: zenoh.Session) -> None:
     """Waits until what is put by `far` arrives, the same way round."""
 
     def is_heard() -> bool:
         far.put(f"{KEY}/inbound/hello", b"are you there")
-        return bool(ears.said)
+        return bool(events.said)
 
     await until(is_heard)
     await asyncio.sleep(0.1)
-    ears.said.clear()
+    events.said.clear()
 
 
 def test_what_is_put_under_inbound_is_heard() -> None:
     async def story() -> None:
-        ears, where = Ears(), locator()
-        transport = ZenohTransport(settings(listen=(where,)), ears, most=100)
+        events, where = Events(), locator()
+        transport = ZenohTransport(settings(listen=(where,)), events, most=100)
         async with serving(transport):
             with session("peer", connect=where) as far:
-                await _hears(ears, far)
+                await _hears(events, far)
                 far.put(f"{KEY}/inbound/cmd_vel", b"go")
                 far.put(f"{KEY}/inbound/cmd_vel", b"x" * 101)
                 far.put(f"{KEY}/inbound", b"x" * 100)
@@ -143,29 +142,29 @@ def test_what_is_put_under_inbound_is_heard() -> None:
                 far.put(f"{KEY}/data/cmd_vel", b"not for us")
                 far.put("rovers/loki_2/inbound/cmd_vel", b"nor this")
                 far.put(f"{KEY}/inbound/cmd_vel", b"stop")
-                await until(lambda: len(ears.said) == 3)
-                assert ears.said == [b"go", b"x" * 100, b"stop"]
-                assert set(ears.said_by) == {ears.clients[0]}
-                assert ears.refusals == ["too_large"]
+                await until(lambda: len(events.said) == 3)
+                assert events.said == [b"go", b"x" * 100, b"stop"]
+                assert set(events.said_by) == {events.clients[0]}
+                assert events.refusals == ["too_large"]
 
     asyncio.run(story())
 
 
 def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway_zenoh_inbox, "MOST_RECEIVED", 5)
+    monkeypatch.setattr(gateway_zenoh, "MOST_RECEIVED", 5)
 
     async def story() -> None:
-        ears, where = Ears(), locator()
-        transport = ZenohTransport(settings(listen=(where,)), ears)
+        events, where = Events(), locator()
+        transport = ZenohTransport(settings(listen=(where,)), events)
         async with serving(transport):
             with session("peer", connect=where) as far:
-                await _hears(ears, far)
+                await _hears(events, far)
                 for number in range(2000):
                     far.put(f"{KEY}/inbound/cmd_vel", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
-                await until(lambda: len(ears.said) + len(ears.refusals) == 2000)
-                assert set(ears.refusals) <= {"rate_limited"}
-                assert ears.failures == []
-                numbers = list(map(int, ears.said))
+                await until(lambda: len(events.said) + len(events.refusals) == 2000)
+                assert set(events.refusals) <= {"rate_limited"}
+                assert events.failures == []
+                numbers = list(map(int, events.said))
                 assert numbers == sorted(numbers)
 
     asyncio.run(story())
@@ -173,9 +172,9 @@ def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypat
 
 def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -> None:
     async def story() -> None:
-        ears, where = Ears(), locator()
-        ears.shown = [schema("std_msgs/msg/Bool"), data(b"true", "/on"), data(b"false", "/off")]
-        transport = ZenohTransport(settings(listen=(where,)), ears)
+        events, where = Events(), locator()
+        events.shown = [schema("std_msgs/msg/Bool"), data(b"true", "/on"), data(b"false", "/off")]
+        transport = ZenohTransport(settings(listen=(where,)), events)
         async with serving(transport):
             with session("client", connect=where) as far:
 
@@ -196,7 +195,7 @@ def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -> None
                 assert await asyncio.to_thread(ask, f"{KEY}/data/unknown") == []
                 several = await asyncio.gather(*(asyncio.to_thread(ask, f"{KEY}/data/on") for _ in range(20)))
                 assert several == [everything[1:2]] * 20
-        assert ears.failures == []
+        assert events.failures == []
 
     asyncio.run(story())
 
@@ -205,10 +204,10 @@ def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> 
     large = b"x" * 7_000_000
 
     async def story() -> None:
-        ears, where = Ears(), locator()
-        transport = ZenohTransport(patient(where), ears)
+        events, where = Events(), locator()
+        transport = ZenohTransport(patient(where), events)
         async with serving(transport):
-            [client] = ears.clients
+            [client] = events.clients
             with session("client", connect=where) as far:
                 listener = Listener(far, f"{KEY}/**")
                 await _heard_by(client, listener)
@@ -224,10 +223,10 @@ def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> 
 
 def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None:
     async def story() -> None:
-        ears, where = Ears(), locator()
-        transport = ZenohTransport(patient(where), ears)
+        events, where = Events(), locator()
+        transport = ZenohTransport(patient(where), events)
         async with serving(transport):
-            [client] = ears.clients
+            [client] = events.clients
             with session("client", connect=where) as far:
                 listener = Listener(far, f"{KEY}/**")
                 await _heard_by(client, listener)
@@ -235,7 +234,7 @@ def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None
                 client.write([data(b"%03d" % number + b"x" * 3_000_000, "/cloud") for number in range(20)])
                 last = f"{KEY}/data/cloud"
                 await until(lambda: any(key == last and value[:3] == b"019" for key, value in listener.heard))
-                lost = sum(lost for _, _, lost in ears.failures)
+                lost = sum(lost for _, _, lost in events.failures)
                 assert lost > 0
                 assert len(listener.heard) + lost == 20
 
@@ -244,13 +243,13 @@ def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None
 
 def test_much_that_is_written_at_once_is_put_and_the_client_drains() -> None:
     async def story() -> None:
-        ears, where = Ears(), locator()
-        transport = ZenohTransport(settings(listen=(where,)), ears)
+        events, where = Events(), locator()
+        transport = ZenohTransport(settings(listen=(where,)), events)
         async with serving(transport):
-            [client] = ears.clients
+            [client] = events.clients
             client.write([data(b"x" * 10_000)] * 100)
             assert client.backlog() > HIGH_WATER
-            await until(lambda: ears.eased == [client])
+            await until(lambda: events.eased == [client])
             assert client.backlog() == 0
 
     asyncio.run(story())
@@ -260,16 +259,16 @@ def test_a_router_that_is_not_there_yet_is_tried_again(monkeypatch: pytest.Monke
     monkeypatch.setattr(gateway_zenoh, "RETRY_SECONDS", 0.02)
 
     async def story() -> None:
-        ears, where = Ears(), locator()
-        transport = ZenohTransport(settings("client", connect=(where,)), ears)
+        events, where = Events(), locator()
+        transport = ZenohTransport(settings("client", connect=(where,)), events)
         with capture_logs() as logs:
             async with opened(transport):
                 assert not transport.is_ready
                 await asyncio.sleep(0.1)
-                assert ears.clients == []
+                assert events.clients == []
                 with session("router", listen=where) as router:
                     await until(lambda: transport.is_ready)
-                    [client] = ears.clients
+                    [client] = events.clients
                     listener = Listener(router, f"{KEY}/**")
                     await _heard_by(client, listener)
         assert [log["log_level"] for log in logs if log["log_level"] != "debug"] == ["warning", "info"]
@@ -281,7 +280,7 @@ def test_a_router_that_is_not_there_yet_is_tried_again(monkeypatch: pytest.Monke
 
 def test_closing_while_the_router_is_not_there_is_prompt() -> None:
     async def story() -> None:
-        transport = ZenohTransport(settings("client", connect=(locator(),)), Ears())
+        transport = ZenohTransport(settings("client", connect=(locator(),)), Events())
         async with opened(transport):
             pass
 
@@ -292,7 +291,7 @@ def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
     async def story() -> None:
         with socket.create_server(("127.0.0.1", 0)) as taken:
             where = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-            transport = ZenohTransport(settings(listen=(where,)), Ears())
+            transport = ZenohTransport(settings(listen=(where,)), Events())
             with pytest.raises(StartError, match=rf"{where} cannot be used: .* has the port"):
                 await transport.open()
 
@@ -303,7 +302,7 @@ def test_a_key_that_is_none_is_refused() -> None:
     async def story() -> None:
         bad = Located("rovers//loki?", SourceSpan("routes/rover.yaml"))
         with pytest.raises(StartError, match="rovers//loki"):
-            await ZenohTransport(ZenohSettings(bad), Ears()).open()
+            await ZenohTransport(ZenohSettings(bad), Events()).open()
 
     asyncio.run(story())
 
@@ -311,7 +310,7 @@ def test_a_key_that_is_none_is_refused() -> None:
 @pytest.mark.parametrize("where", ["nonsense", "tcp/", "carrier-pigeon/127.0.0.1:7447"])
 def test_a_locator_that_zenoh_does_not_know_is_refused(where: str) -> None:
     async def story() -> None:
-        transport = ZenohTransport(settings(connect=(where,)), Ears())
+        transport = ZenohTransport(settings(connect=(where,)), Events())
         with pytest.raises(StartError):
             await transport.open()
         await transport.close()
@@ -357,7 +356,7 @@ def test_a_config_that_zenoh_refuses_when_it_opens_is_refused_with_its_line(
 ) -> None:
     async def story() -> None:
         given = ZenohConfig(SourceSpan("rover.yaml", 7, 9), json.dumps(config)) if config else None
-        transport = ZenohTransport(replace(settings(listen=(where,)), config=given), Ears())
+        transport = ZenohTransport(replace(settings(listen=(where,)), config=given), Events())
         with pytest.raises(StartError, match=why):
             await transport.open()
 
@@ -370,7 +369,7 @@ def test_who_has_no_password_yet_is_tried_again() -> None:
     async def story() -> None:
         where = locator()
         given = ZenohConfig(SourceSpan("rover.yaml"), "{}")
-        transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), Ears())
+        transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), Events())
         with capture_logs() as logs:
             async with opened(transport):
                 assert not transport.is_ready

@@ -13,9 +13,9 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 import pytest
 import zenoh
 
-from router.gateway.transport.zenoh_owner import Owner, owner_of
-from tests.gateway.gateway_ears import PATIENCE_SECONDS
+from router.gateway.transport.zenoh_session import Owner, owner_of
 from tests.gateway.test_gateway_zenoh import locator, session
+from tests.gateway.transport_events import PATIENCE_SECONDS
 from tests.gateway.zenoh_gateway import Gateway
 
 KEY = "rovers/loki_1"

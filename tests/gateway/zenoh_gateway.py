@@ -21,7 +21,7 @@ from structlog.testing import capture_logs
 from router.errors import SourceSpan
 from router.gateway.transport.zenoh import ZenohTransport
 from router.table.model import Located, ZenohConfig, ZenohSettings
-from tests.gateway.gateway_ears import Ears
+from tests.gateway.transport_events import Events
 
 HERE = SourceSpan("routes/rover.yaml")
 
@@ -82,11 +82,11 @@ class Gateway:
 
 async def main(key: str, where: str, config: str, mode: str) -> None:
     """A peer whose mode is "listening" listens at `where`."""
-    ears = Ears()
+    events = Events()
     settings = ZenohSettings(Located(key, HERE), mode, (where,), (), ZenohConfig(HERE, config))
     if mode == "listening":
         settings = replace(settings, mode="peer", connect=(), listen=(where,))
-    transport = ZenohTransport(settings, ears)
+    transport = ZenohTransport(settings, events)
     print(json.dumps({"ready": False, "others": [], "contentions": 0}), flush=True)
     await asyncio.to_thread(sys.stdin.readline)
     with capture_logs() as logs:
@@ -94,7 +94,7 @@ async def main(key: str, where: str, config: str, mode: str) -> None:
         told = None
         while True:
             others = [log["other"] for log in logs if log["log_level"] == "error"]
-            state = {"ready": transport.is_ready, "others": others, "contentions": ears.contentions}
+            state = {"ready": transport.is_ready, "others": others, "contentions": events.contentions}
             if state != told:
                 told = state
                 print(json.dumps(state), flush=True)

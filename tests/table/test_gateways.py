@@ -76,7 +76,8 @@ def test_what_is_left_out_has_a_default(tmp_path: Path, transport: str, given: G
     found = gateway(tmp_path, f"transport: {{{transport}}}")
     assert (found.format, found.include, found.exclude, found.rates, found.inbound) == (given, (), (), (), ())
     assert (found.publish_period, found.schema_period, found.discovery_period) == (500_000_000, 5 * 10**9, 5 * 10**9)
-    assert (found.compression, found.max_datagram, found.max_message, found.max_clients) == (0, 1400, 16 << 20, 1024)
+    assert (found.compression, found.max_datagram, found.max_message) == (0, 1400, 16 << 20)
+    assert (found.max_clients, found.max_clients_per_host) == (1024, 16)
     assert found.receive is None
 
 
@@ -157,6 +158,9 @@ ZENOH = "transport: {zenoh: {key: a}}"
         (f"{UDP}, max_clients: 3", Code.UNKNOWN_KEY),
         (f"{ZENOH}, max_clients: 3", Code.UNKNOWN_KEY),
         (f"{TCP}, max_clients: 0", Code.BAD_VALUE),
+        (f"{UDP}, max_clients_per_host: 3", Code.UNKNOWN_KEY),
+        (f"{ZENOH}, max_clients_per_host: 3", Code.UNKNOWN_KEY),
+        (f"{TCP}, max_clients_per_host: 0", Code.BAD_VALUE),
         (f"{UDP}, max_datagram: 1400B", Code.UNKNOWN_KEY),
         (f"{UDP}, format: gateway_v2, max_datagram: 575B", Code.BAD_VALUE),
         (f"{UDP}, format: gateway_v2, max_datagram: 1400", Code.WRONG_TYPE),

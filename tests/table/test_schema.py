@@ -69,6 +69,7 @@ def test_documented_defaults_of_gateways_are_those_of_the_code() -> None:
     assert parse_size(given["max_datagram"]) == build_gateways.DEFAULT_MAX_DATAGRAM
     assert parse_size(given["max_message"]) == build_gateways.DEFAULT_MAX_MESSAGE
     assert given["max_clients"] == build_gateways.DEFAULT_MAX_CLIENTS
+    assert given["max_clients_per_host"] == build_gateways.DEFAULT_MAX_CLIENTS_PER_HOST
     assert definitions["zenoh"]["properties"]["mode"]["default"] == build_gateways.DEFAULT_MODE
     repeat = definitions["inbound_deadman"]["properties"]["repeat"]
     assert parse_duration(repeat["default"]) == DEFAULT_REPEAT

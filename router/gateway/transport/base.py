@@ -1,6 +1,6 @@
-"""What a gateway and its transports have to do with each other: frames, clients, and who hears of them.
+"""The interface between a gateway and its transports: frames, clients and events.
 
-Everything here is called in the thread of the gateways' loop. Knows no topic's meaning, format or ROS.
+Everything here is called in the thread of the gateways' event loop.
 """
 
 from __future__ import annotations
@@ -11,69 +11,68 @@ from typing import NamedTuple, Protocol
 from router.table.model import Address
 
 HIGH_WATER = 256 * 1024
-"""Bytes that wait for a client from which on nothing more is to be written to it."""
+"""Bytes waiting for a client from which on nothing more is written to it."""
 
 LOW_WATER = 64 * 1024
-"""Bytes below which a client that was over HIGH_WATER is said to have drained."""
+"""Bytes below which a client that had reached HIGH_WATER is reported as drained."""
 
 
 class Frame(NamedTuple):
-    """One thing to send: a packet, or a document. `data` is what clients see, without the transport's own framing.
+    """One packet or document to send. `data` is what clients see, without the framing of the transport.
 
-    `born` is when it was made, in ns of the monotonic clock. A schema belongs to `type_name`, data to `topic`.
+    A schema belongs to `type_name` (and, in packets, to `topic`), data to `topic`.
     """
 
     data: bytes
     topic: str
     type_name: str
     is_schema: bool
-    born: int
 
 
 class Client(Protocol):
-    """One receiver. Hashable; `label` names it in the log."""
+    """One receiver. Hashable; `label` identifies it in the log."""
 
     @property
     def label(self) -> str: ...
 
     def write(self, frames: Sequence[Frame]) -> None:
-        """Takes all of them, whatever their size, and returns at once."""
+        """Accept all frames, whatever their size, without waiting."""
 
     def backlog(self) -> int:
-        """Bytes written that the kernel (or Zenoh) has not taken yet."""
+        """Return the number of bytes written that the kernel (or Zenoh) has not taken yet."""
 
     def close(self) -> None:
-        """Ends it at once; `left` follows."""
+        """Close the connection at once; `Events.left` follows."""
 
 
-class Ears(Protocol):
-    """Who hears what happens at a transport."""
+class Events(Protocol):
+    """Callbacks of a transport."""
 
     def joined(self, client: Client) -> None: ...
 
     def left(self, client: Client) -> None: ...
 
     def drained(self, client: Client) -> None:
-        """Its backlog is below LOW_WATER, after it was at HIGH_WATER or more."""
+        """The backlog fell below LOW_WATER after it had reached HIGH_WATER."""
 
     def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
-        """`arrived_ns` is wall-clock time."""
+        """A client sent one packet or document. `arrived_ns` is wall-clock time."""
 
     def refused(self, reason: str) -> None:
-        """Something came in that is not even looked at. `reason` is one of GATEWAY_REJECT_REASONS."""
+        """Input was discarded unread. `reason` is one of GATEWAY_REJECT_REASONS."""
 
     def failed(self, client: Client | None, error: Exception, lost: int) -> None:
-        """Sending or receiving failed; `lost` frames of it will not arrive."""
+        """Sending or receiving failed; `lost` frames will not arrive."""
 
     def contended(self) -> None:
-        """Another gateway was found that has this one's place in the network."""
+        """Another gateway owns, or claims, the same place in the network."""
 
     def snapshot(self) -> Sequence[Frame]:
-        """Schemas and latest values, for whoever asks for them; schemas first."""
+        """Return all schemas and latest values, schemas first."""
 
 
 class Transport(Protocol):
-    """A way to clients. `address` is the local one, None without one; `is_ready` tells whether clients can come."""
+    """A way to clients. `address` is the local one, if there is one; `is_ready` tells whether clients can come."""
 
     @property
     def address(self) -> Address | None: ...
@@ -82,10 +81,13 @@ class Transport(Protocol):
     def is_ready(self) -> bool: ...
 
     async def open(self) -> None:
-        """Raises StartError. A local address that this machine does not have yet is waited for in the background."""
+        """Open the sockets. A local address that this machine does not have yet is retried in the background.
+
+        Raises StartError.
+        """
 
     async def close(self) -> None:
-        """Ends everything; no client is left when it returns."""
+        """Close the sockets; all clients have left when this returns."""
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
-        """Writes the same to several clients of this transport, and makes its wire form only once."""
+        """Write the same frames to several clients of this transport; their wire form is made once."""

@@ -1,68 +1,156 @@
-"""What the TCP and websocket transports of a gateway have in common: a listener, and clients that may stand still.
-
-Knows no framing.
-"""
+"""What the TCP and websocket transports share: a listener with limits, and clients with a buffer each."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from contextlib import suppress
 from time import monotonic
+from typing import Any, NamedTuple, Union
 
 from router.gateway.transport.arrival import LoopClock
-from router.gateway.transport.base import Client, Ears, Frame
+from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import MOST_UNACCEPTED, Binding, listen_at
-from router.gateway.transport.memory import Trimmer
-from router.gateway.transport.outflow import STALLED_SECONDS, Encoded, Feeder, Outflow
-from router.gateway.transport.unfinished import MOST_UNFINISHED, UNFINISHED_SECONDS, Unfinished
 from router.log import FloodLog, logger
 from router.table.model import Address
 
-LOOK_SECONDS = 5.0
-"""Between looks for clients that stand still."""
+PIECE = 64 * 1024
+"""Bytes written to a connection at a time. Frames are shared by all clients; only one piece is copied for each."""
 
-OVERHEAD = 1 << 20
-"""Bytes beyond its own length that an unfinished message may take up."""
+UNSENT = 128 * 1024
+"""Bytes that the kernel keeps unsent for a client; what waits beyond that can still be superseded by newer values."""
+
+STALLED_SECONDS = 60.0
+"""The kernel closes the connection of a client that acknowledges or takes nothing for so long."""
+
+MESSAGE_SECONDS = 10.0
+"""Time a client has for one message, from its first byte to its last, and for the websocket handshake."""
+
+WATCH_SECONDS = 1.0
+"""Between two checks of that deadline."""
+
+READ_PER_TURN = 32
+"""Messages of one client that are handled before other work of the loop has its turn."""
 
 ACCEPTED_PER_TURN = 16
 """Connections that are accepted before other work of the loop has its turn."""
 
+Piece = Union[bytes, memoryview]
 
-class StreamClient(ABC):
-    """A Client that has an outflow. `encode` is its transport's."""
 
-    label: str
-    outflow: Outflow
-    encode: Callable[[Sequence[Frame]], Encoded]
+class Limits(NamedTuple):
+    """Clients in all, clients from one host, and bytes of one message from a client."""
+
+    clients: int
+    clients_per_host: int
+    message: int
+
+    def exceeded_by(self, host: str, hosts: Sequence[str]) -> str:
+        """Return the key of the limit that a connection of `host` beside those of `hosts` would exceed, or ""."""
+        if len(hosts) >= self.clients:
+            return "max_clients"
+        return "max_clients_per_host" if hosts.count(host) >= self.clients_per_host else ""
+
+
+class Encoded(NamedTuple):
+    """Frames in their wire form. Other data (pings) may be written between two pieces."""
+
+    pieces: Sequence[Piece]
+    size: int
+
+
+class StreamClient:
+    """A Client behind a connection. `drain` waits until the buffer of `connection` is empty.
+
+    `unfinished_since` is the monotonic time of the first byte of a message that is not complete.
+    """
+
+    def __init__(
+        self,
+        owner: StreamTransport,
+        connection: asyncio.Transport,
+        drain: Callable[[], Awaitable[None]],
+        is_open: Callable[[], bool] = lambda: True,
+    ) -> None:
+        peer = connection.get_extra_info("peername") or ("a client that has gone", 0)
+        self.host: str = peer[0]
+        self.label = f"{self.host}:{peer[1]}"
+        self.unfinished_since: float | None = None
+        self._owner = owner
+        self._connection = connection
+        self._drain = drain
+        self._is_open = is_open
+        self._pieces: deque[Piece] = deque()
+        self._waiting = 0
+        self._was_high = False
+        self._writing: asyncio.Task[None] | None = None
+        _configure(connection)
 
     def write(self, frames: Sequence[Frame]) -> None:
-        self.outflow.push(self.encode(frames))
+        self.push(self._owner.encode(frames))
+
+    def push(self, encoded: Encoded) -> None:
+        if not self.can_write():
+            return
+        self._pieces.extend(encoded.pieces)
+        self._waiting += encoded.size
+        if self._writing is None:
+            self._write_now()
+            if self.backlog():
+                self._writing = asyncio.get_running_loop().create_task(self._write_later())
+        self._was_high = self._was_high or self.backlog() >= HIGH_WATER
 
     def backlog(self) -> int:
-        return self.outflow.backlog()
+        return self._waiting + self._connection.get_write_buffer_size()
 
-    @abstractmethod
-    def close(self) -> None: ...
+    def can_write(self) -> bool:
+        return self._is_open() and not self._connection.is_closing()
+
+    def close(self) -> None:
+        self._connection.abort()
+
+    def _write_now(self) -> None:
+        """Write pieces, small ones together, until the kernel takes no more."""
+        while self._pieces and not self._connection.get_write_buffer_size():
+            batch = [self._pieces.popleft()]
+            size = len(batch[0])
+            while self._pieces and size + len(self._pieces[0]) <= PIECE:
+                size += len(self._pieces[0])
+                batch.append(self._pieces.popleft())
+            self._waiting -= size
+            self._connection.write(batch[0] if len(batch) == 1 else b"".join(batch))
+
+    async def _write_later(self) -> None:
+        try:
+            with suppress(OSError):  # the connection ended
+                while self.backlog():
+                    await self._drain()
+                    if not self.can_write():
+                        return
+                    self._write_now()
+                    if self._was_high and self.backlog() < LOW_WATER:
+                        self._was_high = False
+                        self._owner.events.drained(self)
+        finally:
+            self._writing = None
 
 
 class StreamTransport(ABC):
-    """Listens at `address`, and closes clients that stand still, or begin messages of up to `most` bytes in vain."""
+    """Listens at `address` and enforces `limits` and the deadline for a message."""
 
-    def __init__(self, address: Address, ears: Ears, max_clients: int, most: int) -> None:
+    def __init__(self, address: Address, events: Events, limits: Limits) -> None:
         self.address: Address | None = None
-        self._wanted = address
-        self.ears = ears
-        self.feeder = Feeder()
+        self.events = events
+        self.limits = limits
         self.clock = LoopClock()
-        self.trimmer = Trimmer()
-        self._max_clients = max_clients
+        self.is_closing = False
+        self._requested = address
         self._clients: set[StreamClient] = set()
-        self._unfinished: Unfinished[StreamClient] = Unfinished(max(MOST_UNFINISHED, most + OVERHEAD))
         self._binding = Binding("tcp", address, self._bind)
         self._watching: asyncio.TimerHandle | None = None
-        self.is_closing = False
         self._log = FloodLog()
 
     @property
@@ -71,23 +159,23 @@ class StreamTransport(ABC):
 
     async def open(self) -> None:
         await self._binding.open()
+        self.clock.start()
         self._watch()
 
     async def close(self) -> None:
-        self.is_closing = True  # who was accepted in this turn of the loop is told of later
+        self.is_closing = True  # connections that are being accepted are refused
         await self._binding.close()
         if self._watching is not None:
             self._watching.cancel()
         await self._stop()
         self.clock.stop()
-        self.trimmer.close()
         self._log.flush(final=True)
 
     def write_all(self, clients: Iterable[Client], frames: Sequence[Frame]) -> None:
         encoded = self.encode(frames)
         for client in clients:
-            assert isinstance(client, StreamClient)  # noqa: S101 - they came from here
-            client.outflow.push(encoded)
+            assert isinstance(client, StreamClient)  # noqa: S101 - a client of this transport
+            client.push(encoded)
 
     @abstractmethod
     def encode(self, frames: Sequence[Frame]) -> Encoded: ...
@@ -99,7 +187,7 @@ class StreamTransport(ABC):
     async def _stop(self) -> None: ...
 
     async def _bind(self) -> None:
-        listening = listen_at(self._wanted)
+        listening = listen_at(self._requested)
         try:
             await self._serve(listening)
         except BaseException:
@@ -108,56 +196,49 @@ class StreamTransport(ABC):
         listening.listen(MOST_UNACCEPTED)
         self.address = Address(*listening.getsockname())
 
-    def came(self, client: StreamClient) -> bool:
-        """Whether there is room for one more; if there is not, that is logged."""
+    def enter(self, client: StreamClient) -> str:
+        """Add a client and return "", or return (and log) why it is refused."""
         if self.is_closing:
-            return False
-        if len(self._clients) >= self._max_clients:
-            self._log.note("full", logger.warning, "a client was turned away: there are too many", client=client.label)
-            return False
+            return "the gateway closes"
+        if key := self.limits.exceeded_by(client.host, [each.host for each in self._clients]):
+            what = "a client was turned away: there are too many" + (" from its host" if "host" in key else "")
+            self._log.note(key, logger.warning, what, client=client.label, limit=key)
+            return what
         self._clients.add(client)
-        self.clock.start()
-        self.ears.joined(client)
-        return True
+        self.events.joined(client)
+        return ""
 
-    def went(self, client: StreamClient) -> None:
-        """Does nothing for one that was turned away."""
+    def leave(self, client: StreamClient) -> None:
+        """Remove a client; nothing happens for one that was refused."""
         if client in self._clients:
             self._clients.remove(client)
-            client.outflow.clear()
-            if not self._clients:
-                self.clock.stop()
-            self.ears.left(client)
+            self.events.left(client)
 
-    def holds(self, client: StreamClient, size: int) -> None:
-        """To be told whenever `client` has sent something; `size` of its bytes are no whole message yet."""
-        largest = self._unfinished.holds(client, size, monotonic())
-        if largest is not None:
-            self.ears.refused("too_large")
-            self._end_unfinished(largest, "a client was closed: too much was sent in messages that are not whole")
-
-    def holds_nothing(self, client: StreamClient) -> None:
-        """It has gone."""
-        self.trimmer.freed(self._unfinished.forget(client))
-
-    def _end_unfinished(self, client: StreamClient, what: str) -> None:
-        self._log.note(what, logger.warning, what, client=client.label)
-        self.trimmer.freed(MOST_UNFINISHED)  # there may be many, with little each
+    def close_client(self, client: StreamClient, what: str, **details: Any) -> None:
+        """Log why a client is closed, and close it."""
+        self._log.note(what, logger.warning, what, client=client.label, **details)
         client.close()
 
+    def stalled(self, client: StreamClient) -> None:
+        """The kernel closed the connection of a client that took nothing."""
+        self.close_client(client, "a client was closed: send stalled", seconds=STALLED_SECONDS)
+
     def _watch(self) -> None:
-        now = monotonic()
-        for client in self._unfinished.silent(now):
-            self._end_unfinished(client, f"a client was closed: it did not end a message for {UNFINISHED_SECONDS:g} s")
-        for client in [each for each in self._clients if each.outflow.is_stalled(now)]:
-            self._log.note(
-                "stalled",
-                logger.warning,
-                "a client was closed: send stalled",
-                client=client.label,
-                seconds=STALLED_SECONDS,
-                waiting=client.backlog(),
-            )
-            client.close()
+        begun_before = monotonic() - MESSAGE_SECONDS
+        for client in self._clients:
+            if client.unfinished_since is not None and client.unfinished_since < begun_before:
+                self.close_client(client, f"a client was closed: it did not end a message within {MESSAGE_SECONDS:g} s")
         self._log.flush()
-        self._watching = asyncio.get_running_loop().call_later(LOOK_SECONDS, self._watch)
+        self._watching = asyncio.get_running_loop().call_later(WATCH_SECONDS, self._watch)
+
+
+def _configure(connection: asyncio.Transport) -> None:
+    connection.set_write_buffer_limits(0)  # `drain` waits for an empty buffer
+    opened: socket.socket = connection.get_extra_info("socket")
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
+    # Detect a computer that disappeared, whether something is being sent to it or not, and a client that takes nothing.
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 20)
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10)
+    opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(STALLED_SECONDS * 1000))

@@ -1,39 +1,47 @@
-"""A gateway's TCP clients: length-prefixed packets or lines, both ways. Knows nothing of what they say."""
+"""A gateway's TCP clients: length-prefixed packets or lines, both ways."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
+import struct
 from collections.abc import Sequence
+from time import monotonic
 
-from router.gateway.transport.arrival import Arrivals
-from router.gateway.transport.base import Ears, Frame
-from router.gateway.transport.outflow import PIECE, Encoded, Outflow, Piece, label, prepare
-from router.gateway.transport.splitting import LENGTH, Lines, Packets, Splitter, TooLongError
-from router.gateway.transport.stream import ACCEPTED_PER_TURN, StreamClient, StreamTransport
-from router.log import logger
+from router.gateway.transport.base import Events, Frame
+from router.gateway.transport.stream import (
+    ACCEPTED_PER_TURN,
+    PIECE,
+    READ_PER_TURN,
+    Encoded,
+    Limits,
+    Piece,
+    StreamClient,
+    StreamTransport,
+)
 from router.table.model import Address
 
-READ_AT_ONCE = 16 * 1024
-TAKEN_PER_TURN = 32
-"""Packets or lines of a client that are handed on before other work of the loop has its turn."""
+LENGTH = struct.Struct("<I")
+"""Precedes each packet."""
+
+
+class TooLongError(ValueError):
+    """A packet or line exceeds the limit."""
 
 
 class TcpTransport(StreamTransport):
-    """`prefixed`: each packet preceded by its length, u32 little-endian; otherwise one line each.
+    """`prefixed`: each packet is preceded by its length, u32 little-endian; otherwise a packet is a line.
 
-    `most` bounds in bytes what a client may send as one; who sends more is closed.
+    A client that sends a longer message than the limit is closed.
     """
 
-    def __init__(self, address: Address, ears: Ears, prefixed: bool, max_clients: int, most: int) -> None:
-        super().__init__(address, ears, max_clients, most)
+    def __init__(self, address: Address, events: Events, limits: Limits, *, prefixed: bool) -> None:
+        super().__init__(address, events, limits)
         self._prefixed = prefixed
-        self._most = most
         self._server: asyncio.Server | None = None
-        self._inbox = memoryview(bytearray(READ_AT_ONCE))  # one for all: what is in it is taken at once
 
     def encode(self, frames: Sequence[Frame]) -> Encoded:
-        """Small frames are copied together; a large one is only looked at, piece by piece."""
+        """Copy small frames together; a large one becomes views of its pieces."""
         pieces: list[Piece] = []
         small: list[bytes] = []
         small_bytes = size = 0
@@ -56,92 +64,62 @@ class TcpTransport(StreamTransport):
         return Encoded([piece for piece in pieces if piece], size)
 
     async def _serve(self, listening: socket.socket) -> None:
-        make, loop = self._connection, asyncio.get_running_loop()
-        self._server = await loop.create_server(make, sock=listening, backlog=ACCEPTED_PER_TURN)
+        limit = self.limits.message - 1  # of a line without its first byte
+        self._server = await asyncio.start_server(
+            self._serve_client, sock=listening, backlog=ACCEPTED_PER_TURN, limit=limit
+        )
 
     async def _stop(self) -> None:
         if self._server is not None:
             self._server.close()
-        for client in list(self._clients):
+        for client in self._clients:
             client.close()
-        while self._clients:  # each is told in a turn of the loop of its own
+        while self._clients:  # each leaves in a turn of the loop of its own
             await asyncio.sleep(0)
 
-    def _connection(self) -> _TcpClient:
-        return _TcpClient(self, self._inbox, Packets(self._most) if self._prefixed else Lines(self._most))
+    async def _serve_client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        client = StreamClient(self, writer.transport, writer.drain)  # type: ignore[arg-type]  # a server's transport
+        try:
+            if not self.enter(client):
+                await self._read(client, reader)
+        except TooLongError as error:  # where the next message begins is unknown
+            self.events.refused("too_large")
+            self.close_client(client, "a client was closed", why=str(error))
+        except TimeoutError:
+            self.stalled(client)
+        except (asyncio.IncompleteReadError, OSError):
+            pass  # the client left
+        except Exception as error:  # noqa: BLE001 - a fault of the router, reported; it ends this client alone
+            what = {"message": "a fault in the router itself ended a TCP connection", "exception": error}
+            asyncio.get_running_loop().call_exception_handler(what)
+        finally:
+            client.close()
+            self.leave(client)
 
-    def too_long(self, client: _TcpClient, error: TooLongError) -> None:
-        """What it sends can no longer be told apart."""
-        self.ears.refused("too_large")
-        self._log.note("too_long", logger.warning, "a client was closed", client=client.label, why=str(error))
-        client.close()
+    async def _read(self, client: StreamClient, reader: asyncio.StreamReader) -> None:
+        read_rest = self._read_packet if self._prefixed else self._read_line
+        while True:
+            for _ in range(READ_PER_TURN):
+                first = await reader.readexactly(1)
+                client.unfinished_since = monotonic()
+                data = await read_rest(reader, first)
+                client.unfinished_since = None
+                if not client.can_write():  # it was closed, and what came before that is discarded
+                    return
+                self.events.received(client, data, self.clock.stamp())
+            await asyncio.sleep(0)
 
+    async def _read_packet(self, reader: asyncio.StreamReader, first: bytes) -> bytes:
+        (length,) = LENGTH.unpack(first + await reader.readexactly(LENGTH.size - 1))
+        if length > self.limits.message:
+            raise TooLongError(f"a packet of {length} bytes, and at most {self.limits.message} are taken")
+        return await reader.readexactly(length)
 
-class _TcpClient(asyncio.BufferedProtocol, StreamClient):
-    def __init__(self, owner: TcpTransport, inbox: memoryview, incoming: Splitter) -> None:
-        self.encode = owner.encode
-        self._owner = owner
-        self._inbox = inbox
-        self._incoming = incoming
-        self._loop = asyncio.get_running_loop()
-
-    def close(self) -> None:
-        self._transport.abort()
-
-    # -- what asyncio calls --------------------------------------------------------------------------------------
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)  # noqa: S101 - what a server's are
-        self._transport = transport
-        self._arrivals = Arrivals(self._owner.clock, transport.get_extra_info("socket"))
-        self.label = label(transport)
-        prepare(transport)
-        self.outflow = Outflow(transport, self._owner.feeder, lambda: True, self._drained)
-        if not self._owner.came(self):
-            transport.abort()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._incoming.clear()
-        self._owner.holds_nothing(self)
-        self._owner.went(self)
-
-    def pause_writing(self) -> None:
-        self.outflow.paused()
-
-    def resume_writing(self) -> None:
-        self.outflow.resumed()
-
-    def get_buffer(self, sizehint: int) -> memoryview:
-        return self._inbox
-
-    def buffer_updated(self, nbytes: int) -> None:
-        self._arrived = self._arrivals.stamp(is_all=nbytes < READ_AT_ONCE)
-        self._incoming.feed(self._inbox[:nbytes])
-        self._take()
-
-    def eof_received(self) -> None:
-        self.close()  # one that only sends, and wants no answer, has sent all
-
-    # ------------------------------------------------------------------------------------------------------------
-
-    def _take(self) -> None:
-        """Hands on what is complete; who sends much waits until others had their turn."""
-        for _ in range(TAKEN_PER_TURN):
-            if self._transport.is_closing():
-                return
-            try:
-                one = self._incoming.take()
-            except TooLongError as error:
-                self._owner.too_long(self, error)
-                return
-            if one is None:
-                self._owner.holds(self, len(self._incoming))
-                self._transport.resume_reading()
-                return
-            self._owner.ears.received(self, one, self._arrived)
-            self._owner.trimmer.freed(len(one))
-        self._transport.pause_reading()
-        self._loop.call_soon(self._take)
-
-    def _drained(self) -> None:
-        self._owner.ears.drained(self)
+    async def _read_line(self, reader: asyncio.StreamReader, first: bytes) -> bytes:
+        if first == b"\n":
+            return b""
+        try:
+            line = first + await reader.readuntil(b"\n")
+        except asyncio.LimitOverrunError:
+            raise TooLongError(f"a line of more than {self.limits.message} bytes") from None
+        return line[:-1].removesuffix(b"\r")

@@ -10,7 +10,7 @@ import socket
 from collections import deque
 from collections.abc import Iterable, Sequence
 
-from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Ears, Frame
+from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import Binding
 from router.net.kernel import arrivals, ask_for_receive_buffer, drops
 from router.table.model import Address
@@ -37,11 +37,11 @@ class UdpTransport:
     `most` bounds what is received, in bytes.
     """
 
-    def __init__(self, remote: Address, local: Address | None, ears: Ears, most: int = LARGEST_DATAGRAM) -> None:
+    def __init__(self, remote: Address, local: Address | None, events: Events, most: int = LARGEST_DATAGRAM) -> None:
         self.address: Address | None = None
         self._remote = remote
         self._local = local
-        self._ears = ears
+        self._events = events
         self._most = most
         self._binding = Binding("udp", local or Address("0.0.0.0", 0), self._bind)
         self._client: UdpClient | None = None
@@ -90,10 +90,10 @@ class UdpTransport:
             raise
         self._socket = opened
         self.address = Address(*opened.getsockname())
-        self._client = UdpClient(opened, self._remote, self._ears)
+        self._client = UdpClient(opened, self._remote, self._events)
         if self._local is not None:
             asyncio.get_running_loop().add_reader(opened, self._receive, opened, self._client)
-        self._ears.joined(self._client)
+        self._events.joined(self._client)
 
     def _receive(self, opened: socket.socket, client: UdpClient) -> None:
         for _ in range(RECEIVED_PER_TURN):
@@ -102,24 +102,24 @@ class UdpTransport:
             except BlockingIOError:
                 return
             except OSError as error:
-                self._ears.failed(client, error, 0)
+                self._events.failed(client, error, 0)
                 return
             if sender[0] != self._remote.host:
-                self._ears.refused("source_mismatch")
+                self._events.refused("source_mismatch")
             elif len(data) > self._most:
-                self._ears.refused("too_large")
+                self._events.refused("too_large")
             else:
-                self._ears.received(client, data, self._arrived_at())
+                self._events.received(client, data, self._arrived_at())
 
 
 class UdpClient:
     """Whoever hears at the remote address. Each frame is one datagram; bursts are paced."""
 
-    def __init__(self, opened: socket.socket, remote: Address, ears: Ears) -> None:
+    def __init__(self, opened: socket.socket, remote: Address, events: Events) -> None:
         self.label = str(remote)
         self._send = opened.sendto
         self._remote = remote
-        self._ears = ears
+        self._events = events
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[bytes] = deque()
         self._backlog = 0
@@ -150,7 +150,7 @@ class UdpClient:
         self._backlog = 0
         if self._resume is not None:
             self._resume.cancel()
-        self._ears.left(self)
+        self._events.left(self)
 
     def _send_burst(self) -> None:
         """Sends what may be sent now, and the rest later. Of errors, the last one stands for all of the burst."""
@@ -175,11 +175,11 @@ class UdpClient:
         if self._waiting:
             self._resume = self._loop.call_at(self._burst_ends, self._send_burst)
         if failure is not None:
-            self._ears.failed(self, failure, lost)
+            self._events.failed(self, failure, lost)
         if self._was_high and self._backlog < LOW_WATER:
             self._was_high = False
             self._loop.call_soon(self._tell_drained)
 
     def _tell_drained(self) -> None:
         if self._is_open:
-            self._ears.drained(self)
+            self._events.drained(self)

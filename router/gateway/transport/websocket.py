@@ -1,76 +1,88 @@
-"""A gateway's websocket clients, and the page that it shows in a browser. Knows nothing of what messages say."""
+"""A gateway's websocket clients, and the page that the same port serves to browsers."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import socket
 from collections.abc import Sequence
+from functools import partial
+from http import HTTPStatus
+from time import monotonic
 from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode, Opcode
-from websockets.frames import Frame as Part
+from websockets.frames import Frame as WebsocketFrame
+from websockets.http11 import Request, Response
 from websockets.protocol import State
 
-from router.gateway.transport.base import Ears, Frame
-from router.gateway.transport.http import Page
-from router.gateway.transport.outflow import PIECE, Encoded
-from router.gateway.transport.stream import ACCEPTED_PER_TURN, StreamTransport
-from router.gateway.transport.websocket_connection import WebsocketConnection
+from router.assets import page_policy
+from router.gateway.transport.base import HIGH_WATER, Events, Frame
+from router.gateway.transport.stream import (
+    ACCEPTED_PER_TURN,
+    MESSAGE_SECONDS,
+    PIECE,
+    READ_PER_TURN,
+    Encoded,
+    Limits,
+    StreamClient,
+    StreamTransport,
+)
 from router.log import logger
 from router.table.model import Address
 
 PING_SECONDS = 20.0
-"""How often a client is asked whether it is there, and how long it may take to answer."""
+"""Interval of pings, and the time a client has to answer one."""
 
 CLOSING_SECONDS = 1.0
-"""How long clients have to say goodbye."""
+"""Time for the closing handshake."""
 
-TAKEN_PER_TURN = 32
-"""Messages of a client that are handed on before other work of the loop has its turn."""
+READ_AT_ONCE = 16 * 1024
+"""Bytes of a client that are read, and parsed by the library, in one turn of the loop."""
 
-STRANGERS = 64
-"""Connections beyond `max_clients` that may be without a websocket: they fetch the page, or are about to ask."""
+STRANGERS, STRANGERS_PER_HOST = 64, 8
+"""Connections beyond the limits that may be open without a websocket: they fetch the page, or shake hands."""
 
 
 class WebsocketTransport(StreamTransport):
-    """`text`: the frames of one writing are one text message, joined by newlines; otherwise each is a binary message.
+    """`text`: the frames of one `write` are one text message, joined by newlines; otherwise each is a binary message.
 
-    `most` bounds in bytes what a client may send as one; who sends more is closed. `page` is HTML.
+    A client that sends a longer message than the limit is closed. `page` is HTML.
     """
 
-    def __init__(self, address: Address, ears: Ears, text: bool, max_clients: int, most: int, page: bytes) -> None:
-        super().__init__(address, ears, max_clients, most)
+    def __init__(self, address: Address, events: Events, limits: Limits, *, text: bool, page: bytes) -> None:
+        super().__init__(address, events, limits)
         self._text = text
-        self._most = most
         self._page = Page(page)
         self._server: Server | None = None
-        self._connections: set[WebsocketConnection] = set()
-        self._strangers: dict[WebsocketConnection, None] = {}  # in the order in which they came
+        self._connections: set[Connection] = set()
 
     def encode(self, frames: Sequence[Frame]) -> Encoded:
         messages = [frame.data for frame in frames]
         if self._text:
             messages = [b"\n".join(messages)] if messages else []
         opcode = Opcode.TEXT if self._text else Opcode.BINARY
-        parts = [part for message in messages for part in _parts(opcode, message)]
-        return Encoded(parts, sum(map(len, parts)))
+        pieces = [piece for message in messages for piece in _serialized(opcode, message)]
+        return Encoded(pieces, sum(map(len, pieces)))
 
     async def _serve(self, listening: socket.socket) -> None:
         self._server = await serve(
             self._serve_client,
             sock=listening,
             backlog=ACCEPTED_PER_TURN,
-            create_connection=self._connection,  # type: ignore[arg-type]  # anything that makes one will do
+            create_connection=partial(Connection, owner=self),  # type: ignore[arg-type]  # a factory does as well
             process_request=self._page.answer,
             compression=None,
             server_header=None,
+            open_timeout=MESSAGE_SECONDS,
             ping_interval=PING_SECONDS,
             ping_timeout=PING_SECONDS,
             close_timeout=CLOSING_SECONDS,
-            max_size=self._most,
+            max_size=self.limits.message,
             write_limit=0,
             logger=_LOG,
         )
@@ -79,69 +91,142 @@ class WebsocketTransport(StreamTransport):
         if self._server is None:
             return
         self._server.close()
-        for connection in list(self._connections):
-            if connection.protocol.state is State.CONNECTING or connection.client.backlog():
-                connection.transport.abort()
+        for connection in self._connections:
+            if connection.state is State.CONNECTING or connection.client.backlog():
+                connection.client.close()
         await self._server.wait_closed()
 
-    def _connection(self, *args: Any, **settings: Any) -> WebsocketConnection:
-        """Called by the library for each connection, with what a ServerConnection is made of."""
-        connection = WebsocketConnection(*args, **settings)
-        connection.owner = self
-        return connection
-
-    def connected(self, connection: WebsocketConnection) -> None:
-        """Where there is no room, that stranger gives way who has had most time to ask."""
+    def connected(self, connection: Connection) -> None:
+        """Called for each TCP connection, before its handshake."""
+        hosts = [each.client.host for each in self._connections]
+        limits = Limits(self.limits.clients + STRANGERS, self.limits.clients_per_host + STRANGERS_PER_HOST, 0)
         self._connections.add(connection)
-        self._strangers[connection] = None
-        if self.is_closing:
-            connection.transport.abort()
-        elif len(self._connections) > self._max_clients + STRANGERS:
-            oldest = next(iter(self._strangers))
-            del self._strangers[oldest]
-            oldest.transport.abort()
+        if self.is_closing or limits.exceeded_by(connection.client.host, hosts):
+            connection.client.close()
 
-    def disconnected(self, connection: WebsocketConnection) -> None:
+    def disconnected(self, connection: Connection, error: Exception | None) -> None:
         self._connections.discard(connection)
-        self._strangers.pop(connection, None)
-        self.holds_nothing(connection.client)
+        if isinstance(error, TimeoutError):
+            self.stalled(connection.client)
 
     async def _serve_client(self, connection: ServerConnection) -> None:
-        assert isinstance(connection, WebsocketConnection)  # noqa: S101 - they come from here
+        """Handle one websocket after its handshake."""
+        assert isinstance(connection, Connection)  # noqa: S101 - see `create_connection`
         client = connection.client
-        self._strangers.pop(connection, None)
-        self.holds(client, connection.unfinished())  # no greeting any more
         try:
-            if self.came(client):
-                await self._hear(connection)
+            if refused := self.enter(client):
+                await connection.close(CloseCode.TRY_AGAIN_LATER, refused)
             else:
-                await connection.close(CloseCode.TRY_AGAIN_LATER, "there are too many clients")
+                await self._read(connection)
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == CloseCode.MESSAGE_TOO_BIG:
-                self.ears.refused("too_large")
-        except Exception as error:  # noqa: BLE001 - a fault of the router, told loudly, where the library would hide it
+                self.events.refused("too_large")
+        except Exception as error:  # noqa: BLE001 - a fault of the router, which the library would only log
             what = {"message": "a fault in the router itself ended a websocket", "exception": error}
             asyncio.get_running_loop().call_exception_handler(what)
         finally:
-            self.went(client)
+            self.leave(client)
 
-    async def _hear(self, connection: WebsocketConnection) -> None:
+    async def _read(self, connection: Connection) -> None:
         """Raises ConnectionClosed in the end."""
+        client = connection.client
         while True:
-            for _ in range(TAKEN_PER_TURN):
+            for _ in range(READ_PER_TURN):
                 data = await connection.recv(decode=False)
-                self.ears.received(connection.client, data, connection.arrived.popleft())
-                self.trimmer.freed(len(data))
+                if client.unfinished_since is not None:  # by the next message
+                    client.unfinished_since = monotonic()
+                self.events.received(client, data, self.clock.stamp())
             await asyncio.sleep(0)
 
 
-def _parts(opcode: Opcode, message: bytes) -> list[bytes]:
-    """A message as websocket frames; one that is large as several, between which other work and pings have a turn."""
+class Connection(ServerConnection):
+    """The library's connection, which is also counted before the handshake and notes unfinished messages."""
+
+    client: StreamClient
+
+    def __init__(self, *args: Any, owner: WebsocketTransport, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self._owner = owner
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self.transport.max_size = READ_AT_ONCE  # type: ignore[attr-defined]  # asyncio's, but not in its interface
+        self.client = StreamClient(self._owner, self.transport, self.drain, lambda: self.state is State.OPEN)
+        self._owner.connected(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._owner.disconnected(self, exc)
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if not self.protocol.reader.buffer and self.protocol.current_size is None:
+            self.client.unfinished_since = None
+        elif self.client.unfinished_since is None:
+            self.client.unfinished_since = monotonic()
+        if self.transport.get_write_buffer_size() > HIGH_WATER:  # pings without end, whose answers are not read
+            self.client.close()
+
+
+class Page:
+    """HTTP answers of the websocket port: one page, which loads nothing from elsewhere."""
+
+    _HOST = re.compile(r"[A-Za-z0-9.:\[\]-]+")
+
+    def __init__(self, html: bytes) -> None:
+        self._html = html
+        self._policy = page_policy(html)
+
+    def answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the answer to a request; None goes on to a websocket."""
+        if any(value.lower() == "websocket" for value in request.headers.get_all("Upgrade")):
+            if _is_from_elsewhere(request.headers):
+                return connection.respond(
+                    HTTPStatus.FORBIDDEN,
+                    "a page of another host may not connect; open the page by this computer's address\n",
+                )
+            return None
+        if request.path.partition("?")[0] != "/":
+            return connection.respond(HTTPStatus.NOT_FOUND, "there is one page: /\n")
+        return Response(HTTPStatus.OK, "OK", self._headers(request.headers), self._html)
+
+    def _headers(self, request: Headers) -> Headers:
+        host = self._HOST.fullmatch("".join(request.get_all("Host")))
+        # Older browsers do not take websockets of the same host for 'self'.
+        sockets = f" ws://{host.group()} wss://{host.group()}" if host else ""
+        return Headers(
+            {
+                "Content-Type": "text/html; charset=utf-8",
+                "Content-Length": str(len(self._html)),
+                "Cache-Control": "no-store",
+                "Content-Security-Policy": f"{self._policy}; connect-src 'self'{sockets}",
+                "X-Content-Type-Options": "nosniff",
+                "Connection": "close",
+            }
+        )
+
+
+_LOCAL = re.compile(r"([0-9.]+|\[[0-9a-f:]+\]|[a-z0-9-]+|[a-z0-9.-]+\.(local|lan|internal|home\.arpa))(:[0-9]+)?")
+"""Addresses, and names that nobody can register for the whole internet."""
+
+
+def _is_from_elsewhere(headers: Headers) -> bool:
+    """Return whether a page of another host asks: any page that is open in a browser could publish.
+
+    A name that anybody can register may have been made to lead here after its page was loaded (DNS rebinding).
+    """
+    hosts = [host.lower() for host in headers.get_all("Host")]
+    origins = [origin.lower().partition("://")[2] for origin in headers.get_all("Origin")]
+    return any([origin] != hosts or not _LOCAL.fullmatch(origin) for origin in origins)
+
+
+def _serialized(opcode: Opcode, message: bytes) -> list[bytes]:
+    """Return a message as websocket frames; a large one as several, so that pings can pass between them."""
     if len(message) <= PIECE:
-        return [Part(opcode, message).serialize(mask=False)]
+        return [WebsocketFrame(opcode, message).serialize(mask=False)]
     whole = memoryview(message)
     return [
-        Part(
+        WebsocketFrame(
             Opcode.CONT if start else opcode, whole[start : start + PIECE], fin=start + PIECE >= len(message)
         ).serialize(mask=False)
         for start in range(0, len(message), PIECE)
@@ -151,11 +236,11 @@ def _parts(opcode: Opcode, message: bytes) -> list[bytes]:
 class _DebugLog(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         why = record.exc_info[1] if record.exc_info else None
-        logger.debug("websockets says", what=record.getMessage(), why=repr(why))
+        logger.debug("websockets library", what=record.getMessage(), why=repr(why))
 
 
 _LOG = logging.getLogger("router.websocket")
-"""Where the library tells who broke the rules of HTTP or left in the middle: seldom of use to an operator."""
+"""The library logs clients that break the rules of HTTP or leave in the middle, which seldom helps an operator."""
 _LOG.setLevel(logging.WARNING)
 _LOG.propagate = False
 _LOG.addHandler(_DebugLog())

@@ -1,25 +1,34 @@
-"""A gateway in a Zenoh network: puts frames under keys, hears what is put under KEY/inbound, answers late joiners.
+"""A gateway in a Zenoh network: puts frames under keys, receives what is put under KEY/inbound, answers late joiners.
 
-Zenoh may wait in each call and calls from threads of its own: all of it is done in threads beside the loop.
-Knows no packet or document.
+Any call of Zenoh may block, and its callbacks come from its own threads: all calls are made in threads beside the loop.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Sequence
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
-from typing import Protocol
+from typing import NamedTuple, Union
 
 import zenoh
 
-from router.errors import StartError
-from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Ears, Frame
+from router.errors import StartError, TransportError
+from router.gateway.transport.arrival import LoopClock
+from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import RETRY_SECONDS
-from router.gateway.transport.zenoh_config import session_config, short, why_in_vain
-from router.gateway.transport.zenoh_inbox import Inbox, Queries
-from router.gateway.transport.zenoh_owner import Owner, all_tokens, owner_of, owners, this_owner
-from router.gateway.transport.zenoh_puts import Lost, Putter, key_of
+from router.gateway.transport.zenoh_session import (
+    Owner,
+    all_tokens,
+    owner_of,
+    owners,
+    permanent,
+    session_config,
+    short,
+    this_owner,
+)
 from router.log import logger
 from router.table.model import Address, ZenohSettings
 from router.threads.daemon_thread import DaemonThread
@@ -31,41 +40,51 @@ CLOSING_SECONDS = 2.0
 """How long a session has to end."""
 
 PAUSE_SECONDS = 0.2
-"""Between two times that it begins or gives up, however often others come and go."""
+"""Between two changes of the key's owner, however often others come and go."""
 
 LOOK_AGAIN_SECONDS = 2.0
-"""While it waits for the key: in case that it was not heard how the last other one went."""
+"""Between two looks for the owner while waiting for the key, in case its going was not received."""
 
 MOST_OTHERS = 100
-"""Others of its key that a gateway remembers."""
+"""Other owners of its key that a gateway remembers."""
 
+RECEIVED_PER_TURN = 32
+"""Samples that are handed on before other work of the loop has its turn."""
 
-class _Declared(Protocol):
-    def undeclare(self) -> None: ...
+MOST_RECEIVED = 1000
+MOST_RECEIVED_BYTES = 64 << 20
+"""Samples, and their bytes, that wait to be handed on; others are refused."""
+
+MOST_QUERIES = 100
+"""Queries that wait for answers, each of which may be large."""
+
+LARGE = 64 * 1024
+"""Bytes from which on a put can take long."""
+
+Declared = Union[zenoh.LivelinessToken, "zenoh.Subscriber[None]", "zenoh.Queryable[None]"]
 
 
 class ZenohTransport:
-    """Its one client is the network, from when the session is open and the key is free. `most` bounds in bytes what
-    is received as one.
+    """Its one client is the network, from when the session is open and the key is free.
 
-    Where the table names locators, they are all that is connected; only without any, others are looked for by
-    multicast.
+    `most` bounds in bytes what is received as one. Where the table names locators, only those are connected; without
+    any, others are found by multicast.
     """
 
-    def __init__(self, settings: ZenohSettings, ears: Ears, most: int = MOST) -> None:
+    def __init__(self, settings: ZenohSettings, events: Events, most: int = MOST) -> None:
         self.address: Address | None = None
         self._settings = settings
-        self._ears = ears
+        self._events = events
         self._most = most
         self._key = settings.key.value
         self._session: zenoh.Session | None = None
         self._client: ZenohClient | None = None
-        self._owner: Owner | None = None
+        self._owner: Owner | None = None  # this gateway, while it owns the key
         self._others: set[Owner] = set()
-        self._met: set[Owner] = set()
-        self._told: set[Owner] = set()
+        self._met: set[Owner] = set()  # since they were last reported
+        self._reported: set[Owner] = set()
         self._others_changed = asyncio.Event()
-        self._declared: list[_Declared] = []
+        self._declared: list[Declared] = []
         self._session_thread = DaemonThread("zenoh session")
         self._answering = DaemonThread("zenoh answers")
         self._is_closed = False
@@ -81,7 +100,7 @@ class ZenohTransport:
         try:
             await self._connect(config)
         except zenoh.ZError as error:
-            if why := why_in_vain(self._settings, str(error)):
+            if why := permanent(self._settings, str(error)):
                 await self.close()
                 raise StartError(why) from None  # the library's error may quote passwords
             logger.warning("Zenoh cannot be reached yet: trying each second", key=self._key, why=short(error))
@@ -114,10 +133,10 @@ class ZenohTransport:
         """Raises ZError."""
         self._session = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
         if self._session is not None:
-            self._tasks.append(self._loop.create_task(self._mind(self._session)))
+            self._tasks.append(self._loop.create_task(self._mind_key(self._session)))
 
     def _open_session(self, config: zenoh.Config) -> zenoh.Session | None:
-        """In its thread. Raises ZError. None when nobody wants it any more."""
+        """Runs in the session's thread. Raises ZError. Returns None when the transport was closed meanwhile."""
         session = zenoh.open(config)
         if self._is_closed:
             session.close()  # type: ignore[no-untyped-call]  # as Zenoh's stubs have it
@@ -134,9 +153,9 @@ class ZenohTransport:
             else:
                 logger.info("Zenoh is reached", key=self._key)
 
-    # -- who has the key -----------------------------------------------------------------------------------------
+    # -- the owner of the key ------------------------------------------------------------------------------------
 
-    def _heard_of(self, owner: Owner, is_there: bool) -> None:
+    def _on_token(self, owner: Owner, is_there: bool) -> None:
         if not is_there:
             self._others.discard(owner)
         elif len(self._others | self._met) < MOST_OTHERS:
@@ -147,8 +166,8 @@ class ZenohTransport:
         self._others |= others
         self._met |= others
 
-    async def _mind(self, session: zenoh.Session) -> None:
-        """Asks who has the key, and has `_settle` follow what is heard. While it waits for the key, it asks again."""
+    async def _mind_key(self, session: zenoh.Session) -> None:
+        """Look for owners, then settle who owns the key at each change; look again while waiting for it."""
         look = self._watch
         while True:
             try:
@@ -161,49 +180,52 @@ class ZenohTransport:
                 self._others_changed.clear()
                 await self._settle(session)
             except zenoh.ZError as error:
-                self._ears.failed(None, error, 0)
+                self._events.failed(None, error, 0)
             await asyncio.sleep(PAUSE_SECONDS)
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._others_changed.wait(), None if self._client else LOOK_AGAIN_SECONDS)
 
     def _watch(self, session: zenoh.Session) -> set[Owner] | None:
-        """In the session's thread: looks, and has `_heard_of` told of what changes afterwards. Raises ZError."""
+        """Look for owners and subscribe to changes. Runs in the session's thread. Raises ZError."""
         own = str(session.zid())
 
-        def hear(sample: zenoh.Sample) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
             owner = owner_of(sample.key_expr)
             if owner is not None and owner.session != own:
                 is_there = sample.kind == zenoh.SampleKind.PUT
-                self._loop.call_soon_threadsafe(self._heard_of, owner, is_there)
+                self._loop.call_soon_threadsafe(self._on_token, owner, is_there)
 
-        others = self._look(session)  # first: beside a subscriber Zenoh answers from what that has heard until then
-        session.liveliness().declare_subscriber(all_tokens(self._key), hear, history=True)
+        others = self._look(session)  # first: beside a subscriber Zenoh answers from what that has received until then
+        session.liveliness().declare_subscriber(all_tokens(self._key), on_sample, history=True)
         return others
 
     def _look(self, session: zenoh.Session) -> set[Owner] | None:
-        """In the session's thread. Raises ZError."""
+        """Runs in the session's thread. Raises ZError."""
         return owners(session, self._key)
 
     async def _settle(self, session: zenoh.Session) -> None:
-        """Takes the key when nobody has it, gives it up to one that had it before, tells of others. Raises ZError."""
+        """Take the key when it is free, give it up to an earlier owner, report other owners. Raises ZError."""
         first = min(self._others, default=None)
         if self._owner is None and first is None:
             first = await self._take(session)
         has_to_wait = first is not None and (self._owner is None or first < self._owner)
         if self._owner is not None and has_to_wait:
             await self._give_up()
-        if untold := self._met - self._told:
+        if new := self._met - self._reported:
             what = "this gateway waits until it is free" if has_to_wait else "that came later, and has to give way"
-            logger.error(f"another gateway has the Zenoh key: {what}", key=self._key, other=str(min(untold)))
-            self._ears.contended()
-        elif self._told and not self._others:
+            logger.error(f"another gateway has the Zenoh key: {what}", key=self._key, other=str(min(new)))
+            self._events.contended()
+        elif self._reported and not self._others:
             logger.info("no other gateway has the Zenoh key any more", key=self._key)
-        self._told = set(self._others)
+        self._reported = set(self._others)
         self._met.clear()
 
     async def _take(self, session: zenoh.Session) -> Owner | None:
-        """Takes the key, and serves unless another took it in the same moment and was first. Raises ZError."""
-        self._inbox = Inbox(self._ears, self._most)
+        """Take the key, and serve unless another gateway took it in the same moment and was first.
+
+        Returns the first of the other owners. Raises ZError.
+        """
+        self._inbox = Inbox(self._events, self._most)
         self._queries = Queries(self._answer)
         owner = this_owner(session)
         others = await self._loop.run_in_executor(self._session_thread, self._declare, session, owner)
@@ -212,22 +234,22 @@ class ZenohTransport:
         first = min(self._others, default=owner)
         if first < owner:
             return first
-        self._client = ZenohClient(self._key, Putter(session, self._key), self._ears)
-        self._ears.joined(self._client)
+        self._client = ZenohClient(self._key, Putter(session, self._key), self._events)
+        self._events.joined(self._client)
         self._inbox.start(self._client)
         return min(self._others, default=None)
 
     def _declare(self, session: zenoh.Session, owner: Owner) -> set[Owner]:
-        """In the session's thread: returns who else has the key. Raises ZError."""
+        """Return who else owns the key. Runs in the session's thread. Raises ZError."""
         self._declared = [
             session.liveliness().declare_token(owner.token(self._key)),
-            session.declare_subscriber(f"{self._key}/inbound/**", self._inbox.hear),
-            session.declare_queryable(f"{self._key}/**", self._queries.hear),
+            session.declare_subscriber(f"{self._key}/inbound/**", self._inbox.on_sample),
+            session.declare_queryable(f"{self._key}/**", self._queries.on_query),
         ]
         return owners(session, self._key) or set()
 
     async def _give_up(self) -> None:
-        """Serves nobody any more. What waits is lost: it may be old when the key is free."""
+        """Stop serving. What waits is discarded: it may be old when the key is free."""
         self._owner = None
         if self._client is not None:
             self._inbox.stop()
@@ -236,31 +258,111 @@ class ZenohTransport:
         await self._loop.run_in_executor(self._session_thread, self._release)
 
     def _release(self) -> None:
-        """In the session's thread. Raises ZError."""
+        """Runs in the session's thread. Raises ZError."""
         while self._declared:
-            self._declared.pop().undeclare()  # the token last
+            self._declared.pop().undeclare()  # type: ignore[no-untyped-call]  # as Zenoh's stubs have it; the token last
+
+    # -- queries -------------------------------------------------------------------------------------------------
 
     def _answer(self) -> None:
-        """What is asked for at the same time is looked up once."""
+        """Answer all queries that wait from one snapshot."""
         if self._client is None:
             return
-        queries, frames = self._queries.take(), self._ears.snapshot()
+        queries, frames = self._queries.take(), self._events.snapshot()
         answering = self._loop.run_in_executor(self._answering, _reply, queries, self._key, frames)
         answering.add_done_callback(self._answered)
 
     def _answered(self, answering: asyncio.Future[zenoh.ZError | None]) -> None:
         if not answering.cancelled() and (error := answering.result()) is not None:
-            self._ears.failed(None, error, 0)
+            self._events.failed(None, error, 0)
+
+
+class Inbox:
+    """Samples on their way from Zenoh's threads to the loop. `most` bounds one sample, in bytes."""
+
+    def __init__(self, events: Events, most: int) -> None:
+        self._client: Client | None = None
+        self._events = events
+        self._most = most
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[tuple[bytes, int]] = deque()
+        # Each counter is written by one thread alone.
+        self._received_bytes = self._handed_bytes = 0
+        self._lost = self._reported_lost = 0
+        self._clock = LoopClock()
+
+    def start(self, client: Client) -> None:
+        """Hand on samples as coming from `client`."""
+        self._client = client
+        self._clock.start()
+        self._hand_on()
+
+    def stop(self) -> None:
+        self._client = None
+        self._clock.stop()
+
+    def on_sample(self, sample: zenoh.Sample) -> None:
+        """Runs in Zenoh's thread."""
+        if sample.kind != zenoh.SampleKind.PUT:  # never `is`: each is made anew
+            return
+        size = len(sample.payload)
+        waiting_bytes = self._received_bytes - self._handed_bytes
+        if size > self._most:
+            self._loop.call_soon_threadsafe(self._events.refused, "too_large")
+        elif len(self._waiting) >= MOST_RECEIVED or waiting_bytes + size > MOST_RECEIVED_BYTES:
+            self._lost += 1  # reported with those that wait
+        else:
+            self._received_bytes += size
+            self._waiting.append((sample.payload.to_bytes(), self._clock.stamp()))
+            if len(self._waiting) == 1:
+                self._loop.call_soon_threadsafe(self._hand_on)
+
+    def _hand_on(self) -> None:
+        if self._client is None:
+            return
+        try:
+            for _ in range(min(len(self._waiting), RECEIVED_PER_TURN)):
+                data, arrived = self._waiting.popleft()
+                self._handed_bytes += len(data)
+                self._events.received(self._client, data, arrived)
+        finally:
+            if self._waiting:  # otherwise `on_sample` schedules the next call
+                self._loop.call_soon(self._hand_on)
+        for _ in range(self._lost - self._reported_lost):
+            self._reported_lost += 1
+            self._events.refused("rate_limited")
+
+
+class Queries:
+    """Queries that wait for an answer. `wake` is called in the loop when there is one after there was none."""
+
+    def __init__(self, wake: Callable[[], None]) -> None:
+        self._wake = wake
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[zenoh.Query] = deque()
+
+    def on_query(self, query: zenoh.Query) -> None:
+        """Runs in Zenoh's thread."""
+        if len(self._waiting) >= MOST_QUERIES:
+            with query:
+                query.reply_err("too many queries wait for an answer: ask again")
+            return
+        self._waiting.append(query)
+        if len(self._waiting) == 1:
+            self._loop.call_soon_threadsafe(self._wake)
+
+    def take(self) -> list[zenoh.Query]:
+        """Remove and return all that wait."""
+        return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
 
 class ZenohClient:
-    """Everybody in the network. Its backlog is of small frames; of large ones the newest of each key waits apart."""
+    """The whole network. Its backlog is of small frames; of large ones the newest of each key waits apart."""
 
-    def __init__(self, key: str, putter: Putter, ears: Ears) -> None:
+    def __init__(self, key: str, putter: Putter, events: Events) -> None:
         self.label = f"zenoh {key}"
         self._putter = putter
-        self._ears = ears
-        self._loop = asyncio.get_running_loop()
+        self._events = events
         self._waiting: list[Frame] = []
         self._backlog = 0
         self._was_high = False
@@ -283,32 +385,118 @@ class ZenohClient:
         if self._is_open:
             self._is_open = False
             self._putter.close()
-            self._ears.left(self)
+            self._events.left(self)
 
     def _put(self) -> None:
-        """All that waits, in one go; what is written meanwhile goes in the next."""
+        """Put all that waits together; what is written meanwhile goes with the next call."""
         frames, self._waiting = self._waiting, []
         size = sum(len(frame.data) for frame in frames)
         self._is_putting = True
         putting = asyncio.wrap_future(self._putter.put(frames))
-        putting.add_done_callback(lambda done: self._has_put(done, size))
+        putting.add_done_callback(lambda done: self._on_put(done, size))
 
-    def _has_put(self, putting: asyncio.Future[list[Lost]], size: int) -> None:
+    def _on_put(self, putting: asyncio.Future[list[Lost]], size: int) -> None:
         self._is_putting = False
         self._backlog -= size
         if not self._is_open:
             return
         for error, lost in putting.result():
-            self._ears.failed(self, error, lost)
+            self._events.failed(self, error, lost)
         if self._waiting:
             self._put()
         if self._was_high and self._backlog < LOW_WATER:
             self._was_high = False
-            self._ears.drained(self)
+            self._events.drained(self)
+
+
+class Lost(NamedTuple):
+    """Frames that were not put, and why."""
+
+    error: Exception
+    frames: int
+
+
+class Putter:
+    """Puts frames under KEY/data/TOPIC and KEY/schema/TYPE, in threads: a put may wait for a slow network.
+
+    Large values go in a thread of their own, with less priority and of each key only the newest, so that small ones
+    need not wait. A key that once had a large value is a large one from then on.
+    """
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self._session = session
+        self._key = key
+        self._small = DaemonThread("zenoh puts")
+        self._large = DaemonThread("zenoh large puts")
+        self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
+        self._large_keys: set[str] = set()
+        self._large_waiting: dict[str, bytes] = {}
+        self._failed_large: list[Exception] = []
+        self._lock = threading.Lock()
+
+    def put(self, frames: Sequence[Frame]) -> Future[list[Lost]]:
+        """Complete when Zenoh has the small frames and the large ones are queued. Gives what was lost until then."""
+        return self._small.submit(self._put_all, frames)
+
+    def close(self) -> None:
+        """Discard what waits; a put that is under way ends when Zenoh lets it."""
+        for executor in (self._small, self._large):
+            executor.shutdown()
+
+    def _put_all(self, frames: Sequence[Frame]) -> list[Lost]:
+        lost = []
+        for frame in frames:
+            key = key_of(self._key, frame)
+            if len(frame.data) > LARGE:
+                self._large_keys.add(key)
+            try:
+                if key in self._large_keys:
+                    self._queue_large(key, frame.data)
+                else:
+                    self._put(key, frame.data, is_large=False)
+            except (zenoh.ZError, TransportError) as error:
+                lost.append(Lost(error, 1))
+        with self._lock:
+            failed, self._failed_large = self._failed_large, []
+        return lost + [Lost(error, 1) for error in failed]
+
+    def _queue_large(self, key: str, data: bytes) -> None:
+        """Raises TransportError for the value that this one replaces."""
+        with self._lock:
+            is_newer = key in self._large_waiting
+            self._large_waiting[key] = data
+        if is_newer:
+            raise TransportError("a large value was not put before the next one of its topic came")
+        self._large.submit(self._put_large)
+
+    def _put_large(self) -> None:
+        with self._lock:
+            key, data = next(iter(self._large_waiting.items()))
+            del self._large_waiting[key]
+        try:
+            self._put(key, data, is_large=True)
+        except Exception as error:  # noqa: BLE001 - reported with the next frames
+            with self._lock:
+                self._failed_large.append(error)
+
+    def _put(self, key: str, data: bytes, *, is_large: bool) -> None:
+        """Raises ZError."""
+        publisher = self._publishers.get((key, is_large))
+        if publisher is None:
+            priority = zenoh.Priority.DATA_LOW if is_large else zenoh.Priority.DATA
+            drop = zenoh.CongestionControl.DROP
+            publisher = self._session.declare_publisher(key, congestion_control=drop, priority=priority)
+            self._publishers[key, is_large] = publisher
+        publisher.put(data)
+
+
+def key_of(root: str, frame: Frame) -> str:
+    """Return the key of a frame below the gateway's own key."""
+    return f"{root}/schema/{frame.type_name}" if frame.is_schema else f"{root}/data/{frame.topic.lstrip('/')}"
 
 
 def _reply(queries: Sequence[zenoh.Query], root: str, frames: Sequence[Frame]) -> zenoh.ZError | None:
-    """In its thread. Returns the last error: whoever asked has gone, mostly."""
+    """Answer queries; runs in a thread. Returns the last error: mostly, whoever asked has gone."""
     failure = None
     for query in queries:
         with query:

@@ -1,4 +1,4 @@
-"""Ears that write down what they hear, and what the tests of the gateway's transports share."""
+"""Events that write down what they hear, and what the tests of the gateway's transports share."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ PATIENCE_SECONDS = 20.0
 
 
 def data(payload: bytes, topic: str = "/imu", type_name: str = "T") -> Frame:
-    return Frame(payload, topic, type_name, is_schema=False, born=0)
+    return Frame(payload, topic, type_name, is_schema=False)
 
 
 @dataclass
-class Ears:
+class Events:
     """What is heard of clients that come and go, in order, and what they say."""
 
     clients: list[Client] = field(default_factory=list)

@@ -1,0 +1,170 @@
+"""The clients of one gateway: each gets frames at once, or, while it is behind, the newest of each topic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from itertools import count
+
+from router.gateway.encoding import Encoding
+from router.gateway.ledger import Ledger
+from router.gateway.transport.base import HIGH_WATER, Client, Frame, Transport
+from router.log import FloodLog, logger
+
+
+class Subscriber:
+    """One client. `number` is its label in metrics: the lowest that no other client of the gateway has.
+
+    While its backlog is at HIGH_WATER, frames wait in a queue that holds one per topic (and schema): a newer frame
+    takes the place of the one that waits, so that each topic keeps its turn. `sent` and `dropped` count frames since
+    the client came. Times are monotonic, in ns.
+    """
+
+    def __init__(self, client: Client, number: int, on_wire: Callable[[Sequence[Frame]], Sequence[Frame]]) -> None:
+        self.client = client
+        self.number = number
+        self.sent = 0
+        self.dropped = 0
+        self._on_wire = on_wire
+        self._behind_since: int | None = None
+        self._schemas: dict[Hashable, Frame] = {}
+        self._values: dict[Hashable, Frame] = {}
+
+    @property
+    def waiting(self) -> int:
+        """Frames in the queue."""
+        return len(self._schemas) + len(self._values)
+
+    @property
+    def keeps_up(self) -> bool:
+        """Whether frames can be written at once."""
+        return self._behind_since is None and self.client.backlog() < HIGH_WATER
+
+    def lag(self, now: int) -> int:
+        """Return for how long (ns) the client has not had everything."""
+        return 0 if self._behind_since is None else now - self._behind_since
+
+    def write(self, frames: Sequence[Frame]) -> None:
+        self.client.write(self._on_wire(frames))
+        self.sent += len(frames)
+
+    def queue(self, schemas: Mapping[Hashable, Frame], values: Mapping[Hashable, Frame], frames: int, now: int) -> int:
+        """Queue the newest of so many `frames`. Return how many frames gave way to newer ones."""
+        if self._behind_since is None:
+            self._behind_since = now
+        before = self.waiting
+        self._schemas.update(schemas)
+        self._values.update(values)
+        superseded = before + frames - self.waiting
+        self.dropped += superseded
+        return superseded
+
+    def drained(self) -> None:
+        """Write as much of the queue as the client can take, schemas first."""
+        while self.waiting and self.client.backlog() < HIGH_WATER:
+            self.write(self._take())
+        if not self.waiting:
+            self._behind_since = None
+
+    def _take(self) -> list[Frame]:
+        """Remove frames from the front of the queue: HIGH_WATER bytes, or one frame that is larger."""
+        taken: list[Frame] = []
+        size = 0
+        for queue in (self._schemas, self._values):
+            for key, frame in list(queue.items()):
+                size += len(frame.data)
+                if taken and size > HIGH_WATER:
+                    return taken
+                taken.append(frame)
+                del queue[key]
+        return taken
+
+
+class Subscribers:
+    """All clients of a gateway. `clock_ns` is monotonic, `wall_s` gives the wall clock in seconds."""
+
+    def __init__(
+        self,
+        gateway: str,
+        encoding: Encoding,
+        ledger: Ledger,
+        clock_ns: Callable[[], int],
+        wall_s: Callable[[], float],
+    ) -> None:
+        self.by_client: dict[Client, Subscriber] = {}
+        self._gateway = gateway
+        self._encoding = encoding
+        self._ledger = ledger
+        self._clock_ns = clock_ns
+        self._wall_s = wall_s
+        self._log = FloodLog()
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self.by_client)
+
+    def send(self, frames: Sequence[Frame], transport: Transport) -> None:
+        """Write frames to every client that keeps up, and queue them for the others."""
+        if not frames or not self.by_client:
+            return
+        ready: list[Subscriber] = []
+        behind: list[Subscriber] = []
+        for each in self.by_client.values():
+            (ready if each.keeps_up else behind).append(each)
+        if behind:
+            self._queue(behind, frames)
+        if len(ready) > 1:
+            transport.write_all([each.client for each in ready], self._on_wire(frames, len(ready)))
+            for each in ready:
+                each.sent += len(frames)
+        elif ready:
+            ready[0].write(frames)
+
+    def send_to(self, subscriber: Subscriber, frames: Sequence[Frame]) -> None:
+        """Answer one client."""
+        if not frames:
+            return
+        if subscriber.keeps_up:
+            subscriber.write(frames)
+        else:
+            self._queue([subscriber], frames)
+
+    async def flush_log(self) -> None:
+        self._log.flush()
+
+    def joined(self, client: Client) -> Subscriber:
+        taken = {each.number for each in self.by_client.values()}
+        number = next(number for number in count() if number not in taken)
+        subscriber = self.by_client[client] = Subscriber(client, number, self._on_wire)
+        self._ledger.clients(len(self.by_client))
+        self._log_change("client joined", subscriber)
+        return subscriber
+
+    def left(self, client: Client) -> None:
+        if (subscriber := self.by_client.pop(client, None)) is not None:
+            self._ledger.left(subscriber.waiting)
+            self._ledger.clients(len(self.by_client))
+            self._log_change("client left", subscriber)
+
+    def drained(self, client: Client) -> None:
+        if (subscriber := self.by_client.get(client)) is not None:
+            subscriber.drained()
+
+    def close(self) -> None:
+        self._log.flush(final=True)
+
+    def _queue(self, subscribers: Sequence[Subscriber], frames: Sequence[Frame]) -> None:
+        schemas: dict[Hashable, Frame] = {(each.topic, each.type_name): each for each in frames if each.is_schema}
+        values: dict[Hashable, Frame] = {each.topic: each for each in frames if not each.is_schema}
+        now = self._clock_ns()
+        self._ledger.superseded(sum(each.queue(schemas, values, len(frames), now) for each in subscribers))
+
+    def _log_change(self, event: str, subscriber: Subscriber) -> None:
+        """Log who came or went; repetitions from one host are summed up."""
+        address = subscriber.client.label
+        key = event, address.rpartition(":")[0]
+        self._log.note(key, logger.info, event, gateway=self._gateway, client=subscriber.number, address=address)
+
+    def _on_wire(self, frames: Sequence[Frame], clients: int = 1) -> Sequence[Frame]:
+        wire = self._encoding.on_wire(frames, self._wall_s())
+        self._ledger.written(len(wire) * clients, sum(len(frame.data) for frame in wire) * clients)
+        return wire

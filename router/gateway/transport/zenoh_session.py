@@ -1,0 +1,139 @@
+"""A gateway's Zenoh session: its configuration, what its errors mean, and who owns a key.
+
+Each gateway that serves a key keeps a liveliness token at KEY/owner/SINCE/SESSION/HOST/PID.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+from datetime import datetime, timezone
+from typing import NamedTuple
+
+import zenoh
+
+from router.clock import wall_ns
+from router.compiler.zenoh_config import is_default, library_config, reason
+from router.errors import StartError
+from router.net.port_holder import port_taken
+from router.table.model import ZenohSettings
+
+LARGE_MESSAGE_US = 2_000_000
+"""How long Zenoh may wait for room for the fragments of one large message before it drops it: 7 MB take 0.6 s at
+100 Mbit/s. By default it gives up after 50 ms."""
+
+LOOK_SECONDS = 1.5
+"""How long tokens are asked for. All that are reachable answer at once, unless one of them stands still. Less than a
+session has to end: closing waits for it."""
+
+_TEMPORARY = "Unable to connect|timeout|os error (?:19|99|100|101|110|113)\\b"
+"""Errors that pass when others, or a network interface, are there."""
+
+_LONGEST = 64
+"""Characters of a host's name that are shown."""
+
+
+def session_config(settings: ZenohSettings) -> zenoh.Config:
+    """Return what `config` of the table says, and what the gateway sets itself. Raises StartError."""
+    try:
+        zenoh.KeyExpr(settings.key.value)
+    except zenoh.ZError as error:
+        raise StartError(f"'{settings.key.value}' is no key of Zenoh's: {short(error)}") from error
+    try:
+        config = library_config(settings.config)
+    except zenoh.ZError as error:  # a file that has changed since it was checked
+        raise StartError(_refused(settings, error)) from None
+    unless_said: dict[str, object] = {
+        "scouting/multicast/enabled": not settings.connect and not settings.listen,
+        "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": LARGE_MESSAGE_US,
+    }
+    values = {key: value for key, value in unless_said.items() if is_default(config, key)}
+    values["mode"] = settings.mode
+    if settings.connect:
+        values["connect/endpoints"] = settings.connect
+    if settings.listen:
+        values["listen/endpoints"] = settings.listen
+    for name, value in values.items():
+        try:
+            config.insert_json5(name, json.dumps(value))
+        except zenoh.ZError as error:
+            raise StartError(f"Zenoh does not take {value!r} for {name}: {short(error)}") from error
+    return config
+
+
+def permanent(settings: ZenohSettings, error: str) -> str:
+    """Return what to do about an error that does not pass by itself, "" for others."""
+    if "not supported" in error:
+        return f"Zenoh cannot use one of these: {', '.join((*settings.connect, *settings.listen))}: {short(error)}"
+    if "os error 98" not in error:
+        is_refused = settings.config is not None or "TLS" in error
+        return _refused(settings, error) if is_refused and not re.search(_TEMPORARY, error) else ""
+    for locator in settings.listen:
+        port = re.search(r":(\d+)$", locator)
+        if port and locator in error:
+            return f"{locator} cannot be used: {port_taken('tcp', int(port[1]))}"
+    return f"Zenoh cannot listen: {short(error)}"
+
+
+def short(error: object) -> str:
+    """Return the error's text without locations in Zenoh's source."""
+    return re.sub(r" at /\S+:\d+\.?", "", str(error))
+
+
+def _refused(settings: ZenohSettings, error: object) -> str:
+    if settings.config is None:
+        return f"Zenoh needs a `config` for this: {reason(error)}"
+    return f"{settings.config.span}: Zenoh does not take this `config`: {reason(error)}"
+
+
+class Owner(NamedTuple):
+    """A gateway that owns a key. The lesser of two came first: `since_ns` is wall-clock time, `session` a Zenoh id."""
+
+    since_ns: int
+    session: str
+    host: str
+    pid: str
+
+    def __str__(self) -> str:
+        since = datetime.fromtimestamp(self.since_ns // 1_000_000_000, timezone.utc)
+        return f"pid {self.pid} on {self.host}, since {since:%Y-%m-%dT%H:%M:%SZ}, session {self.session}"
+
+    def token(self, key: str) -> str:
+        """Return the key expression of its token."""
+        return "/".join((key, "owner", *map(str, self)))
+
+
+def all_tokens(key: str) -> str:
+    """Return a key expression that matches every token of a key, and nothing else."""
+    return f"{key}/owner/*/*/*/*"
+
+
+def this_owner(session: zenoh.Session) -> Owner:
+    """Return this process as the owner of a key from now on."""
+    host = re.sub(r"[^A-Za-z0-9_.-]", "_", socket.gethostname())[:_LONGEST] or "unknown"
+    return Owner(wall_ns(), str(session.zid()), host, str(os.getpid()))
+
+
+def owner_of(token: object) -> Owner | None:
+    """Return who declared a token, None where it is no token of a gateway."""
+    since, session, host, pid = str(token).rsplit("/", 4)[1:]
+    if not re.fullmatch("[0-9]{1,19}", since):
+        return None
+    return Owner(int(since), session[:_LONGEST], host[:_LONGEST], pid[:_LONGEST])
+
+
+def owners(session: zenoh.Session, key: str) -> set[Owner] | None:
+    """Return the owners of a key other than `session`. None when not all who were asked have answered.
+
+    Takes LOOK_SECONDS at most. Raises ZError.
+    """
+    found = set()
+    for reply in session.liveliness().get(all_tokens(key), timeout=LOOK_SECONDS):
+        if reply.ok is None:
+            return None
+        owner = owner_of(reply.ok.key_expr)
+        if owner is not None and owner.session != str(session.zid()):
+            found.add(owner)
+    return found
