@@ -15,8 +15,8 @@ from router.cli.tool_options import explained
 if TYPE_CHECKING:
     from router.compiler import Checked
     from router.errors import Diagnostic
+    from router.tools.new_message import NewMessage, Site
     from router.tools.new_message_files import Written
-    from router.tools.new_message_model import NewMessage, Site
 
 _DESCRIPTION = """Add a message that a board sends: its .proto file, its number in the envelope and in the lock, the ROS
 message, a route from the board to ROS and the basestation, and a test of it. Files keep their comments and their
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from router.assets import asset, is_installed
     from router.errors import UsageError
     from router.tools.new_message import new_message
-    from router.tools.new_message_files import Written, changes
+    from router.tools.new_message_files import Written, changes, locked
 
     if is_installed(asset("schemas")):
         what = "this router is installed, and its ROS messages with it; use the one of a checkout"
@@ -59,9 +59,10 @@ def run(args: argparse.Namespace) -> int:
     planned = changes(message, site, [checked.table for checked in before[1:] if checked.table is not None])
     written = Written(planned.texts)
     try:
+        written.write(site.schema.lock, locked(site))
         after = _check(args.table)
         print_findings(_news(before, after), sys.stderr)
-    except BaseException:  # somebody pressed Ctrl-C
+    except BaseException:  # Ctrl-C, too
         written.undo()
         raise
     if any(checked.has_errors for checked in after):
@@ -88,7 +89,7 @@ def _check(table: Path) -> list[Checked]:
 
 def _site(checked: Checked) -> Site:
     from router.assets import asset
-    from router.tools.new_message_model import site_of
+    from router.tools.new_message import site_of
 
     return site_of(checked, asset("schemas") / "comms" / "msg")
 

@@ -1,8 +1,4 @@
-"""A message that the rover shall have: what it is called, its number and fields, and why there can be none like it.
-
-Knows the table, the payload cases and the lock that there are, and writes nothing. What is written of it is the
-business of `new_message_proto`, `new_message_ros` and `new_message_tables`.
-"""
+"""What `router new` adds: a message with its number and fields, checked against what there is."""
 
 from __future__ import annotations
 
@@ -10,13 +6,96 @@ import keyword
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 
+from router.compiler import Checked
 from router.errors import UsageError, did_you_mean, nearest, shown_path
-from router.table.model import Endpoint, EndpointKind, RouteTable
+from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, RouteTable
 from router.table.scalars import resolve, surprise
-from router.tools.new_message_model import SCALARS, NewField, NewMessage, Site, prefix_of
-from router.tools.new_message_number import check_number
+from router.types.lock_file import read_lock
 from router.types.model import Enum, MessageType
+from router.types.protobuf import Envelope, ProtoSchema, load_protos
+
+SCALARS = {
+    "bool": "bool", "float": "float32", "double": "float64", "int32": "int32", "int64": "int64", "uint32": "uint32",
+    "uint64": "uint64",
+}  # fmt: skip
+"""What a field can be beside an enum or a message: protobuf's spelling, and ROS's. Boards take all of these."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewField:
+    """`type` is one of SCALARS, or the full name of an enum or a message of the protos."""
+
+    name: str
+    type: str
+    comment: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NewMessage:
+    """`board` is the endpoint that sends it, `case` its payload case, `fields` in the order of their numbers."""
+
+    name: str
+    number: int
+    board: str
+    case: str
+    fields: tuple[NewField, ...]
+
+    @property
+    def prefix(self) -> str:
+        """What the names of the board's messages begin with."""
+        return prefix_of(self.board)
+
+    @property
+    def board_words(self) -> str:
+        return self.board.replace("_", " ")
+
+    @property
+    def title(self) -> str:
+        return f"{self.case.replace('_', ' ').capitalize()} from the {self.board_words}"
+
+    @property
+    def stem(self) -> str:
+        """The name of its `.proto` file."""
+        return self.case.removesuffix("_info")
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """What a message is added to: a table without errors, its schema, and the folder of the ROS messages."""
+
+    table: RouteTable
+    settings: EnvelopeSettings
+    schema: ProtoSchema
+    envelope: Envelope
+    messages: Path
+
+    def file(self, name: str) -> str:
+        """The `.proto` file of a message or an enum, relative to the folder of the protos."""
+        return self.schema.sources.file(name)
+
+    def new_file(self, message: NewMessage) -> str:
+        """Where its `.proto` file goes: the folder of its board, beside that of the envelope."""
+        common = PurePosixPath(self.file(self.envelope.name)).parent
+        return (common.parent / message.board / f"{message.stem}.proto").as_posix()
+
+
+def site_of(checked: Checked, messages: Path) -> Site:
+    """`checked` is a table without errors. Raises UsageError where it has no envelope."""
+    if checked.table is None or checked.envelope is None:
+        raise ValueError(f"{checked.path} has errors")
+    settings = checked.table.envelope
+    if settings is None:
+        raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
+    schema = load_protos(settings, with_others=True)  # a field's type may be in a file of its own
+    return Site(checked.table, settings, schema, checked.envelope, messages)
+
+
+def prefix_of(board: str) -> str:
+    return "".join(word.capitalize() for word in board.split("_"))
+
 
 _OF_C = frozenset(
     """
@@ -28,19 +107,23 @@ _OF_C = frozenset(
     typeid typename union unsigned using virtual void volatile wchar_t while xor xor_eq
     """.split()  # noqa: SIM905 - ninety words are read more easily without quotes
 )
-"""What boards and ROS nodes, which are compiled from the same names, cannot have as a name."""
+"""No names: boards and ROS nodes are compiled from the same declarations."""
 _MESSAGE_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
 _FIELD_NAME = re.compile(r"[a-z](_?[a-z0-9])*")
 _WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
+_LARGEST_NUMBER = (1 << 29) - 1
+_OF_PROTOBUF = range(19_000, 20_000)
+"""Field numbers that protobuf keeps for itself."""
+
 
 def new_message(name: str, number: int, board: str, fields: Sequence[str], site: Site) -> NewMessage:
-    """The message as asked for, `fields` as `parsed_fields` has them. Raises UsageError for what cannot be."""
+    """The message as asked for on the command line. Raises UsageError for one that cannot be."""
     endpoint = _endpoint(board, site.table)
     case = _case(name, endpoint.name)
     _check_names(name, case, site)
-    check_number(number, case, site)
-    asked = parsed_fields(fields, site) if fields else usual_fields(prefix_of(endpoint.name), site)
+    _check_number(number, case, site)
+    asked = _parsed_fields(fields, site) if fields else _usual_fields(prefix_of(endpoint.name), site)
     message = NewMessage(name, number, endpoint.name, case, asked)
     for path in (site.schema.root / site.new_file(message), site.messages / f"{name}.msg"):
         if path.exists():
@@ -48,8 +131,8 @@ def new_message(name: str, number: int, board: str, fields: Sequence[str], site:
     return message
 
 
-def parsed_fields(texts: Sequence[str], site: Site) -> tuple[NewField, ...]:
-    """Of `dose_rate:float state:SensorState`, or a single field with its unit, `dose_rate:float # uSv/h`."""
+def _parsed_fields(texts: Sequence[str], site: Site) -> tuple[NewField, ...]:
+    """Fields from `dose_rate:float state:SensorState`, or one from `dose_rate:float # uSv/h`."""
     fields: list[NewField] = []
     for text in texts:
         declared, _, comment = text.partition("#")
@@ -65,8 +148,8 @@ def parsed_fields(texts: Sequence[str], site: Site) -> tuple[NewField, ...]:
     return tuple(fields)
 
 
-def usual_fields(prefix: str, site: Site) -> tuple[NewField, ...]:
-    """One number to begin with, and what most messages of that board have."""
+def _usual_fields(prefix: str, site: Site) -> tuple[NewField, ...]:
+    """The fields of a message without `--fields`: a number, and the enums and messages most siblings have."""
     siblings = [case.type for case in site.envelope.cases.values() if case.type.short_name.startswith(prefix)]
     shared = Counter(
         NewField(field.name, field.type.name)
@@ -103,7 +186,7 @@ def _field(text: str, comment: str, site: Site) -> NewField:
 
 
 def _check_word(name: str, remedy: str) -> None:
-    """Boards and ROS nodes have it as a name in their own languages."""
+    """Refuse words of C and C++."""
     if name in _OF_C:
         raise UsageError(f"'{name}' is a word of C or C++, and no name there; {remedy}")
 
@@ -145,3 +228,36 @@ def _check_names(name: str, case: str, site: Site) -> None:
     topics = {topic.topic.value: route.name for route in site.table.routes for topic in route.topics}
     if case in topics:
         raise UsageError(f"the route {topics[case]} has a topic '{case}' already; take another name")
+
+
+def _check_number(number: int, case: str, site: Site) -> None:
+    """Raises UsageError, with the next free number, for one that was ever given out, reserved or promised."""
+    lock, envelope = read_lock(site.schema.lock), site.envelope.name
+    entries = lock.messages[envelope].entries if lock is not None and envelope in lock.messages else frozenset()
+    holders = {entry.number: entry.name for entry in entries}
+    holders |= {field.number: field.name for field in site.schema.messages[envelope].fields}
+    above = range(max(holders, default=0) + 1, _LARGEST_NUMBER)
+    free = next(candidate for candidate in above if _is_free(candidate, site))
+    if not 1 <= number <= _LARGEST_NUMBER or number in _OF_PROTOBUF:
+        raise UsageError(f"{number} is no field number of protobuf; {free} is free")
+    if number in holders:
+        raise UsageError(f"number {number} belongs to '{holders[number]}', for ever; {free} is free")
+    if any(number in span for span in site.schema.reserved_numbers(envelope)):
+        raise UsageError(f"{envelope} reserves number {number}; {free} is free")
+    if promised := _promise(number, site):
+        raise UsageError(f"{site.file(envelope)} says: {promised} {free} is free")
+    if case in holders.values():
+        was = next(old for old, name in holders.items() if name == case)
+        raise UsageError(f"'{case}' had number {was} once, and cannot come back with another; take another name")
+
+
+def _is_free(number: int, site: Site) -> bool:
+    reserved = any(number in span for span in site.schema.reserved_numbers(site.envelope.name))
+    return not reserved and number not in _OF_PROTOBUF and not _promise(number, site)
+
+
+def _promise(number: int, site: Site) -> str:
+    """The comment in the envelope's file that promises the number, such as `Number 30 is promised to ...`."""
+    text = (site.schema.root / site.file(site.envelope.name)).read_text(encoding="utf-8")
+    found = re.search(rf"//\s*(.*\b[Nn]umber {number}\b.*)", text)
+    return found[1] if found else ""

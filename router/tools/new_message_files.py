@@ -1,46 +1,55 @@
-"""Which files a new message changes and to what, and writing them: all, or none.
-
-Decides nothing about the message, and prints nothing.
-"""
+"""The files that a new message adds or changes. Existing files get lines inserted; every other line stays as it is."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from router.errors import UsageError, shown_path
-from router.table.model import RouteTable
-from router.tools.new_message_model import NewMessage, Site
-from router.tools.new_message_proto import proto_texts
-from router.tools.new_message_ros import msg_text
-from router.tools.new_message_tables import board_table_text, forwarding_table_text
-from router.tools.new_message_testing import with_test
+import yaml
+
+from router.errors import Severity, UsageError, shown_path
+from router.table.model import ANY, EndpointKind, Route, RouteTable
+from router.tools.new_message import SCALARS, NewField, NewMessage, Site
+from router.types.lock import check_lock, extended_lock
+from router.types.lock_file import lock_text
+from router.types.model import Bool, Enum, Float, MessageType, Type
+from router.types.protobuf import find_envelope, load_protos
+
+_WIDEST = 120
+_SECTION_WIDTH = 115
+_COMMENT_GAP = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """`texts` are the whole contents of each file. `unrouted` are tables beside that need a person to route it."""
+    """`texts` are the whole contents of each file. `unrouted` are tables beside that need a route by hand."""
 
     texts: Mapping[Path, str]
     unrouted: tuple[Path, ...]
 
 
 def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Changes:
-    """`others` are the tables beside the site's. Raises UsageError, and TableError for a broken test file."""
-    texts = {site.schema.root / name: text for name, text in proto_texts(message, site).items()}
-    texts[site.messages / f"{message.name}.msg"] = msg_text(message, site)
-    path = site.table.path
-    package = site.messages.parent.name
-    texts[path] = board_table_text(_read(path), message, site.table, shown_path(path), package)
-    tests = path.with_name(f"{path.stem}.test{path.suffix}")
+    """Everything but the lock. `others` are the tables beside the site's. Raises UsageError."""
+    root, table = site.schema.root, site.table
+    envelope = root / site.file(site.envelope.name)
+    texts = {
+        root / site.new_file(message): _proto(message, site),
+        envelope: _in_envelope(_read(envelope), message, site),
+        site.messages / f"{message.name}.msg": _msg(message, site),
+        table.path: _in_table(_read(table.path), message, site),
+    }
+    tests = table.path.with_name(f"{table.path.stem}.test{table.path.suffix}")
     if tests.exists():
-        texts[tests] = with_test(tests, _read(tests), message, site)
+        texts[tests] = _in_tests(tests, message, site)
     unrouted = []
     for other in others:
-        if path in other.files or _protos(other) != _protos(site.table):
+        if table.path in other.files or _protos(other) != _protos(table):
             continue
-        text = forwarding_table_text(_read(other.path), message, other, shown_path(other.path))
+        text = _in_forwarding_table(_read(other.path), message, other)
         if text is None:
             unrouted.append(other.path)
         else:
@@ -48,12 +57,8 @@ def changes(message: NewMessage, site: Site, others: Sequence[RouteTable]) -> Ch
     return Changes(texts, tuple(unrouted))
 
 
-def _protos(table: RouteTable) -> Path | None:
-    return table.envelope.protos.value if table.envelope else None
-
-
 class Written:
-    """The files of some changes, written, their ends of lines as they were.
+    """Files as they are written, line ends kept, so that all of it can be undone.
 
     Raises UsageError when one cannot be written, and then none is.
     """
@@ -61,22 +66,22 @@ class Written:
     def __init__(self, texts: Mapping[Path, str]) -> None:
         self._before: dict[Path, bytes | None] = {}
         self._folders: list[Path] = []
+        for path, text in texts.items():
+            self.write(path, text)
+
+    def write(self, path: Path, text: str) -> None:
         try:
-            for path, text in texts.items():
-                self._write(path, text)
+            before = path.read_bytes() if path.exists() else None
+            self._before[path] = before
+            self._folders += [folder for folder in path.parents if not folder.exists()]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8", newline="\r\n" if before and b"\r\n" in before else "\n")
         except OSError as error:
             self.undo()
             raise UsageError(f"{error.filename} cannot be written: {error.strerror}") from error
-        except BaseException:  # somebody pressed Ctrl-C
+        except BaseException:  # Ctrl-C
             self.undo()
             raise
-
-    def _write(self, path: Path, text: str) -> None:
-        before = path.read_bytes() if path.exists() else None
-        self._before[path] = before
-        self._folders += [folder for folder in path.parents if not folder.exists()]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8", newline="\r\n" if before and b"\r\n" in before else "\n")
 
     @property
     def new(self) -> list[Path]:
@@ -87,7 +92,6 @@ class Written:
         return [path for path, before in self._before.items() if before is not None]
 
     def undo(self) -> None:
-        """Everything as it was."""
         for path, before in self._before.items():
             if before is None:
                 path.unlink(missing_ok=True)
@@ -95,6 +99,312 @@ class Written:
                 path.write_bytes(before)
         for folder in self._folders:  # the innermost first
             folder.rmdir()
+
+
+def locked(site: Site) -> str:
+    """The lock with what the `.proto` files declare now. Raises UsageError and TableError."""
+    schema = load_protos(site.settings)
+    envelope = find_envelope(schema, site.settings)
+    errors = [each for each in check_lock(schema, envelope) if each.severity is Severity.ERROR]
+    if errors:
+        raise UsageError("; ".join(each.message for each in errors))
+    return lock_text(extended_lock(schema, envelope))
+
+
+# Protobuf and ROS declarations
+
+
+def _proto(message: NewMessage, site: Site) -> str:
+    imports = sorted({site.file(field.type) for field in message.fields if field.type not in SCALARS})
+    rows = [
+        (f"  {field.type} {field.name} = {number};", field.comment) for number, field in enumerate(message.fields, 1)
+    ]
+    lines = [
+        f"// {message.title}.",
+        'syntax = "proto3";',
+        "",
+        *(f'import "{name}";' for name in imports),
+        *([""] if imports else []),
+        f"message {message.name} {{",
+        *_aligned(rows, "//"),
+        "}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+_IMPORT = re.compile(r'\s*import\s+(?:public\s+)?"(.*)"\s*;')
+_HEAD = re.compile(r"\s*(syntax|package)\b")
+
+
+def _in_envelope(text: str, message: NewMessage, site: Site) -> str:
+    """The envelope's file with the import, in its order, and the payload case after the last one."""
+    lines = text.split("\n")
+    places = {
+        field: site.schema.span(site.envelope.name, field.name).line
+        for field in site.schema.messages[site.envelope.name].fields
+        if field.oneof == site.envelope.oneof
+    }
+    last = max(places, key=lambda field: places[field])
+    end = next(index for index in range(places[last] - 1, len(lines)) if ";" in lines[index])
+    indent = " " * _indent(lines[end])
+    own = f"{indent}{message.name} {message.case} = {message.number};"
+    is_of_same_board = site.envelope.cases[last.name].type.short_name.startswith(message.prefix)
+    lines[end + 1 : end + 1] = [own] if is_of_same_board else ["", f"{indent}// {message.board_words}", own]
+
+    imports = {index: found[1] for index, line in enumerate(lines) if (found := _IMPORT.match(line))}
+    head = max((index for index, line in enumerate(lines) if _HEAD.match(line)), default=-1)
+    new = site.new_file(message)
+    place = next((index for index, name in imports.items() if name > new), max(imports, default=head) + 1)
+    lines.insert(place, f'import "{new}";')
+    return "\n".join(lines)
+
+
+def _msg(message: NewMessage, site: Site) -> str:
+    """The ROS message whose fields `fields: auto` fills by their names.
+
+    An enum is a message of its own where there is one, else a uint8 with its values as constants. Raises UsageError
+    for a field whose type has no ROS message.
+    """
+    lines = [f"# {message.title}.", ""]
+    for name in dict.fromkeys(field.type for field in message.fields):
+        if constants := list(_constants(name, site)):
+            lines += [*constants, ""]
+    rows = [(f"{_ros_type(field, site)} {field.name}", _msg_comment(field, site)) for field in message.fields]
+    return "\n".join([*lines, *_aligned(rows, "#")]) + "\n"
+
+
+def _ros_type(field: NewField, site: Site) -> str:
+    if field.type in SCALARS:
+        return SCALARS[field.type]
+    if _has_message(field.type, site):
+        return _short(field.type)
+    if field.type in site.schema.enums:
+        return "uint8"
+    raise UsageError(f"'{field.name}' needs {site.messages.name}/{_short(field.type)}.msg; declare that first")
+
+
+def _constants(name: str, site: Site) -> Iterator[str]:
+    if name not in site.schema.enums or _has_message(name, site):
+        return
+    for value, number in site.schema.enums[name].values:
+        if not 0 <= number <= 255:
+            raise UsageError(f"{name}.{value} is {number}, which is no uint8; write the .msg file by hand")
+        yield f"uint8 {value}={number}"
+
+
+def _msg_comment(field: NewField, site: Site) -> str:
+    if field.comment or field.type not in site.schema.enums or _has_message(field.type, site):
+        return field.comment
+    words = {value.partition("_")[0] for value, _ in site.schema.enums[field.type].values}
+    return f"{words.pop()}_*" if len(words) == 1 else ""
+
+
+def _has_message(name: str, site: Site) -> bool:
+    return Path(site.messages, f"{_short(name)}.msg").exists()
+
+
+def _short(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
+    """Declarations with their comments below each other."""
+    rows = list(rows)
+    width = max((len(code) for code, comment in rows if comment), default=0) + _COMMENT_GAP
+    for code, comment in rows:
+        yield f"{code:{width}}{mark} {comment}" if comment else code
+
+
+# Tables and tests
+
+
+class _Entry(NamedTuple):
+    """One entry of a YAML section: `first` is the index of its key's line, `end` of the one behind its last."""
+
+    first: int
+    end: int
+    indent: int
+    value: yaml.Node
+
+
+def _entries(text: str, section: str) -> list[_Entry]:
+    """The entries of a top-level mapping."""
+    root = yaml.compose(text, yaml.SafeLoader)
+    top = root.value if isinstance(root, yaml.MappingNode) else []
+    found = next((value for key, value in top if key.value == section), None)
+    return [
+        _Entry(key.start_mark.line, max(_last_line(value), key.start_mark.line) + 1, key.start_mark.column, value)
+        for key, value in (found.value if isinstance(found, yaml.MappingNode) else [])
+    ]
+
+
+def _last_line(node: yaml.Node) -> int:
+    """The index of a node's last line. The end of a block is where the next token begins, behind any comments."""
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _last_line(last[1] if isinstance(last, tuple) else last)
+    return int(node.end_mark.line)
+
+
+def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str = "") -> str:
+    """The text with another entry below one, under a heading of its own where `section` says so."""
+    lines = text.split("\n")
+    indent = " " * after.indent
+    head = ["", f"{indent}# ---- {section} ".ljust(_SECTION_WIDTH, "-")] if section else []
+    return "\n".join([*lines[: after.end], *head, "", *(indent + line for line in stanza), *lines[after.end :]])
+
+
+def _in_table(text: str, message: NewMessage, site: Site) -> str:
+    """The table with a route from the board to ROS and the basestation, after the last route of that board."""
+    own = _own_routes(site.table)
+    of_board = [route for route in own if message.board in (source.value for source in route.sources)]
+    last = _last_route(text, of_board or own)
+    route = _route(message, site, _WIDEST - last.indent)
+    return _with_stanza(text, last, route, "" if of_board else message.board_words)
+
+
+def _route(message: NewMessage, site: Site, width: int) -> list[str]:
+    told = _basestations(message, site.table)
+    destinations = [f"  destinations: [{', '.join(told)}]"] if told else []
+    package = site.messages.parent.name
+    keys = [f"topic: {message.case}", f"type: {package}/msg/{message.name}", "queue_depth: 10", "fields: auto"]
+    topic = f"{{{', '.join(keys)}}}"
+    layouts = (
+        [f"  topics: [{topic}]"],
+        ["  topics:", f"    - {topic}"],
+        ["  topics:", f"    - {keys[0]}", *(f"      {key}" for key in keys[1:])],
+    )
+    topics = next((each for each in layouts if max(map(len, each)) <= width), layouts[-1])
+    return [f"{message.case}:", f"  source: {message.board}", *destinations, *topics]
+
+
+_ONE_LINE = re.compile(r" *\w+: +(\{.*\}) *$")
+
+
+def _in_forwarding_table(text: str, message: NewMessage, table: RouteTable) -> str | None:
+    """A table that sends everything to the same endpoints, with the new case among it. None for any other."""
+    own = _own_routes(table)
+    if not own or len({_forwarding(route) for route in table.routes}) != 1 or _forwarding(own[0])[0] != (ANY,):
+        return None
+    last = _last_route(text, own)
+    lines = text.split("\n")
+    template = _ONE_LINE.match(lines[last.first])
+    if template is None:
+        return None
+    key = f"{' ' * last.indent}{message.case}:"
+    lines.insert(last.end, f"{key.ljust(template.start(1) - 1)} {template[1]}")
+    return "\n".join(lines)
+
+
+def _forwarding(route: Route) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    sources = tuple(source.value for source in route.sources)
+    return sources, tuple(destination.endpoint.value for destination in route.destinations)
+
+
+def _own_routes(table: RouteTable) -> list[Route]:
+    """Those of the file itself, not of the tables that it extends."""
+    return [route for route in table.routes if route.span.file == shown_path(table.path)]
+
+
+def _last_route(text: str, routes: Iterable[Route]) -> _Entry:
+    line = max((route.case.span.line for route in routes), default=0)
+    found = next((entry for entry in _entries(text, "routes") if entry.first == line - 1), None)
+    if found is None:
+        raise UsageError("the table has no routes of its own that one could be added to; write it by hand")
+    return found
+
+
+def _basestations(message: NewMessage, table: RouteTable) -> list[str]:
+    """The endpoints that get everything that a board says."""
+    endpoints = table.endpoints.items()
+    return [name for name, each in endpoints if each.kind is EndpointKind.BASESTATION and name != message.board]
+
+
+def _in_tests(path: Path, message: NewMessage, site: Site) -> str:
+    """The test file with one more test, below the last one of that board: all that it says comes out unchanged."""
+    text = _read(path)
+    try:
+        entries = _entries(text, "tests")
+    except yaml.YAMLError as error:
+        raise UsageError(f"{shown_path(path)} is no YAML: {error}") from error
+    if not entries:
+        raise UsageError(f"{shown_path(path)} has no 'tests'; write one, or remove the file")
+    of_board = [entry for entry in entries if message.board in _senders(entry.value)]
+    return _with_stanza(text, (of_board or entries)[-1], _test(message, site), "" if of_board else message.board_words)
+
+
+def _senders(node: yaml.Node) -> Iterator[str]:
+    """Everything that a test names as `from`."""
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            yield from _senders(item)
+    elif isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            if key.value == "from" and isinstance(value, yaml.ScalarNode):
+                yield value.value
+            yield from _senders(value)
+
+
+def _test(message: NewMessage, site: Site) -> Iterator[str]:
+    told = _basestations(message, site.table)
+    subject = message.case.replace("_", " ")
+    yield f"{subject} reaches {'the operator and ROS as it is' if told else 'ROS as the operator sent it'}:"
+    yield "  given:"
+    yield f"    case: {message.case}"
+    yield f"    from: {message.board}"
+    fields = _flow({field.name: _sample(field.type, place, site) for place, field in enumerate(message.fields)})
+    yield from _wrapped(f"    fields: {fields}", " " * 13)
+    yield "  expect:"
+    if told:
+        yield f"    sent: {told[0] if len(told) == 1 else '[' + ', '.join(told) + ']'}"
+    yield f"    published: {{{message.case}: unchanged}}"
+
+
+def _wrapped(text: str, indent: str) -> list[str]:
+    """On several lines if it is long; a name and its value stay on one."""
+    lines = textwrap.wrap(
+        text.replace(": ", ":\0"),
+        _WIDEST - 2,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [line.replace("\0", " ") for line in lines]
+
+
+def _flow(values: Mapping[str, str]) -> str:
+    return f"{{{', '.join(f'{name}: {value}' for name, value in values.items())}}}"
+
+
+def _sample(type_name: str, place: int, site: Site) -> str:
+    """A value that no field has by default, and mostly another one for each."""
+    if type_name in SCALARS:
+        return _scalar(type_name == "bool", type_name in ("float", "double"), place)
+    if type_name in site.schema.enums:
+        return _value(site.schema.enums[type_name], place)
+    return _value(site.schema.messages[type_name], place)
+
+
+def _value(kind: Type, place: int) -> str:
+    if isinstance(kind, Enum):
+        return next((name for name, number in kind.values if number), kind.values[0][0])
+    if isinstance(kind, MessageType):
+        return _flow({field.name: _value(field.type, index) for index, field in enumerate(kind.fields, place)})
+    return _scalar(isinstance(kind, Bool), isinstance(kind, Float), place)
+
+
+def _scalar(is_bool: bool, is_float: bool, place: int) -> str:
+    if is_bool:
+        return "true"
+    return f"{place + 1}.5" if is_float else str(place + 1)
+
+
+def _protos(table: RouteTable) -> Path | None:
+    return table.envelope.protos.value if table.envelope else None
+
+
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip())
 
 
 def _read(path: Path) -> str:
