@@ -176,7 +176,7 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
     outlets = plain_outlets(
         program.counters,
         {plan.endpoint: send for plan in program.senders},
-        {plan.topic: publish for plan in program.publishers},
+        {plan.label: publish for plan in program.publishers},
         _forget,
         counts=counts,
         publish_errors=(PublishError,),

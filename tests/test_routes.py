@@ -165,7 +165,7 @@ def published(rover: Program) -> Publish:
     def route(case: str, **values: object) -> dict[str, bytes]:
         sent: dict[str, bytes] = {}
         reports: list[object] = []
-        topics = [plan.topic for plan in rover.publishers]
+        topics = [plan.label for plan in rover.publishers]
         outlets = plain_outlets(
             rover.counters,
             send={sender.endpoint: len for sender in rover.senders},

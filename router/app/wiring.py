@@ -150,7 +150,7 @@ def wire(
     return Wiring(
         program=program,
         receive={name: inbound.receiver(name) for name in sockets.listeners},
-        take={plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions},
+        take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},
         feed=feeder(deadmen, keepers.inbound_deadman.guard),
         state=state,
         deadmen=deadmen,

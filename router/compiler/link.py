@@ -124,7 +124,7 @@ def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan]
     """One for each topic, however many routes name it: the check has seen to it that they agree."""
     plans: dict[str, TopicPlan] = {}
     for plan in (*(_topic(topic, declared, topic.topic.value) for topic, declared in used), *more):
-        plans.setdefault(plan.topic, plan)
+        plans.setdefault(plan.label, plan)
     return tuple(plans.values())
 
 
@@ -243,8 +243,8 @@ def _inbound(entry: CheckedInbound, gateway: str, counters: Counters) -> Inbound
     if inbound.deadman is not None and entry.stop is not None:
         deadman = _client_deadman(f"{gateway}:{topic}", inbound.deadman, topic, entry.stop, counters)
     return InboundPlan(
-        topic=topic,
-        name=inbound.topic.topic.value,
+        label=topic,
+        topic=inbound.topic.topic.value,
         type=entry.type,
         ttl=inbound.ttl.value if inbound.ttl else None,
         max_rate=inbound.max_rate.value if inbound.max_rate else None,

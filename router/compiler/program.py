@@ -75,14 +75,14 @@ class QosPlan:
 
 @dataclass(frozen=True, slots=True)
 class TopicPlan:
-    """One ROS publisher or subscription: `topic` is its label, `name` what the node is asked for, which ROS resolves.
+    """One ROS publisher or subscription: `label` names it in metrics, `topic` is the name that ROS resolves.
 
     `definitions` are what its CDR bytes are laid out after: of the type itself and of each type nested
     in it, by name, the fields as rclpy spells them.
     """
 
+    label: str
     topic: str
-    name: str
     type_name: str
     qos: QosPlan
     definitions: Mapping[str, tuple[tuple[str, str], ...]]
@@ -125,13 +125,13 @@ class DeadmanPlan:
 class InboundPlan:
     """A topic that a gateway's clients may publish on, with its type. `ttl` in ns, `max_rate` in Hz.
 
-    `topic` is what clients call it, `name` what the table does, which ROS resolves.
+    `label` is the absolute name that clients use, `topic` the name in the table, which ROS resolves.
 
     The datagrams of its deadman are CDR bytes, and the topic stands where a route's deadman has an endpoint.
     """
 
+    label: str
     topic: str
-    name: str
     type: MessageType
     ttl: int | None
     max_rate: float | None

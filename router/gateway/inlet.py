@@ -54,9 +54,9 @@ class _Topic:
         self.most = int(min(longest_text(plan.type, style) + _BESIDES, gateway.max_message))
         self.build = cdr_builder(plan.type, style)
         self.may_pass = RateLimit(plan.max_rate).may_pass if plan.max_rate is not None else None
-        self.published = counters.index("messages_published", gateway.name, plan.topic)
+        self.published = counters.index("messages_published", gateway.name, plan.label)
         self.dropped = {
-            reason: counters.index("messages_dropped", gateway.name, plan.topic, reason)
+            reason: counters.index("messages_dropped", gateway.name, plan.label, reason)
             for reason in INBOUND_DROP_REASONS
         }
 
@@ -138,7 +138,7 @@ class Inlet:
         if topic.plan.deadman is not None:
             self._outlets.feed_deadman[topic.plan.deadman.route](now)
         try:
-            self._outlets.publish[topic.plan.topic](checked.cdr)
+            self._outlets.publish[topic.plan.label](checked.cdr)
         except self._outlets.publish_errors as error:
             raise self._lost(topic, "publish_error", str(error), error) from error
         self._counts[topic.published] += 1
@@ -157,5 +157,5 @@ class Inlet:
     def _lost(self, topic: _Topic, reason: str, detail: str, error: Exception | None = None) -> RefusedError:
         self._counts[topic.dropped[reason]] += 1
         if reason != "rate_limited":  # which is what the table asks for
-            self._outlets.report(Report("drop", self._gateway, topic.plan.topic, reason, error, detail))
-        return RefusedError(reason, detail, topic.plan.topic)
+            self._outlets.report(Report("drop", self._gateway, topic.plan.label, reason, error, detail))
+        return RefusedError(reason, detail, topic.plan.label)

@@ -54,7 +54,7 @@ class Reader:
         if letter.is_quick:
             understood = _understood(letter, size, self._inlet)
             if isinstance(understood, Checked):
-                topic = understood.topic.plan.topic
+                topic = understood.topic.plan.label
             if not self._waiting[client, topic]:
                 self._settle(client, understood, arrived_ns)
                 return

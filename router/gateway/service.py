@@ -164,7 +164,7 @@ class GatewayService:
         if not self._has_page:
             return []
         rows = [
-            InboundRow(inbound.topic, inbound.type.name, schema_text(inbound.type), example(inbound.type))
+            InboundRow(inbound.label, inbound.type.name, schema_text(inbound.type), example(inbound.type))
             for inbound in self.plan.inbound.values()
         ]
         return [self._document("inbound", inbound_document(rows))]

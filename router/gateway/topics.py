@@ -65,7 +65,7 @@ class Topics:
         self._ledger = ledger
         self._tasks = tasks
         self._deliver = deliver
-        self._let_in = around.hub.resolved(each.name for each in plan.inbound.values())
+        self._let_in = around.hub.resolved(each.topic for each in plan.inbound.values())
         self._selector = TopicSelector(plan.settings, self._let_in)
         self._served: dict[str, Served] = {}
         self._not_installed: set[str] = set()

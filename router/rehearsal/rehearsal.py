@@ -43,7 +43,7 @@ class Rehearsal:
         inbound = Engine(program, outlets, arrived_at)
         self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
         outbound = OutboundEngine(program, outlets)
-        self._take = {plan.topic: outbound.taker(plan.topic) for plan in program.subscriptions}
+        self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
         self._data = b""
 
     def datagram(self, listener: str, peer: Peer, data: bytes, arrived_ns: int | None = None) -> None:
@@ -87,8 +87,8 @@ class Rehearsal:
         return Outlets(
             counts=counts,
             send=send,
-            publish={plan.topic: self._take_message for plan in program.publishers},
-            wanted={plan.topic: [True] for plan in program.publishers},
+            publish={plan.label: self._take_message for plan in program.publishers},
+            wanted={plan.label: [True] for plan in program.publishers},
             report=self._explain,
             clock_ns=lambda: self.now,
             wall_ns=lambda: self.now,

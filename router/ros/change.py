@@ -39,20 +39,20 @@ def opened_beside(
     """What `plans` want, by topic, and what of it was opened here: `now` is open. Raises StartError."""
     classes = {}
     for plan in plans:
-        if plan.topic in now and now[plan.topic].plan.type_name != plan.type_name:
-            kept = now[plan.topic].plan.type_name  # DDS has one type for a topic in a process
-            what = f"topic '{plan.topic}' is {kept} in the running router, and cannot become {plan.type_name}"
-            raise StartError(f"{spans[plan.topic]}: {what} while it runs; restart it, or take another name")
-        classes[plan.topic] = checked_class(plan.type_name, plan.definitions, spans[plan.topic])
+        if plan.label in now and now[plan.label].plan.type_name != plan.type_name:
+            kept = now[plan.label].plan.type_name  # DDS has one type for a topic in a process
+            what = f"topic '{plan.label}' is {kept} in the running router, and cannot become {plan.type_name}"
+            raise StartError(f"{spans[plan.label]}: {what} while it runs; restart it, or take another name")
+        classes[plan.label] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
     opened: list[Opened] = []
     with ExitStack() as opening:
         for plan in plans:
-            if plan.topic not in now or now[plan.topic].plan != plan:
-                opened.append(open_one(plan, classes[plan.topic], spans[plan.topic]))
+            if plan.label not in now or now[plan.label].plan != plan:
+                opened.append(open_one(plan, classes[plan.label], spans[plan.label]))
                 opening.callback(opened[-1].close)
         opening.pop_all()
-    beside = {each.plan.topic: each for each in opened}
-    return {plan.topic: beside.get(plan.topic) or now[plan.topic] for plan in plans}, opened
+    beside = {each.plan.label: each for each in opened}
+    return {plan.label: beside.get(plan.label) or now[plan.label] for plan in plans}, opened
 
 
 def left_by(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
@@ -69,14 +69,14 @@ def hand_over(
     from the one that is left. Returns what came to the new one alone: topic, CDR bytes and when it set out.
     """
     left = left_by(then, now)
-    anew = {each.plan.topic: then[each.plan.topic] for each in left if each.plan.topic in then}
+    anew = {each.plan.label: then[each.plan.label] for each in left if each.plan.label in then}
     if anew:
         sleep(_ON_ITS_WAY_S)  # what was taken from the one that is left before the pause has come to the other one then
     for each in anew.values():
         each.raw.take_all()
     if anew:
         sleep(_ON_ITS_WAY_S)
-    heard = {each.plan.topic: messages.finish(each.raw) for each in left}
+    heard = {each.plan.label: messages.finish(each.raw) for each in left}
     return [
         (topic, *message)
         for topic, each in anew.items()

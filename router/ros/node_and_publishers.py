@@ -109,11 +109,11 @@ class RosEdge:
             )
             opening.pop_all()
         for each in published:
-            earlier = self._publications.get(each.plan.topic)
+            earlier = self._publications.get(each.plan.label)
             if earlier is not None and earlier.wanted[0]:
                 each.meet()
         for subscription in subscribed:
-            if subscription.plan.topic in self._subscriptions:
+            if subscription.plan.label in self._subscriptions:
                 subscription.meet()
         return RosChange(publications, kept, [*published, *subscribed])
 

@@ -65,10 +65,10 @@ class Publication:
         """Raises StartError."""
         self.plan = plan
         self.wanted = [plan.qos.serves_late_joiners]
-        with _refusing(f"{span}: topic '{plan.topic}' cannot be published"), ExitStack() as opening:
+        with _refusing(f"{span}: topic '{plan.label}' cannot be published"), ExitStack() as opening:
             self._publisher = node.create_publisher(
                 message,
-                plan.name,
+                plan.topic,
                 qos_profile(plan.qos),
                 event_callbacks=peers.of_publisher(plan, self.wanted),
                 callback_group=ReentrantCallbackGroup(),  # the node's own keeps a little of each publisher for ever
@@ -122,8 +122,8 @@ class Subscription:
     def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
         """Raises StartError."""
         self.plan = plan
-        with _refusing(f"{span}: topic '{plan.topic}' cannot be subscribed to"):
-            self.raw = RawSubscription(node, message, plan.name, qos_profile(plan.qos), peers.of_subscription(plan))
+        with _refusing(f"{span}: topic '{plan.label}' cannot be subscribed to"):
+            self.raw = RawSubscription(node, message, plan.topic, qos_profile(plan.qos), peers.of_subscription(plan))
         self.events: Sequence[EventHandler] = self.raw.events
         self.topic: str = self.raw.handle.get_topic_name()
         self.qos = subscription_qos(self.raw.handle.pointer)

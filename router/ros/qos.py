@@ -123,17 +123,17 @@ class PeerEvents:
         """They keep `wanted` up to date as well: whether anybody listens."""
 
         def on_matched(status: Any) -> None:
-            (self.subscribed.add if status.current_count else self.subscribed.discard)(plan.topic)
+            (self.subscribed.add if status.current_count else self.subscribed.discard)(plan.label)
             wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
             if status.total_count_change > 0:
-                self._met(plan.topic)
+                self._met(plan.label)
 
         def on_incompatible_qos(status: Any) -> None:
             sentence = "a subscriber asks for a QoS that the table does not offer, and gets nothing"
             self._on_incompatible_qos(sentence, plan, status)
 
         def on_incompatible_type(_: Any) -> None:
-            logger.warning("a subscriber expects another type, and gets nothing", topic=plan.topic, type=plan.type_name)
+            logger.warning("a subscriber expects another type, and gets nothing", topic=plan.label, type=plan.type_name)
 
         return PublisherEventCallbacks(
             matched=on_matched, incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type
@@ -164,15 +164,15 @@ class PeerEvents:
             self._on_incompatible_qos(sentence, plan, status)
 
         def on_incompatible_type(_: Any) -> None:
-            logger.warning("a publisher has another type, and is not heard", topic=plan.topic, type=plan.type_name)
+            logger.warning("a publisher has another type, and is not heard", topic=plan.label, type=plan.type_name)
 
         return SubscriptionEventCallbacks(incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type)
 
     def _on_incompatible_qos(self, sentence: str, plan: TopicPlan, status: Any) -> None:
         """The middleware names one policy: the last one of the last peer."""
         policy = qos_policy_name_from_kind(status.last_policy_kind).lower()
-        self._looks[plan.topic] = _EMPTY_LOOKS
-        logger.warning(sentence, topic=plan.topic, policy=policy)
+        self._looks[plan.label] = _EMPTY_LOOKS
+        logger.warning(sentence, topic=plan.label, policy=policy)
 
 
 def _apart(node: Node, publisher: Publication | None, subscription: Subscription | None) -> Iterator[str]:

@@ -88,7 +88,7 @@ class Rig:
         self.published: list[tuple[str, bytes]] = []
         self.reports: list[Report] = []
         self.failures: dict[str, Exception] = {}
-        self.wanted = {plan.topic: [plan.topic not in unwanted] for plan in made.publishers}
+        self.wanted = {plan.label: [plan.label not in unwanted] for plan in made.publishers}
         self.machines: list[Machine] = []
         guarded = Guarded(self.counts, self._guard)
         send = {plan.endpoint: self._sender(plan.endpoint) for plan in made.senders}
@@ -101,7 +101,7 @@ class Rig:
         self.outlets = Outlets(
             counts=self.counts,
             send=send,
-            publish={plan.topic: self._outlet(plan.topic, self.published) for plan in made.publishers},
+            publish={plan.label: self._outlet(plan.label, self.published) for plan in made.publishers},
             wanted=self.wanted,
             report=self.reports.append,
             clock_ns=lambda: self.now,
@@ -117,7 +117,7 @@ class Rig:
         engine = Engine(made, self.outlets, arrived_at)
         self.receivers = {plan.name: engine.receiver(plan.name) for plan in made.listeners}
         outbound = OutboundEngine(made, self.outlets)
-        self.takers = {plan.topic: outbound.taker(plan.topic) for plan in made.subscriptions}
+        self.takers = {plan.label: outbound.taker(plan.label) for plan in made.subscriptions}
         self.changes: list[tuple[str, bool]] = []
 
     def receive(self, data: bytes, peer: tuple[str, int] = SENSOR_BOARD, listener: str = "trimmed") -> None:

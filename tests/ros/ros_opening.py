@@ -40,5 +40,5 @@ def open_ros(
     args: Sequence[str] = (),
     incompatible: Callable[[str, str, int], None] = lambda *_: None,
 ) -> RosEdge:
-    spans = {plan.topic: SPAN for plan in (*plans, *subscriptions)}
+    spans = {plan.label: SPAN for plan in (*plans, *subscriptions)}
     return RosEdge(NodeSettings("router_test", "/"), plans, subscriptions, spans, args, incompatible)

@@ -59,7 +59,7 @@ class Receiver:
         self.stamps: list[int] = []
         self.failures: list[Exception] = []
         self.ros = open_ros(subscriptions=subscriptions)
-        self._topics = [plan.topic for plan in subscriptions]
+        self._topics = [plan.label for plan in subscriptions]
 
     def start(self) -> None:
         self.ros.start({topic: self._receiver(topic) for topic in self._topics}, self.failures.append)
