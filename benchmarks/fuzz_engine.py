@@ -21,7 +21,7 @@ from pathlib import Path
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine import MAX_DATAGRAM, Engine, Report
+from router.engine import MAX_DATAGRAM, InboundEngine, Report
 from tests.engine.ledger import Ledger
 from tests.engine.plain import plain_outlets
 from tests.tables import ROUTES
@@ -183,7 +183,7 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
     )
     timed = replace(outlets, clock_ns=time.monotonic_ns, wall_ns=time.time_ns)
     listener = program.listeners[0].name
-    return Engine(program, timed, {listener: time.time_ns}).receiver(listener)
+    return InboundEngine(program, timed, {listener: time.time_ns}).receiver(listener)
 
 
 def _forget(report: Report) -> None:

@@ -13,7 +13,7 @@ from sensor_msgs.msg import FluidPressure, Imu, MagneticField, NavSatFix, NavSat
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine import Engine
+from router.engine import InboundEngine
 from router.table.model import Route, RouteTable, Transport
 from tests.engine.plain import plain_outlets
 from tests.tables import ROUTES
@@ -173,7 +173,7 @@ def published(rover: Program) -> Publish:
             report=reports.append,
             wall_ns=WALL_NS,
         )
-        engine = Engine(rover, outlets, {"rover": lambda: WALL_NS})
+        engine = InboundEngine(rover, outlets, {"rover": lambda: WALL_NS})
         envelope = rover.envelope.message_class(**{case: values})
         engine.receiver("rover")(envelope.SerializeToString(), ("192.168.0.30", 8))
         assert reports == []

@@ -31,7 +31,7 @@ from router.observe.reports import Reporter
 from router.observe.running import ReloadResult
 from router.recording.mirror import Mirror
 from router.table.model import Address
-from router.threads.background import background_threads
+from router.threads import background_threads
 
 if TYPE_CHECKING:
     from router.gateway.subscribers import Subscriber

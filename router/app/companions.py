@@ -14,7 +14,7 @@ from router.log import logger
 from router.observe.metrics import Asked
 from router.observe.running import Running
 from router.table.model import Address
-from router.threads.daemon_thread import DaemonThread
+from router.threads import DaemonThread
 
 if TYPE_CHECKING:
     from router.recording.recorder import Recorder

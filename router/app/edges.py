@@ -16,13 +16,12 @@ from router.app.topics import open_ros, places, wants_ros, who_names
 from router.app.wiring import Surroundings, Wiring, begin, wire
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM
-from router.engine.state import State
+from router.engine.binding import State
+from router.engine.dispatch import Receive
 from router.log import logger
-from router.net.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS
-from router.net.reader import Receive
-from router.net.receiver import ReceiveThread
+from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, ReceiveThread
 from router.ros.environment import check_environment
-from router.threads.background import background_threads
+from router.threads import background_threads
 
 if TYPE_CHECKING:
     from router.gateway.thread import GatewayChange, GatewayThread
@@ -92,7 +91,7 @@ class Edges:
 
     def rewire(self) -> None:
         """Asks `tee` again."""
-        self._receiving.between(self._give)
+        self._receiving.call_between(self._give)
 
     # -- another program -----------------------------------------------------------------------------------------
 
@@ -112,7 +111,7 @@ class Edges:
             if self.wiring is None:
                 begin(program, self._around, sockets, state)
             topics = self._prepare_topics(program, undo)
-            undo.callback(lambda: self._around.keepers.release(list(state.made())))
+            undo.callback(lambda: self._around.keepers.release(list(state.added())))
             wiring = wire(program, self._around, sockets, self._ros, topics, state)
             if self.wiring is None:
                 wiring.begin(self._around.keepers)
@@ -128,7 +127,7 @@ class Edges:
         try:
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
-            self._receiving.between(lambda: self._swap(change))
+            self._receiving.call_between(lambda: self._swap(change))
         except BaseException:
             change.undo.close()
             raise
@@ -162,7 +161,7 @@ class Edges:
             last_first.callback(change.sockets.left.close)
             if self._ros is not None and change.topics is not None:
                 last_first.callback(self._ros.finish, change.topics)
-            last_first.callback(change.wiring.state.settle)
+            last_first.callback(change.wiring.state.forget_previous)
             if self.gateways is not None and change.gateways is not None:
                 last_first.callback(self.gateways.finish, change.gateways)
                 last_first.callback(self._follow_drops, self.gateways, change.gateways)
@@ -219,7 +218,7 @@ class Edges:
         return FOR_SUBSCRIBERS if self._ros is not None and self._ros.subscribed else FOR_SOCKETS
 
     def _give(self) -> None:
-        self._receiving.give_to(self._teed())
+        self._receiving.replace_receivers(self._teed())
 
     def _teed(self) -> dict[str, Receive]:
         receive = self.wiring.receive if self.wiring else {}

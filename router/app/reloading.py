@@ -23,8 +23,7 @@ from router.compiler.program import Program
 from router.errors import Diagnostic, Severity, StartError
 from router.log import logger
 from router.observe.running import ReloadResult
-from router.threads.background import background_threads
-from router.threads.parking import StuckError
+from router.threads import StuckError, background_threads
 
 
 class Reloader:

@@ -11,10 +11,10 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
+from router.app.timers import TimerThread
 from router.clock import monotonic_ns
 from router.log import logger
-from router.net.inherited import inherited
-from router.threads.timekeeper import Timekeeper
+from router.net.udp import inherited
 
 _LOOKS = 4
 """How often the watchdog looks in the time that it is given."""
@@ -38,7 +38,7 @@ def supervised(progress: Callable[[], int]) -> Iterator[None]:
         tell("READY=1")
         if (limit := _watchdog_ns()) is not None:
             faulthandler.enable()
-            keeper = Timekeeper("watchdog", monotonic_ns, _tell_fault)
+            keeper = TimerThread("watchdog", monotonic_ns, _tell_fault)
             keeper.add(Watchdog(progress, limit // _LOOKS, monotonic_ns()))
             keeper.start()
             ending.callback(keeper.stop)

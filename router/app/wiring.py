@@ -9,18 +9,16 @@ from typing import TYPE_CHECKING
 
 from router.app.accounts import Accounts
 from router.app.sockets import SocketChange
+from router.app.timers import TimerThread
 from router.clock import monotonic_ns, wall_ns
 from router.compiler.program import DeadmanPlan, Program
-from router.engine import Engine, OutboundEngine
-from router.engine.binding import Guarded, Outlets
+from router.engine import InboundEngine, OutboundEngine
+from router.engine.binding import EngineContext, State, TimerGroup
 from router.engine.deadman import Deadman, FeedMaker, feeder
-from router.engine.outbound import Take
+from router.engine.dispatch import Receive, Take
 from router.engine.pacing import Pacer
-from router.engine.state import State
 from router.log import logger
-from router.net.reader import Receive
 from router.observe.reports import Reporter
-from router.threads.timekeeper import Timekeeper
 
 if TYPE_CHECKING:
     from router.ros.change import RosChange
@@ -36,7 +34,7 @@ class Keepers:
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self.deadman, self.inbound_deadman, self.pacing, self.collecting = (
-            Timekeeper(name, monotonic_ns, failed) for name in ("deadman", "inbound deadman", "pacing", "collect")
+            TimerThread(name, monotonic_ns, failed) for name in ("deadman", "inbound deadman", "pacing", "collect")
         )
 
     def start(self) -> None:
@@ -79,14 +77,14 @@ class Wiring:
         """The router starts: has deadmen that publish do so as soon as a subscriber is met."""
         for plan in _inbound_deadmen(self.program):
             deadman = self.deadmen[plan.route]
-            keepers.inbound_deadman.guard(deadman, deadman.wait_to_meet)(monotonic_ns())
+            keepers.inbound_deadman.locked(deadman, deadman.await_subscribers)(monotonic_ns())
 
     def meet(self, topic: str, keepers: Keepers) -> None:
         """Somebody new subscribes to `topic`."""
         for plan in _inbound_deadmen(self.program):
             if topic in dict(plan.datagrams):
                 deadman = self.deadmen[plan.route]
-                _tell_start(plan.route, keepers.inbound_deadman.guard(deadman, deadman.meet)(monotonic_ns()))
+                _tell_start(plan.route, keepers.inbound_deadman.locked(deadman, deadman.greet)(monotonic_ns()))
 
     def forget(self) -> None:
         """Nobody calls the functions any more. Each is in a ring with its globals; cut, they are gone at once."""
@@ -103,18 +101,18 @@ class Wiring:
             before = earlier.deadmen.get(route) if earlier else None
             if before is not None and before is not deadman:
                 keeper = keepers.inbound_deadman if route in inbound else keepers.deadman
-                keeper.guard(deadman, deadman.inherit)(before)
+                keeper.locked(deadman, deadman.replace)(before)
         keepers.release(list(self.state.left()))
         places = {(each.route, target.target) for each in self.program.handlers for target in each.targets}
         for pacer in self.pacers.values():
-            keepers.pacing.guard(pacer, pacer.serve_only)(monotonic_ns(), places)
+            keepers.pacing.locked(pacer, pacer.keep_only)(monotonic_ns(), places)
 
 
 def begin(program: Program, around: Surroundings, sockets: SocketChange, state: State) -> None:
     """The router starts: has the deadmen of routes send. That needs the sockets only; ROS takes seconds to open."""
     for plan in program.deadmen:
         deadman = _deadman(plan, program, around, _looking(sockets), state)
-        _tell_start(plan.route, around.keepers.deadman.guard(deadman, deadman.begin)())
+        _tell_start(plan.route, around.keepers.deadman.locked(deadman, deadman.start)())
 
 
 def wire(
@@ -130,7 +128,7 @@ def wire(
     send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
     deadmen = _deadmen(program, around, _looking(sockets), ros, state)
     pacers = _pacers(program, keepers.pacing, send, state)
-    outlets = Outlets(
+    context = EngineContext(
         counts=accounts.receive,
         send=send,
         publish={topic: each.publish for topic, each in topics.publications.items()} if topics else {},
@@ -138,24 +136,24 @@ def wire(
         report=around.reporter.report,
         clock_ns=monotonic_ns,
         wall_ns=wall_ns,
-        pacing=Guarded(accounts.pacing, keepers.pacing.guard),
-        collecting=Guarded(accounts.collecting, keepers.collecting.guard),
-        feed=feeder(deadmen, keepers.deadman.guard),
+        pacing=TimerGroup(accounts.pacing, keepers.pacing.locked),
+        collecting=TimerGroup(accounts.collecting, keepers.collecting.locked),
+        feed=feeder(deadmen, keepers.deadman.locked),
         publish_errors=ros.publish_errors if ros else (),
         pacers=pacers,
         state=state,
     )
-    inbound = Engine(program, outlets, {name: each.arrived_at for name, each in sockets.listeners.items()})
-    outbound = OutboundEngine(program, replace(outlets, counts=accounts.ros))
+    inbound = InboundEngine(program, context, {name: each.arrived_at for name, each in sockets.listeners.items()})
+    outbound = OutboundEngine(program, replace(context, counts=accounts.ros))
     return Wiring(
         program=program,
         receive={name: inbound.receiver(name) for name in sockets.listeners},
         take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},
-        feed=feeder(deadmen, keepers.inbound_deadman.guard),
+        feed=feeder(deadmen, keepers.inbound_deadman.locked),
         state=state,
         deadmen=deadmen,
         pacers=pacers,
-        cuts=(inbound.forget, outbound.forget),
+        cuts=(inbound.close, outbound.close),
     )
 
 
@@ -196,7 +194,7 @@ def _tell_start(route: str, sent_to: Sequence[str]) -> None:
         logger.info("the deadman has sent its payload, since the router starts", route=route, to=list(sent_to))
 
 
-def _pacers(program: Program, keeper: Timekeeper, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
+def _pacers(program: Program, keeper: TimerThread, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
     pacers = {}
     for plan in program.senders:
         if plan.budget:

@@ -114,7 +114,7 @@ def _print(batches: Iterable[Sequence[Heard | HeardMessage]], args: argparse.Nam
 
 
 def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> None:
-    from router.threads.background import background_threads
+    from router.threads import background_threads
     from router.tools.conditions import Condition
     from router.tools.places import peer_names
     from router.tools.running_router import tap

@@ -1,8 +1,7 @@
-"""What happens to a message: bytes in, calls out. Knows no socket, no rclpy, no thread and no clock of its own."""
+"""What happens to a message: bytes in, calls out. Sockets, ROS, threads and clocks are handed in."""
 
-from router.engine.dispatch import Engine
-from router.engine.outbound import OutboundEngine
-from router.engine.outcome import Report
-from router.engine.settling import MAX_DATAGRAM
+from router.engine.delivery import Report
+from router.engine.dispatch import InboundEngine, OutboundEngine
+from router.engine.slow_path import MAX_DATAGRAM
 
-__all__ = ["MAX_DATAGRAM", "Engine", "OutboundEngine", "Report"]
+__all__ = ["MAX_DATAGRAM", "InboundEngine", "OutboundEngine", "Report"]

@@ -1,47 +1,73 @@
-"""Turns a handler's code into a function: its namespace gets counters, senders, publishers, limits and machines."""
+"""Turns a handler's code into a function: its namespace gets counters, senders, publishers, limits and timers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import FunctionType
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from router.compiler.metrics import Counters
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
-from router.engine.delivery import Deliver, Feed, immediately
+from router.engine.delivery import MAPPING_FAILURES, Deliver, Feed, FrameOutcome, Outcome, Report, immediately
 from router.engine.freshness import Freshness
-from router.engine.latest import Latest
-from router.engine.limiter import RateLimit
-from router.engine.machine import Guard
-from router.engine.outcome import MAPPING_FAILURES, FrameOutcome, Outcome, Report
-from router.engine.pacing import Pacer
-from router.engine.state import State
+from router.engine.pacing import Latest, Pacer, RateLimit
+from router.engine.timers import Locked
 from router.table.model import Keep
 
+T = TypeVar("T")
+
 Handle = Callable[..., None]
-"""A generated function; compiler.handlers says what it takes."""
+"""A generated function; its arguments are described in compiler.handlers."""
+
+
+class State:
+    """What the handlers of a program keep from one message to the next, by key; survives a reload.
+
+    A program's state takes over from that of the `previous` program what has the same key: then both programs use the
+    same object, whichever of them runs. A key therefore has to contain everything that its object depends on.
+    """
+
+    def __init__(self, previous: State | None = None) -> None:
+        self._previous: dict[Hashable, object] = previous._kept if previous else {}
+        self._kept: dict[Hashable, object] = {}
+
+    def keep(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return the object with this key, of this program or the previous one; make it if there is none."""
+        if key not in self._kept:
+            self._kept[key] = self._previous[key] if key in self._previous else make()
+        return cast("T", self._kept[key])
+
+    def added(self) -> Iterator[object]:
+        """The objects that the previous program does not have."""
+        return (value for key, value in self._kept.items() if key not in self._previous)
+
+    def left(self) -> Iterator[object]:
+        """The objects that only the previous program has; none after `forget_previous`."""
+        return (value for key, value in self._previous.items() if key not in self._kept)
+
+    def forget_previous(self) -> None:
+        self._previous = {}
 
 
 @dataclass(frozen=True, slots=True)
-class Guarded:
-    """What serves machines: `guard` makes their calls safe, and `counts` are touched under it only."""
+class TimerGroup:
+    """Timers with one lock. `counts` are changed only under it."""
 
     counts: list[int]
-    guard: Guard
+    locked: Locked
 
 
 @dataclass(frozen=True, slots=True)
-class Outlets:
-    """What an engine hands to its handlers.
+class EngineContext:
+    """What an engine's handlers use of the running router. Clocks in ns.
 
-    `send` takes a datagram, by endpoint name, and may raise OSError. `publish` takes CDR bytes, by topic,
-    and may raise `publish_errors`. `wanted` says by topic whether anybody listens, in a list of one that
-    its owner keeps up to date. `report` hears of every loss; it is called only for those. `counts` belong to the
-    thread that calls the handlers. `feed` makes what tells deadmen of a route's commands (see engine.deadman).
-    `pacers` are those of the endpoints with a budget, served by `pacing`; `collecting` serves frames. `state` has what
-    handlers remember. Clocks in ns.
+    `send` takes a datagram, by endpoint, and may raise OSError. `publish` takes CDR bytes, by topic, and may raise
+    `publish_errors`. `wanted`, by topic, is a list of one that its owner keeps up to date: whether anybody subscribes.
+    `report` is called for losses only. `counts` belong to the thread that calls the handlers. `feed(route, names)`
+    returns what feeds a command's deadmen (see engine.deadman). `pacers` are those of the endpoints with a budget, in
+    the group `pacing`; frames are collected in the group `collecting`.
     """
 
     counts: list[int]
@@ -51,96 +77,93 @@ class Outlets:
     report: Callable[[Report], None]
     clock_ns: Callable[[], int]
     wall_ns: Callable[[], int]
-    pacing: Guarded
-    collecting: Guarded
+    pacing: TimerGroup
+    collecting: TimerGroup
     feed: Callable[[str, Sequence[str]], Feed]
     publish_errors: tuple[type[Exception], ...] = ()
     pacers: Mapping[str, Pacer] = field(default_factory=dict)
     state: State = field(default_factory=State)
 
 
-def bind(handler: Handler, counters: Counters, outlets: Outlets, freshness: Freshness) -> FunctionType:
+def bind(handler: Handler, counters: Counters, context: EngineContext, freshness: Freshness) -> FunctionType:
+    """Execute the handler's code in a namespace of its own, and return the function that it defines."""
     namespace: dict[str, Any] = {
         **handler.constants,
-        "counts": outlets.counts,
-        "FAILURES": (*MAPPING_FAILURES, OSError, *outlets.publish_errors),
-        "clock_ns": outlets.clock_ns,
+        "counts": context.counts,
+        "FAILURES": (*MAPPING_FAILURES, OSError, *context.publish_errors),
+        "clock_ns": context.clock_ns,
         "monotonic": freshness.born,
     }
     if handler.collect_timeout is not None:
-        namespace["collect"] = _collect(handler, handler.collect_timeout, counters, outlets)
+        namespace["collect"] = _collect(handler, handler.collect_timeout, counters, context)
     for target in handler.targets:
-        namespace |= _bound(target, handler, counters, outlets)
+        namespace |= _target_names(target, handler, counters, context)
     exec(handler.code, namespace)  # noqa: S102 - code that our compiler made of a checked table
     handle: FunctionType = namespace[handler.function]
     return handle
 
 
 def unbind(handle: FunctionType) -> None:
-    """Nobody calls it any more. It is in a ring with its globals, which keeps both until this cuts it."""
+    """Clear the namespace of a handler that is no longer called: it refers to the handler, a reference cycle."""
     handle.__globals__.clear()
 
 
-def _bound(target: TargetPlan, handler: Handler, counters: Counters, outlets: Outlets) -> dict[str, Any]:
+def _target_names(target: TargetPlan, handler: Handler, counters: Counters, context: EngineContext) -> dict[str, Any]:
     name, route = target.name, handler.route
     place = route, handler.topic, target
-    bound: dict[str, Any] = {f"lost_{name}": Outcome(counters, outlets.counts, route, target, outlets.report).failed}
+    names: dict[str, Any] = {f"lost_{name}": Outcome(counters, context.counts, route, target, context.report).failed}
     if target.is_topic:
-        bound[f"wanted_{name}"] = outlets.wanted[target.target]
+        names[f"wanted_{name}"] = context.wanted[target.target]
     if target.is_deferred:
-        outcome = Outcome(counters, outlets.pacing.counts, route, target, outlets.report)
-        bound[f"deliver_{name}"] = _deliver(place, outcome, outlets)
+        outcome = Outcome(counters, context.pacing.counts, route, target, context.report)
+        names[f"deliver_{name}"] = _deliver(place, outcome, context)
     elif target.is_topic:
-        bound[f"publish_{name}"] = outlets.publish[target.target]
+        names[f"publish_{name}"] = context.publish[target.target]
     else:
-        bound[f"send_{name}"] = outlets.send[target.target]
+        names[f"send_{name}"] = context.send[target.target]
         if target.deadmen:
-            bound[f"feed_{name}"] = outlets.feed(route, target.deadmen)
+            names[f"feed_{name}"] = context.feed(route, target.deadmen)
     if target.max_rate is not None and target.keep is Keep.FIRST:
         rate = target.max_rate
-        bound[f"limit_{name}"] = outlets.state.keep(("limit", *place), lambda: RateLimit(rate)).may_pass
-    return bound
+        names[f"limit_{name}"] = context.state.keep(("limit", *place), lambda: RateLimit(rate)).may_pass
+    return names
 
 
 def _collect(
-    handler: Handler, timeout: int, counters: Counters, outlets: Outlets
+    handler: Handler, timeout: int, counters: Counters, context: EngineContext
 ) -> Callable[..., list[object] | None]:
-    counts = outlets.collecting.counts
+    counts = context.collecting.counts
     targets = tuple(target for target in handler.targets if target.is_topic)
 
     def collector() -> Collector:
-        outcomes = [FrameOutcome(counters, counts, handler.route, target, outlets.report) for target in targets]
+        outcomes = [FrameOutcome(counters, counts, handler.route, target, context.report) for target in targets]
         return Collector(timeout, outcomes)
 
-    parts = handler.case.message_class  # those of another one would not make a frame with them
-    kept = outlets.state.keep(("collect", handler.route, timeout, parts, targets), collector)
-    return outlets.collecting.guard(kept, kept.offer)
+    parts = handler.case.message_class  # parts of different classes do not make a frame
+    kept = context.state.keep(("collect", handler.route, timeout, parts, targets), collector)
+    return context.collecting.locked(kept, kept.offer)
 
 
-Place = tuple[str, "str | None", TargetPlan]
-"""A target of a route, for one of the topics that it comes from."""
+def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, context: EngineContext) -> Deliver:
+    """Return the Deliver of a target whose messages may wait. `place` is the route, its topic if any, and the target.
 
-
-def _deliver(place: Place, outcome: Outcome, outlets: Outlets) -> Deliver:
-    """Through what holds the target's messages back, to where they go and are counted.
-
-    Deadmen are told there as well: their lock is taken while that of pacing is held, never the other way round.
+    Deadmen are fed when a message leaves: their lock is taken while that of `pacing` is held, never in reverse order.
     """
-    (route, _, target), guard = place, outlets.pacing.guard
-    feed = outlets.feed(route, target.deadmen) if target.deadmen else None
-    end: object  # where they go, whatever is between
-    pacer = None if target.is_topic else outlets.pacers.get(target.target)
+    (route, _, target), locked = place, context.pacing.locked
+    feed = context.feed(route, target.deadmen) if target.deadmen else None
+    destination: object
+    pacer = None if target.is_topic else context.pacers.get(target.target)
     if pacer is not None:
-        end, deliver = pacer, pacer.queue(target.priority, outcome, feed)
+        destination, deliver = pacer, pacer.queue(target.priority, outcome, feed)
     elif target.is_topic:
-        end = publish = outlets.publish[target.target]
-        deliver = immediately(publish, outcome, outlets.publish_errors)
+        destination = publish = context.publish[target.target]
+        deliver = immediately(publish, outcome, context.publish_errors)
     else:
-        end = send = outlets.send[target.target]
+        destination = send = context.send[target.target]
         deliver = immediately(send, outcome, feed=feed)
     if target.keep is Keep.LATEST and target.max_rate is not None:
         rate = target.max_rate
-        latest = outlets.state.keep(("latest", *place, end), lambda: Latest(rate, deliver, outcome))
-        return guard(latest, latest.offer)
+        latest = context.state.keep(("latest", *place, destination), lambda: Latest(rate, deliver, outcome))
+        return locked(latest, latest.offer)
     assert pacer is not None  # noqa: S101 - the other reason to defer
-    return guard(pacer, deliver)
+    return locked(pacer, deliver)

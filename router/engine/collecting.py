@@ -1,7 +1,4 @@
-"""`collect`: the messages of a frame, which arrive one by one and in any order, come out as one list.
-
-Knows no message: a part is any object, and its place in the frame is told.
-"""
+"""`collect`: collects the parts of a frame, which arrive one by one in any order, into one list."""
 
 from __future__ import annotations
 
@@ -10,17 +7,17 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from router.engine.machine import Machine
+from router.engine.timers import Timer
 from router.errors import MappingError
 
 MOST_FRAMES = 64
 MOST_PARTS = 8192
 MOST_CLOSED = 1024
-"""What is held at most, whatever the numbers say: open frames, parts of all of them, keys of closed frames."""
+"""Limits of what is held: open frames, parts of all of them, keys of closed frames."""
 
 
 class PartOutcome(Protocol):
-    """What becomes of a part at one target of frames; FrameOutcome counts that in the counters."""
+    """Counts what becomes of the parts at one target; `FrameOutcome` for the router's counters."""
 
     def collected(self) -> None: ...
 
@@ -36,16 +33,16 @@ class _Frame:
     parts: dict[int, object] = field(default_factory=dict)
 
 
-class Collector(Machine):
-    """Collects the frames of one route. A frame has `timeout` ns from its first part.
+class Collector(Timer):
+    """Collects the frames of one route. A frame ends `timeout` ns after its first part.
 
-    `outcomes` are those of the targets that get the frames; in each, every part counts once. The first part of a
-    frame stands for the whole: if it becomes complete, who offered the last part counts what becomes of the
-    list; if not, it is dropped as `incomplete` here. The others are collected. Copies are filtered, and so is, for
-    another `timeout`, what comes after the end of its frame: that is a copy too, or a loss that was told already.
+    `outcomes` are those of the targets that get the frames; each counts every part once. The first part stands for the
+    whole frame: the caller counts the complete list, and an incomplete frame is dropped as `incomplete` here. The other
+    parts are counted as collected. Copies are filtered, as are for another `timeout` parts of a frame that has ended:
+    they are copies, or of a frame that was counted as lost.
 
-    A frame also ends when there is no room, the oldest first, and when a part with the same key tells another
-    count: that one opens a new frame. A part of a frame that would never have room is dropped as `incomplete`.
+    A frame also ends when there is no room, the oldest first, and when a part with the same key has another count,
+    which opens a new frame. A part of a frame that is larger than MOST_PARTS is dropped as `incomplete`.
     """
 
     def __init__(self, timeout: int, outcomes: Sequence[PartOutcome]) -> None:
@@ -57,9 +54,9 @@ class Collector(Machine):
         self._held = 0
 
     def offer(self, now: int, key: Hashable, count: int, index: int, part: object) -> list[object] | None:
-        """The parts 0 to `count` - 1 of a frame that is complete with this one, None for any other part.
+        """Return the parts 0 to `count` - 1 if this one completes its frame, else None.
 
-        Raises MappingError for numbers that no frame has; the part is then not counted here.
+        Raises MappingError if `index` is out of range; the part is then not counted here.
         """
         if not 0 <= index < count:
             raise MappingError(f"a frame of {count} has no part {index}")
@@ -82,7 +79,7 @@ class Collector(Machine):
                 outcome.collected()
         frame.parts[index] = part
         self._held += 1
-        return self._settle(now, key, frame)
+        return self._completed(now, key, frame)
 
     def due(self, now: int) -> None:
         while self._frames and self._oldest.ends_at <= now:
@@ -102,8 +99,8 @@ class Collector(Machine):
         frame = self._frames[key] = _Frame(count, now + self._timeout)
         return frame
 
-    def _settle(self, now: int, key: Hashable, frame: _Frame) -> list[object] | None:
-        """Takes the frame out if it is complete; makes room if it is not."""
+    def _completed(self, now: int, key: Hashable, frame: _Frame) -> list[object] | None:
+        """Remove and return the frame if it is complete; make room if it is not."""
         complete = None
         if len(frame.parts) == frame.count:
             complete = [frame.parts[index] for index in range(frame.count)]

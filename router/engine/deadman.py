@@ -1,4 +1,4 @@
-"""What is sent in a route's place when its commands stop coming. Knows no clock: whoever calls tells the time."""
+"""`deadman`: sends a payload in place of a route's commands when these stop coming."""
 
 from __future__ import annotations
 
@@ -7,25 +7,24 @@ from dataclasses import dataclass
 
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
-from router.engine.delivery import Feed
-from router.engine.machine import Guard
-from router.engine.outcome import Report
+from router.engine.delivery import Feed, Report
+from router.engine.timers import Locked, Timer
 
 FeedMaker = Callable[[str, Sequence[str]], Feed]
-"""Makes of a route's name, and of the names in TargetPlan.deadmen, the call that tells all these deadmen at once."""
+"""Returns for a route and the names in its TargetPlan.deadmen the call that feeds or disarms all of these at once."""
 
 _NEVER = 1 << 63
 
 START = 10_000_000_000
-"""How long after the router's start a new subscriber may be one who was there before (ns): discovery takes less."""
+"""For so many ns after the start, a new subscriber may be one that was there before: discovery takes less."""
 
 GREETING = 500_000_000
-"""How long after that the subscriber knows the publisher as well, in ns."""
+"""ns after which a subscriber that was discovered has discovered the publisher as well."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Destination:
-    """One datagram that is ready to be sent, and the slots in which it is counted."""
+    """A datagram that is ready to be sent, and the indexes of its counters."""
 
     endpoint: str
     datagram: bytes
@@ -34,21 +33,21 @@ class _Destination:
     errors: int
 
 
-class Deadman:
-    """A machine with three states.
+class Deadman(Timer):
+    """The deadman of one route, a state machine with three states.
 
-    unarmed: no command was sent yet, or others have taken over since, and nothing is due.
-    armed:   the next thing due is `timeout` after the last command was sent. Then it trips.
-    tripped: sends at once, then on the grid of the time at which it was due to trip.
+    unarmed: no command was sent yet, or another route has taken over; nothing is due.
+    armed:   trips `timeout` after the last command was sent.
+    tripped: has sent the payload when it tripped, and repeats it on the grid of the time at which that was due.
 
-    A command that is sent arms it, whatever its state (`feed`); one of a route that it hands over to disarms it
-    (`relieve`). Both are to be called right before the command is sent, not when it begins to wait, so that nothing the
-    deadman sends comes behind the command. Called for a deadman that another one has replaced, they act on that one:
-    what waited since before a reload is sent after it.
+    Sending a command arms the deadman in any state (`feed`); a command of a route that it hands over to disarms it
+    (`disarm`). Both are to be called right before the command is sent, not when it begins to wait, so that the deadman
+    sends nothing behind the command. Calls of a deadman that was replaced act on its successor: what waits during a
+    reload is sent afterwards.
 
-    `begin` and `meet` send the payload at the start of the router, and change no state. `send` is by endpoint and may
-    raise OSError, which ends nothing. `changed` hears the route's name and whether the deadman is active now. All times
-    in ns of the monotonic clock.
+    `start` and `greet` send the payload when the router starts, without a change of state. `send` is by endpoint and
+    may raise OSError, which is counted and reported. `changed` is called with the route and whether the deadman is now
+    tripped. All times in ns of the monotonic clock.
     """
 
     def __init__(
@@ -61,9 +60,9 @@ class Deadman:
         changed: Callable[[str, bool], None],
     ) -> None:
         self.next_due: int | None = None
-        self._meets_until = 0
-        self._greets = False  # what is due is no trip, but the second message to a new subscriber
-        self._acting = [self]  # shared with all that it replaced: the one that took the place of them
+        self._greets_until = 0
+        self._greets_again = False  # what is due is not a trip, but the second message to a new subscriber
+        self._acting = [self]  # shared with all that it has replaced
         self._plan = plan
         self._tripped = False
         self._counts = counts
@@ -83,56 +82,55 @@ class Deadman:
         self._changed = changed
 
     def feed(self, now: int) -> None:
-        """A fresh command is about to be sent."""
+        """Called when a fresh command is about to be sent."""
         acting = self._acting[0]
         acting.next_due = now + acting._plan.timeout
-        acting._greets = False
+        acting._greets_again = False
         acting._release()
 
-    def relieve(self, now: int) -> None:
-        """A fresh command of a route that it hands over to is about to be sent."""
+    def disarm(self, now: int) -> None:
+        """Called when a fresh command of a route that it hands over to is about to be sent."""
         acting = self._acting[0]
         acting.next_due = None
         acting._release()
 
-    def begin(self) -> list[str]:
-        """The router starts: what moves may go on with the last command of a router that was killed.
+    def start(self) -> list[str]:
+        """Send the payload when the router starts, unless the table says otherwise; return the endpoints reached.
 
-        Sends, before anything else is sent, unless the table says that it is silent. Returns the endpoints that it was
-        sent to.
+        What moves may still follow the last command of a router that was killed. To be called before anything is sent.
         """
         return self._send() if self._plan.at_start else []
 
-    def wait_to_meet(self, now: int) -> None:
-        """The router starts: as `begin`, where nobody can be sent to before he is met."""
-        self._meets_until = now + START if self._plan.at_start else 0
+    def await_subscribers(self, now: int) -> None:
+        """As `start`, for publishing: nobody can be reached before subscribers are discovered."""
+        self._greets_until = now + START if self._plan.at_start else 0
 
-    def meet(self, now: int) -> list[str]:
-        """A new subscriber is there. Sends, shortly after the start and as long as no command was sent.
+    def greet(self, now: int) -> list[str]:
+        """Send to a new subscriber, shortly after the start and as long as no command was sent.
 
-        Sends again after GREETING: subscriber and publisher do not learn of each other at the same time, and best
-        effort loses what is sent between.
+        Sends again after GREETING: subscriber and publisher do not discover each other at the same time, and best
+        effort loses what is sent in between.
         """
-        if now >= self._meets_until or (self.next_due is not None and not self._greets):
+        if now >= self._greets_until or (self.next_due is not None and not self._greets_again):
             return []
-        self._greets, self.next_due = True, now + GREETING
+        self._greets_again, self.next_due = True, now + GREETING
         return self._send()
 
-    def inherit(self, earlier: Deadman) -> None:
-        """Takes the place of `earlier`, the same route's in another table: armed by its command, tripped if it was.
+    def replace(self, earlier: Deadman) -> None:
+        """Take over from `earlier`, the deadman of the same route in the previous table: its deadline and state.
 
-        `earlier` keeps the destinations that are not ours, for its last word.
+        `earlier` keeps only the destinations that are not ours, to which it sends when it ends.
         """
-        self._meets_until = earlier._meets_until if self._plan.at_start else 0
+        self._greets_until = earlier._greets_until if self._plan.at_start else 0
         self._acting = earlier._acting
         self._acting[0] = self
         ours = {(each.endpoint, each.send) for each in self._destinations}
         earlier._destinations = [each for each in earlier._destinations if (each.endpoint, each.send) not in ours]
-        if earlier.next_due is None or earlier._greets:
+        if earlier.next_due is None or earlier._greets_again:
             earlier.next_due = None
             return
-        due, earlier.next_due = earlier.next_due, _NEVER  # it does nothing any more but end
-        if self.next_due is not None:  # it has heard of a command already, which was a later one
+        due, earlier.next_due = earlier.next_due, _NEVER  # armed until it ends, so that it sends then
+        if self.next_due is not None:  # it was already fed by a later command
             earlier._release()
             return
         self._tripped, now, then = earlier._tripped, earlier._plan, self._plan
@@ -142,11 +140,11 @@ class Deadman:
         due, repeat = self.next_due, self._plan.repeat
         if due is None or now < due:
             return
-        if self._greets:
-            self._greets, self.next_due = False, None
+        if self._greets_again:
+            self._greets_again, self.next_due = False, None
             self._send()
             return
-        # Before anything can fail; and what a stalled process has missed is left out, not made up for in a burst.
+        # Set before anything can fail. Repetitions that a stalled process has missed are left out.
         self.next_due = due + repeat * ((now - due) // repeat + 1)
         if self._tripped:
             self._send()
@@ -158,8 +156,8 @@ class Deadman:
         self._changed(self._plan.route, True)
 
     def end(self, now: int) -> None:
-        """Orderly shutdown: sends a last time unless no command ever came. Then nothing is due any more."""
-        self._meets_until, is_armed = 0, self.next_due is not None and not self._greets
+        """Send a last time, if armed or tripped."""
+        self._greets_until, is_armed = 0, self.next_due is not None and not self._greets_again
         self.next_due = None
         if is_armed:
             self._send()
@@ -184,20 +182,17 @@ class Deadman:
         return sent
 
 
-def feeder(deadmen: Mapping[str, Deadman], guard: Guard) -> FeedMaker:
-    """`deadmen` are by route. `guard` makes the call safe: it has one lock for all of them.
+def feeder(deadmen: Mapping[str, Deadman], locked: Locked) -> FeedMaker:
+    """`deadmen` are by route; `locked` has one lock for all of them. A deadman is served once its route has a feed."""
 
-    Each is served from when its own route's call was made.
-    """
-
-    def feed(route: str, told: Sequence[str]) -> Feed:
-        calls = [deadmen[name].feed if name == route else deadmen[name].relieve for name in told]
+    def feed(route: str, names: Sequence[str]) -> Feed:
+        calls = [deadmen[name].feed if name == route else deadmen[name].disarm for name in names]
         first, *others = calls
 
-        def tell(now: int) -> None:
+        def call_all(now: int) -> None:
             for call in calls:
                 call(now)
 
-        return guard(deadmen[told[0]], tell if others else first)
+        return locked(deadmen[names[0]], call_all if others else first)
 
     return feed

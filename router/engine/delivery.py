@@ -1,19 +1,113 @@
-"""Handing a message over to where it goes: now, or through what may hold it back."""
+"""Handing messages over to a target: counting and reporting what becomes of each."""
 
 from __future__ import annotations
 
+import errno
+import struct
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from router.engine.outcome import Outcome
+from router.compiler.metrics import DROP_REASONS, Counters
+from router.compiler.program import TargetPlan
+from router.errors import MappingError, NonFiniteError
+
+MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
+"""What a value in a message can make a mapping raise. Any other exception is a bug of the router and propagates."""
+
+_BUFFER_FULL = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS})
+
+Place = tuple[str, str]
+"""A route and the name of one of its targets."""
 
 Deliver = Callable[[int, bytes, int | None], None]
-"""Takes the time, the datagram or the CDR bytes, and the time after which they are stale (None: never).
+"""Called with the time, the datagram or CDR bytes, and the time after which they are stale (None: never).
 
-Monotonic times in ns. What becomes of the message is counted by then or later; it raises nothing of that.
+Monotonic times in ns. The message is counted before or after the return; losses raise nothing.
 """
 
 Feed = Callable[[int], None]
-"""Tells deadmen that a command is about to be sent, at a time of the monotonic clock in ns."""
+"""Called right before a command is sent, with the monotonic time in ns: restarts the timeouts of its deadmen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A loss. `kind` is `drop` (of one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
+
+    `place` is the listener for a reject, else the route; `target` is empty for a reject.
+    """
+
+    kind: str
+    place: str
+    target: str
+    reason: str
+    error: BaseException | None = None
+    detail: str = ""
+
+
+class Outcome:
+    """The counters of one target of one route, in `counts`.
+
+    Every loss is reported except `rate_limited`, which the table asks for.
+    """
+
+    def __init__(
+        self, counters: Counters, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
+    ) -> None:
+        self.place: Place = route, target.target
+        self._counts = counts
+        self._is_topic = target.is_topic
+        self._report = report
+        self._dropped = {
+            reason: counters.index("messages_dropped", route, target.target, reason) for reason in DROP_REASONS
+        }
+        self._filtered = counters.index("messages_filtered", route, target.target)
+        self._delivered = counters.index(
+            "messages_published" if target.is_topic else "datagrams_sent", route, target.target
+        )
+        self._sent_bytes = None if target.is_topic else counters.index("sent_bytes", route, target.target)
+
+    def delivered(self, size: int) -> None:
+        """Count a message as published, or as sent with `size` bytes."""
+        self._counts[self._delivered] += 1
+        if self._sent_bytes is not None:
+            self._counts[self._sent_bytes] += size
+
+    def dropped(self, reason: str, error: Exception | None = None, detail: str = "") -> None:
+        """Count a message as lost for one of DROP_REASONS."""
+        self._counts[self._dropped[reason]] += 1
+        if reason != "rate_limited":
+            self._report(Report("drop", *self.place, reason, error, detail))
+
+    def failed(self, error: Exception) -> None:
+        """Count a message as lost because mapping it or handing it over raised `error`."""
+        self.dropped(_reason(error, self._is_topic), error)
+
+    def filtered(self) -> None:
+        self._counts[self._filtered] += 1
+
+
+class FrameOutcome(Outcome):
+    """The counters of a target that gets frames; only those have a series for collected parts."""
+
+    def __init__(
+        self, counters: Counters, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
+    ) -> None:
+        super().__init__(counters, counts, route, target, report)
+        self._collected = counters.index("messages_collected", route, target.target)
+
+    def collected(self) -> None:
+        """Count a message as part of a frame."""
+        self._counts[self._collected] += 1
+
+
+def _reason(error: Exception, is_topic: bool) -> str:
+    if isinstance(error, NonFiniteError):
+        return "non_finite"
+    if isinstance(error, MAPPING_FAILURES):
+        return "mapping_error"
+    if is_topic:
+        return "publish_error"
+    return "send_buffer_full" if isinstance(error, OSError) and error.errno in _BUFFER_FULL else "send_error"
 
 
 def immediately(
@@ -22,7 +116,7 @@ def immediately(
     failures: tuple[type[Exception], ...] = (OSError,),
     feed: Feed | None = None,
 ) -> Deliver:
-    """Hands over whatever it gets; `hand_over` may raise `failures`. `feed` is called before that."""
+    """Return a Deliver that calls `feed` and then `hand_over`, which may raise `failures`."""
 
     def deliver(now: int, data: bytes, expires: int | None) -> None:
         if feed is not None:

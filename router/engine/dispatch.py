@@ -1,10 +1,11 @@
-"""From a datagram to the handler of its payload case, or to the counter that says why there is none."""
+"""From a received datagram or ROS message to its handlers, or to the counter of the reason why there is none."""
 
 from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import FunctionType
 
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
@@ -13,22 +14,23 @@ from router.compiler import STRANGER, source_label
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS
 from router.compiler.network import recognisers
 from router.compiler.program import Handler, Program
-from router.engine.binding import Handle, Outlets, bind, unbind
-from router.engine.framing import LEN
+from router.engine.binding import EngineContext, Handle, bind, unbind
+from router.engine.delivery import Report
 from router.engine.freshness import Freshness
-from router.engine.outcome import Report
-from router.engine.settling import MAX_DATAGRAM, Rejected, Settler
+from router.engine.slow_path import LEN, MAX_DATAGRAM, Rejected, SlowPath
 
 Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]
+Take = Callable[[bytes, int], None]
+
 _Addresses = Sequence[tuple[object, str]]
-"""By what endpoints are recognised, and their names."""
+"""Keys by which endpoints are recognised (IP address, or IP address and port), each with the endpoint's name."""
 _SUM = HISTOGRAM_CELLS - 1
 
 
 @dataclass(frozen=True, slots=True)
 class _Route:
-    """A route as one of its senders has it: the slots in which it counts, and what expressions call the sender."""
+    """A route for one of its senders: the indexes of its counters, and the sender's name in expressions."""
 
     received: int
     name: str
@@ -39,7 +41,7 @@ class _Route:
 
 @dataclass(frozen=True, slots=True)
 class _Case:
-    """What dispatch needs of a payload case. `routes` is by IP address, or by (IP address, port)."""
+    """A payload case. `routes` is by IP address, or by (IP address, port)."""
 
     name: str
     parse: Callable[[bytes], Message]
@@ -47,31 +49,91 @@ class _Case:
     stranger: _Route | None
 
 
-class Engine:
-    """A program's routes from UDP, bound to the outside world.
+class InboundEngine:
+    """A program's routes from UDP.
 
-    `arrived_at` tells by listener when the kernel got the datagram that was last received (wall clock, ns).
+    `arrived_at`, by listener, returns when the kernel got the datagram that was last received (wall clock, ns).
     """
 
-    def __init__(self, program: Program, outlets: Outlets, arrived_at: Mapping[str, Callable[[], int]]) -> None:
+    def __init__(self, program: Program, context: EngineContext, arrived_at: Mapping[str, Callable[[], int]]) -> None:
         self._program = program
-        self._outlets = outlets
-        self._counts = outlets.counts
+        self._context = context
+        self._counts = context.counts
         self._arrived_at = arrived_at
-        self._freshness = outlets.state.keep("freshness of datagrams", Freshness)
+        self._freshness = context.state.keep("freshness of datagrams", Freshness)
         self._handles = {
-            handler.route: bind(handler, program.counters, outlets, self._freshness)
+            handler.route: bind(handler, program.counters, context, self._freshness)
             for handlers in program.inbound.values()
             for handler in handlers
         }
 
-    def forget(self) -> None:
-        """Nobody calls the handlers any more."""
+    def close(self) -> None:
+        """Free the handlers. No receiver may be called afterwards."""
         for handle in self._handles.values():
             unbind(handle)
 
+    def receiver(self, listener: str) -> Receive:
+        """Return the function that takes the datagrams of one listener. It never raises for what was received.
+
+        This is the hot path: everything it needs is a local name, and the usual datagram (one payload,
+        complete, of a routed case, from its endpoint) goes straight through.
+        """
+        counters, counts = self._program.counters, self._counts
+        # An endpoint that is believed only by another listener is a stranger here.
+        by_host, by_address = recognisers(self._program.table.endpoints, listener)
+        addresses: _Addresses = [*by_host.items(), *by_address.items()]
+        cases = self._cases(listener, addresses)
+        # Cases whose tag is at most two bytes long.
+        by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
+        clock_ns, wall_ns, bounds = self._context.clock_ns, self._context.wall_ns, HISTOGRAM_BOUNDS_NS
+        received, received_bytes = (
+            counters.index("datagrams_received", listener),
+            counters.index("received_bytes", listener),
+        )
+        seen = self._seen_indexes(addresses)
+        parse_slowly, reject = SlowPath(self._program, counts, listener, cases).parse, self._rejecter(listener)
+
+        def receive(data: bytes, peer: Peer) -> None:
+            now = clock_ns()
+            received_at = wall_ns()
+            size = len(data)
+            counts[received] += 1
+            counts[received_bytes] += size
+            sender_key = peer if by_address and peer in by_address else peer[0]
+            if sender_key in seen:
+                counts[seen[sender_key]] = received_at
+            try:
+                tag, start = data[0], 1
+                if tag > 0x7F:
+                    tag, start = tag & 0x7F | data[1] << 7, 2
+                length, start = data[start], start + 1
+                if length > 0x7F:
+                    length, start = length & 0x7F | data[start] << 7, start + 1
+                case = by_tag[tag]
+                if start + length != size or size > MAX_DATAGRAM:
+                    raise LookupError
+                message = case.parse(data[start:])
+            except (LookupError, ProtobufError):  # not the usual datagram
+                try:
+                    case, message = parse_slowly(data)
+                except Rejected as rejected:
+                    reject(rejected.reason, peer, str(rejected))
+                    return
+            route = case.routes.get(sender_key, case.stranger)
+            if route is None:
+                reject("source_mismatch", peer, case.name)
+                return
+            counts[route.received] += 1
+            route.handle(message, data, received_at, now, route.name)
+            counts[route.last_message] = received_at
+            elapsed = clock_ns() - now
+            counts[route.seconds + bisect_left(bounds, elapsed)] += 1
+            counts[route.seconds + _SUM] += elapsed
+
+        return receive
+
     def _cases(self, listener: str, addresses: _Addresses) -> dict[int, _Case]:
-        """What a listener's datagrams are given to, by field number."""
+        """The cases with a route, by field number."""
         inbound = self._program.inbound
         return {number: self._case(handlers, listener, addresses) for number, handlers in inbound.items()}
 
@@ -98,7 +160,7 @@ class Engine:
         )
 
     def _aged(self, handle: Handle, arrived_at: Callable[[], int]) -> Handle:
-        """Of a route with a `ttl`: the time that a datagram waited in the socket counts as well."""
+        """The handler of a route with a `ttl`: the time that a datagram waited in the socket counts too."""
         born = self._freshness.born
 
         def aged(message: Message, data: bytes, received_at: int, now: int, source: str) -> None:
@@ -106,78 +168,75 @@ class Engine:
 
         return aged
 
-    def receiver(self, listener: str) -> Receive:
-        """The function that takes the datagrams of one listener. It never raises for what was received.
-
-        This is the hot path: everything it needs is a local name, and the usual datagram (one payload,
-        complete, of a routed case, from its endpoint) goes straight through.
-        """
-        counters, counts = self._program.counters, self._counts
-        # Whose they are: an endpoint that is believed by another listener is a stranger here.
-        by_host, by_address = recognisers(self._program.table.endpoints, listener)
-        addresses: _Addresses = [*by_host.items(), *by_address.items()]
-        cases = self._cases(listener, addresses)
-        # Of those whose tag is two bytes at most.
-        by_tag = {number << 3 | LEN: case for number, case in cases.items() if number < 2048}
-        clock_ns, wall_ns, bounds = self._outlets.clock_ns, self._outlets.wall_ns, HISTOGRAM_BOUNDS_NS
-        received, received_bytes = (
-            counters.index("datagrams_received", listener),
-            counters.index("received_bytes", listener),
-        )
-        seen = self._seen_indexes(addresses)
-        settle, reject = Settler(self._program, counts, listener, cases).settle, self._rejecter(listener)
-
-        def receive(data: bytes, peer: Peer) -> None:
-            now = clock_ns()
-            received_at = wall_ns()
-            size = len(data)
-            counts[received] += 1
-            counts[received_bytes] += size
-            sender_key = peer if by_address and peer in by_address else peer[0]
-            if sender_key in seen:
-                counts[seen[sender_key]] = received_at
-            try:
-                tag, start = data[0], 1
-                if tag > 0x7F:
-                    tag, start = tag & 0x7F | data[1] << 7, 2
-                length, start = data[start], start + 1
-                if length > 0x7F:
-                    length, start = length & 0x7F | data[start] << 7, start + 1
-                case = by_tag[tag]
-                if start + length != size or size > MAX_DATAGRAM:
-                    raise LookupError
-                message = case.parse(data[start:])
-            except (LookupError, ProtobufError):  # not the usual datagram
-                try:
-                    case, message = settle(data)
-                except Rejected as rejected:
-                    reject(rejected.reason, peer, str(rejected))
-                    return
-            route = case.routes.get(sender_key, case.stranger)
-            if route is None:
-                reject("source_mismatch", peer, case.name)
-                return
-            counts[route.received] += 1
-            route.handle(message, data, received_at, now, route.name)
-            counts[route.last_message] = received_at
-            elapsed = clock_ns() - now
-            counts[route.seconds + bisect_left(bounds, elapsed)] += 1
-            counts[route.seconds + _SUM] += elapsed
-
-        return receive
-
     def _seen_indexes(self, addresses: _Addresses) -> dict[object, int]:
         metric = "endpoint_last_seen_timestamp_seconds"
         return {key: self._program.counters.index(metric, name) for key, name in addresses}
 
     def _rejecter(self, listener: str) -> Callable[[str, Peer, str], None]:
-        counters, counts, report = self._program.counters, self._counts, self._outlets.report
-        slots = {reason: counters.index("datagrams_rejected", listener, reason) for reason in REJECT_REASONS}
+        counters, counts, report = self._program.counters, self._counts, self._context.report
+        indexes = {reason: counters.index("datagrams_rejected", listener, reason) for reason in REJECT_REASONS}
 
         def reject(reason: str, peer: Peer, what: str) -> None:
-            counts[slots[reason]] += 1
+            counts[indexes[reason]] += 1
             if reason != "ignored":
                 detail = f"from {peer[0]}:{peer[1]}" + (f": {what}" if what else "")
                 report(Report("reject", listener, "", reason, None, detail))
 
         return reject
+
+
+@dataclass(frozen=True, slots=True)
+class _OutboundRoute:
+    handle: Handle
+    is_aged: bool
+    last_message: int
+    seconds: int
+
+
+class OutboundEngine:
+    """A program's routes from ROS."""
+
+    def __init__(self, program: Program, context: EngineContext) -> None:
+        self._program = program
+        self._context = context
+        self._handles: list[FunctionType] = []
+        self._freshness = context.state.keep("freshness of ROS messages", Freshness)
+
+    def close(self) -> None:
+        """Free the handlers. No taker may be called afterwards."""
+        for handle in self._handles:
+            unbind(handle)
+
+    def taker(self, topic: str) -> Take:
+        """Return the function that takes one topic's messages. It never raises for what was received.
+
+        Its arguments are CDR bytes, and when the middleware got them (wall clock, ns).
+        """
+        routes = [self._route(handler) for handler in self._program.outbound[topic]]
+        counts, bounds = self._context.counts, HISTOGRAM_BOUNDS_NS
+        clock_ns, wall_ns, born = self._context.clock_ns, self._context.wall_ns, self._freshness.born
+
+        def take(cdr: bytes, arrived_at: int) -> None:
+            now = clock_ns()
+            received_at = wall_ns()
+            for route in routes:
+                if route.is_aged:
+                    route.handle(cdr, received_at, now, topic, born(arrived_at, received_at, now))
+                else:
+                    route.handle(cdr, received_at, now, topic)
+                counts[route.last_message] = received_at
+                elapsed = clock_ns() - now
+                counts[route.seconds + bisect_left(bounds, elapsed)] += 1
+                counts[route.seconds + _SUM] += elapsed
+
+        return take
+
+    def _route(self, handler: Handler) -> _OutboundRoute:
+        counters = self._program.counters
+        self._handles.append(handle := bind(handler, counters, self._context, self._freshness))
+        return _OutboundRoute(
+            handle=handle,
+            is_aged=handler.ttl is not None,
+            last_message=counters.index("route_last_message_timestamp_seconds", handler.route),
+            seconds=counters.index("route_duration_seconds", handler.route),
+        )

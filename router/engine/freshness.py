@@ -1,7 +1,4 @@
-"""When something happened on the monotonic clock, from a stamp of the wall clock that may have jumped since.
-
-Reads no clock: whoever calls tells both.
-"""
+"""Converts a time stamp of the wall clock, which may have jumped since, to the monotonic clock."""
 
 from __future__ import annotations
 
@@ -9,17 +6,17 @@ from collections import deque
 from dataclasses import dataclass
 
 TOLERANCE = 10_000_000
-"""ns by which a time that `born` gives may be wrong because the wall clock is being slewed, at up to 1 ms/s."""
+"""Error in ns of a time that `born` returns while the wall clock is slewed, at up to 1 ms/s."""
 
 MEMORY = 10_000_000_000
-"""ns for which a past setting of the wall clock is remembered after the next one was noticed."""
+"""ns for which a past setting of the wall clock is remembered after the next one was detected."""
 
 _MOST_SETTINGS = 32
 
 
 @dataclass(frozen=True, slots=True)
 class _Setting:
-    """A wall clock that was `offset` ahead of the monotonic one, not before `since` and not after `until`."""
+    """The wall clock was `offset` ahead of the monotonic one, at most from `since` until `until`."""
 
     offset: int
     since: int
@@ -29,25 +26,24 @@ class _Setting:
 class Freshness:
     """Follows the wall clock through its jumps. For one thread, which calls `born` with every stamp.
 
-    Each call tells how far the wall clock is ahead of the monotonic one. Where that is no longer what it was, the
-    clock was set since the last call. A stamp means another time under each setting, but can only mean a time
-    at which that setting may have been in force; of several such times the latest is taken.
+    Each call compares the wall clock with the monotonic one. If the offset has changed, the clock was set since the
+    last call. A stamp means a different time under each setting, but only times at which that setting may have been in
+    force are possible; of these the latest is taken.
 
     Provided that the clock was set at most once between two calls, and that stamps come from clocks that are set
     together with ours, it follows for an event of the last MEMORY, within TOLERANCE:
 
     - It is never taken to be older than it is: no jump makes a fresh message stale.
     - It is taken to be younger than it is only if the wall clock was set since, or since the last call before it, by
-      some `d` no greater than its age: then it may pass for `d` younger. So a message that is stale by 2 s
-      passes for fresh if the clock was set by about 2 s while it was under way or in the silence before it,
-      and not if it was set by more or less, or earlier. A stamp cannot tell then which of two times is meant:
-      set back, the wall clock has shown the same time twice. To take the earlier time would be to refuse every
-      message for `d` after the clock was set back by `d`.
+      some `d` no greater than its age: then it may pass for `d` younger. A message that is stale by 2 s is taken for
+      fresh if the clock was set by about 2 s while it was under way or in the silence before it, and not if it was set
+      by more or less, or earlier. Such a stamp is ambiguous: a clock that is set back shows the same time twice.
+      Taking the earlier time would refuse every message for `d` after the clock was set back by `d`.
 
-    An older event may pass for any age if the clock was set since.
+    An older event may be taken for any age if the clock was set since.
 
-    A stamp in the future under all settings is that of another computer whose clock is ahead; it counts as
-    now. For MEMORY after our clock was set back by more than theirs is ahead, it is instead taken for one made before.
+    A stamp in the future under all settings comes from a computer whose clock is ahead; it counts as now. For MEMORY
+    after our clock was set back by more than theirs is ahead, it is instead taken for a stamp from before that.
     """
 
     def __init__(self) -> None:
@@ -57,7 +53,7 @@ class Freshness:
         self._past: deque[_Setting] = deque(maxlen=_MOST_SETTINGS)
 
     def born(self, stamp: int, received_at: int, now: int) -> int:
-        """The monotonic time in ns of the event that was stamped `stamp` (ns of the wall clock); never after `now`.
+        """Return the monotonic time in ns of an event stamped `stamp` (wall clock, ns); never after `now`.
 
         `now` and `received_at` are the monotonic and the wall clock, read now in this order: a pause between
         makes events older, not younger.

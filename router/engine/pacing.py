@@ -1,19 +1,20 @@
-"""`budget`: how fast datagrams go to one endpoint, and which of them wait or are dropped when that is too slow."""
+"""`max_rate`, `keep: latest` and `budget`: which messages pass, which wait and which are dropped."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Container
+from math import ceil
 from typing import NamedTuple
 
-from router.engine.delivery import Deliver, Feed, immediately, is_stale
-from router.engine.limiter import NS
-from router.engine.machine import Machine
-from router.engine.outcome import Outcome, Place
+from router.engine.delivery import Deliver, Feed, Outcome, Place, immediately, is_stale
+from router.engine.timers import Timer
 from router.table.model import Priority
 
+NS = 1_000_000_000
+
 BURST = NS // 50
-"""What is saved up in a pause, as the time (ns) that the budget takes for it."""
+"""What a pause saves up, as the time (ns) in which the budget earns it."""
 
 OVERDRAFT, LEAST_OVERDRAFT = NS // 10, 2048
 """What commands may overdraw the budget: as time (ns), and in bytes where the budget is so small that this is more."""
@@ -22,38 +23,104 @@ QUEUE, LEAST_QUEUE = NS, 65536
 """What may wait: as time (ns), and in bytes where that is more."""
 
 
+class RateLimit:
+    """Passes at most `hertz` messages per second; all times are monotonic, in ns.
+
+    Passes keep to a grid of one period. A message up to half a period early takes its place on the grid (a limiter by
+    interval would wait for the next and undershoot: 25 instead of 30 Hz out of 100); after a pause the grid starts
+    anew, so nothing is saved up for a burst. At most `hertz` + 1 messages pass in any second.
+
+    `next_pass` is the time from which on a message may pass.
+    """
+
+    __slots__ = ("_late", "_period", "next_pass")
+
+    def __init__(self, hertz: float) -> None:
+        self._period = ceil(NS / hertz)
+        self._late = self._period - self._period // 2
+        self.next_pass = -self._period  # a whole period ago at any time, because monotonic time is not negative
+
+    def may_pass(self, now: int) -> bool:
+        """Whether a message may pass now; if so, it takes the place."""
+        waited = now - self.next_pass
+        if waited < 0:
+            return False
+        self.next_pass = self.next_pass + self._period if waited < self._period else now + self._late
+        return True
+
+
+class Latest(Timer):
+    """Delivers at most `hertz` messages per second, and holds the newest of those in between until it may pass.
+
+    A held message is dropped as `rate_limited` when a newer one replaces it, as `stale` when it expires.
+    """
+
+    def __init__(self, hertz: float, deliver: Deliver, outcome: Outcome) -> None:
+        self.next_due: int | None = None
+        self._limit = RateLimit(hertz)
+        self._deliver = deliver
+        self._outcome = outcome
+        self._held: tuple[bytes, int | None] | None = None
+
+    def offer(self, now: int, data: bytes, expires: int | None) -> None:
+        """A Deliver: hand the message on now or later."""
+        if self._held is not None:
+            self._outcome.dropped("rate_limited")
+        if self._limit.may_pass(now):
+            self._release()
+            self._deliver(now, data, expires)
+        else:
+            self._held = (data, expires)
+            self.next_due = self._limit.next_pass
+
+    def due(self, now: int) -> None:
+        if self._held is not None and (is_stale(now, self._held[1]) or self._limit.may_pass(now)):
+            self.end(now)
+
+    def end(self, now: int) -> None:
+        """Deliver the held message early, unless it has expired."""
+        if self._held is None:
+            return
+        data, expires = self._held
+        self._release()
+        if is_stale(now, expires):
+            self._outcome.dropped("stale")
+        else:
+            self._deliver(now, data, expires)
+
+    def _release(self) -> None:
+        self._held = self.next_due = None
+
+
 class _Waiting(NamedTuple):
-    """`takes` is the time (ns) that the budget takes for `data`."""
+    """A queued datagram. `cost` is the time (ns) in which the budget earns `data`."""
 
     outcome: Outcome
     send: Deliver
     data: bytes
     expires: int | None
-    takes: int
+    cost: int
 
 
-class Pacer(Machine):
-    """Sends to one endpoint, on average at most `bytes_per_second` of datagrams.
+class Pacer(Timer):
+    """Sends to one endpoint, on average at most `bytes_per_second` of UDP payload, as in `sent_bytes`.
 
-    Bytes are those of `sent_bytes`; what UDP, IP and the link put around a datagram (28 bytes and more) comes on
-    top.
+    Datagrams that are no commands leave only when the budget for them is saved up, so they never overdraw it. At most
+    BURST is saved up, and beyond that the cost of the first datagrams that wait: the longest datagram passes the
+    smallest budget. A command leaves as long as no earlier command waits and the budget is overdrawn by the overdraft
+    at most: it waits for commands only, and all others wait until the overdraft is paid.
 
-    What is not a command leaves only when the budget for it has been saved up, so it never overdraws the budget. BURST
-    is saved up at most, and beyond that what the first datagrams that wait will take: so the longest datagram goes
-    through the smallest budget. A command leaves as long as no earlier command waits and the budget is overdrawn by the
-    overdraft at most. So a command waits for commands only; all others wait until the overdraft is paid.
+    Waiting datagrams leave by priority, then by age. When more waits than the queue holds, the oldest of the lowest
+    priority is dropped as `queue_full`; what expires in the queue is dropped as `stale`.
 
-    What has to wait goes by priority, within one by age. When more waits than the queue holds, the oldest of the lowest
-    priority is dropped as `queue_full`; what is too old when it waits first as `stale`.
-
-    `send` may raise OSError; what it refuses has used up its share all the same.
+    `send` may raise OSError; the datagram is charged all the same.
     """
 
     def __init__(self, bytes_per_second: int, send: Callable[[bytes], int]) -> None:
         self.next_due: int | None = None
         self._rate = bytes_per_second
         self._send = send
-        self._overdraft = max(OVERDRAFT, self._time_of(LEAST_OVERDRAFT))
+        self._overdraft = max(OVERDRAFT, self._cost(LEAST_OVERDRAFT))
         self._lanes: dict[Priority, deque[_Waiting]] = {priority: deque() for priority in Priority}
         self._commands = self._lanes[Priority.COMMAND]
         self._others = [lane for lane in self._lanes.values() if lane is not self._commands]
@@ -61,46 +128,33 @@ class Pacer(Machine):
         self._paid_at = -BURST  # when the budget has paid for all that was sent; what lies before now is saved up
 
     def queue(self, priority: Priority, outcome: Outcome, feed: Feed | None = None) -> Deliver:
-        """The way to the endpoint for one target: sends now or later, or drops. `feed` is as in `immediately`."""
+        """Return the Deliver of one target, which sends now or later, or drops. `feed` is as in `immediately`."""
         lane, send = self._lanes[priority], immediately(self._send, outcome, feed=feed)
 
         def deliver(now: int, data: bytes, expires: int | None) -> None:
-            self._forfeit(now)
-            lane.append(_Waiting(outcome, send, data, expires, self._time_of(len(data))))
+            self._limit_savings(now)
+            lane.append(_Waiting(outcome, send, data, expires, self._cost(len(data))))
             self._room -= len(data)
-            self._serve(now)
+            self._send_affordable(now)
             while self._room < 0:
                 self._drop_one()
 
         return deliver
 
     def due(self, now: int) -> None:
-        self._forfeit(now)
-        self._serve(now)
-
-    def _serve(self, now: int) -> None:
-        self.next_due = None
-        for lane in self._lanes.values():
-            while lane:
-                expires, takes = lane[0][3:]
-                may_go_at = self._paid_at + (-self._overdraft if lane is self._commands else takes)
-                if now < may_go_at and not is_stale(now, expires):
-                    self.next_due = may_go_at + BURST // 2  # later than it may: one call then sends several
-                    if expires is not None:  # nothing is saved up for what is too old
-                        self.next_due = min(self.next_due, expires + 1)
-                    return
-                self._send_first(lane, now)
+        self._limit_savings(now)
+        self._send_affordable(now)
 
     def end(self, now: int) -> None:
-        """Sends what waits, whatever the budget: that is no more than the queue holds."""
+        """Send all that waits, whatever the budget: at most what the queue holds."""
         self.next_due = None
         for lane in self._lanes.values():
             while lane:
                 self._send_first(lane, now)
 
-    def serve_only(self, now: int, places: Container[Place]) -> None:
-        """Sends what waits for other targets, whatever the budget: later, nobody would count it."""
-        self._forfeit(now)
+    def keep_only(self, now: int, places: Container[Place]) -> None:
+        """Send what waits for targets other than `places`, whatever the budget, as their counters will be gone."""
+        self._limit_savings(now)
         for lane in self._lanes.values():
             for _ in range(len(lane)):
                 if lane[0].outcome.place in places:
@@ -108,22 +162,35 @@ class Pacer(Machine):
                 else:
                     self._send_first(lane, now)
 
+    def _send_affordable(self, now: int) -> None:
+        self.next_due = None
+        for lane in self._lanes.values():
+            while lane:
+                expires, cost = lane[0][3:]
+                may_go_at = self._paid_at + (-self._overdraft if lane is self._commands else cost)
+                if now < may_go_at and not is_stale(now, expires):
+                    self.next_due = may_go_at + BURST // 2  # later than necessary: one call then sends several
+                    if expires is not None:  # an expired datagram no longer counts in the savings
+                        self.next_due = min(self.next_due, expires + 1)
+                    return
+                self._send_first(lane, now)
+
     def _send_first(self, lane: deque[_Waiting], now: int) -> None:
-        outcome, send, data, expires, takes = lane.popleft()
+        outcome, send, data, expires, cost = lane.popleft()
         self._room += len(data)
         if is_stale(now, expires):
             outcome.dropped("stale")
-            self._forfeit(now)
+            self._limit_savings(now)
         else:
-            self._paid_at += takes
+            self._paid_at += cost
             send(now, data, expires)
 
-    def _forfeit(self, now: int) -> None:
-        """Limits what is saved up. To be called before others wait first than did until now."""
+    def _limit_savings(self, now: int) -> None:
+        """Cap what is saved up. To be called before the first datagram of a lane changes."""
         first = 0
         for lane in self._others:
-            if lane and lane[0].takes > first:
-                first = lane[0].takes
+            if lane and lane[0].cost > first:
+                first = lane[0].cost
         self._paid_at = max(self._paid_at, now - BURST - first)
 
     def _drop_one(self) -> None:
@@ -132,6 +199,6 @@ class Pacer(Machine):
         self._room += len(dropped.data)
         dropped.outcome.dropped("queue_full")
 
-    def _time_of(self, size: int) -> int:
-        """How long the budget takes for `size` bytes, in ns."""
+    def _cost(self, size: int) -> int:
+        """The time in ns in which the budget earns `size` bytes."""
         return -(-size * NS // self._rate)

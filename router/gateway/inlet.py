@@ -11,7 +11,7 @@ from router.compiler.program import GatewayPlan, InboundPlan
 from router.engine import Report
 from router.engine.delivery import Feed as FeedDeadman
 from router.engine.freshness import Freshness
-from router.engine.limiter import RateLimit
+from router.engine.pacing import RateLimit
 from router.gateway.documents import PublishRequest
 from router.gateway.json_longest import longest_text
 from router.gateway.json_reading import InvalidMessageError, cdr_builder

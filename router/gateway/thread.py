@@ -27,7 +27,7 @@ from router.gateway.transport.udp import UdpTransport
 from router.gateway.transports import new_transport
 from router.table.model import Gateway
 from router.table.sameness import are_same
-from router.threads.daemon_thread import DaemonThread
+from router.threads import DaemonThread
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy

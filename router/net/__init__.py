@@ -1,1 +1,1 @@
-"""UDP: sockets, the receive thread, what the kernel dropped."""
+"""UDP: sockets, the receive thread, and what the kernel reports about both."""

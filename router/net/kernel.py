@@ -1,18 +1,18 @@
-"""What Linux tells of a UDP socket, and the socket module does not: when a datagram arrived, and what was dropped.
-
-And of a network interface: whether it is there and up, and its address.
-"""
+"""What Linux reports beyond Python's socket module: arrival times, drops, buffers, interfaces, who holds a port."""
 
 from __future__ import annotations
 
 import fcntl
+import os
 import socket
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 
-# Linux values that the socket module does not name.
+# Linux constants that the socket module does not name.
 SO_RCVBUFFORCE = 33
+SO_TIMESTAMPNS = 35
 SO_MEMINFO = 55
 SIOCGSTAMPNS = 0x8907
 SIOCGIFFLAGS = 0x8913
@@ -24,13 +24,15 @@ _TIMESPEC = struct.Struct("@ll")
 _MEMINFO = struct.Struct("9I")
 _MEMINFO_DROPS = 8
 
+_BOUND = {"udp": "07", "tcp": "0A"}
+"""The state of a socket that receives from anybody, in /proc/net."""
+
 
 def arrivals(opened: socket.socket) -> Callable[[], int]:
-    """From now on the kernel stamps what arrives. Returns what tells when it got the datagram last received, in ns of
-    the wall clock.
+    """Have the kernel stamp datagrams. Return a function: when the last received one arrived, in ns of the wall clock.
 
-    The time that it lay in the receive buffer does not count. Costs a system call, and receiving costs nothing
-    more for it. For the thread that receives; raises FileNotFoundError before the first datagram.
+    That is before it waited in the receive buffer. The function makes one system call and is for the receiving thread;
+    it raises FileNotFoundError before the first datagram.
     """
     stamp = bytearray(_TIMESPEC.size)
 
@@ -39,19 +41,19 @@ def arrivals(opened: socket.socket) -> Callable[[], int]:
         seconds, nanoseconds = _TIMESPEC.unpack(stamp)
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
-    with suppress(FileNotFoundError):  # nothing was received yet, but now that it was asked the kernel stamps
+    with suppress(FileNotFoundError):  # raised as nothing was received; stamping begins all the same
         arrived_at()
     return arrived_at
 
 
 def drops(opened: socket.socket) -> int:
-    """Datagrams that the kernel threw away before anybody received them, since the socket was opened."""
+    """Datagrams that the kernel dropped before they were received, since the socket was opened."""
     words = _MEMINFO.unpack(opened.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size))
     return int(words[_MEMINFO_DROPS])
 
 
 def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
-    """Asks for `size` bytes, past the system's limit where that is allowed. Returns how many were granted."""
+    """Ask for `size` bytes, beyond the system's limit where that is allowed. Return how many were granted."""
     opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
     if (granted := receive_buffer(opened)) >= size:
         return granted
@@ -63,13 +65,13 @@ def ask_for_receive_buffer(opened: socket.socket, size: int) -> int:
 
 
 def receive_buffer(opened: socket.socket) -> int:
-    """Its size in bytes, as it is asked for."""
-    # The kernel counts its own overhead too: it doubles what was asked for, and tells the doubled value.
+    """The size in bytes, without the kernel's overhead."""
+    # The kernel doubles what is asked for, to have room for its overhead, and returns the doubled value.
     return opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
 
 
 def bound_interface(opened: socket.socket) -> str | None:
-    """The network interface that a socket is bound to, empty for none; None where that interface has gone."""
+    """The network interface that a socket is bound to, "" for none; None if the interface has gone."""
     try:
         return opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, IFNAMSIZ).rstrip(b"\0").decode()
     except OSError:
@@ -77,13 +79,13 @@ def bound_interface(opened: socket.socket) -> str | None:
 
 
 def interface_is_up(name: str) -> bool | None:
-    """Whether it is; None where there is no such network interface."""
+    """Whether a network interface is up; None if there is none of that name."""
     answer = _ask_interface(name, SIOCGIFFLAGS)
     return None if answer is None else bool(int.from_bytes(answer[:2], "little") & IFF_UP)
 
 
 def interface_address(name: str) -> str | None:
-    """Its first IPv4 address, if there is one."""
+    """The first IPv4 address of a network interface, or None."""
     answer = _ask_interface(name, SIOCGIFADDR)
     return None if answer is None else socket.inet_ntoa(answer[4:8])
 
@@ -95,3 +97,54 @@ def _ask_interface(name: str, request: int) -> bytes | None:
         except OSError:
             return None
     return bytes(_IFREQ.unpack(answer)[1])
+
+
+def port_taken(protocol: str, port: int) -> str:
+    """Return who holds a port, and the remedy, for the text of an error. `protocol` is udp or tcp."""
+    process = _process(protocol, port)
+    if process is not None and process.name == str(os.getpid()):
+        return f"the router itself (pid {process.name}) has the port; restart it, or choose another port"
+    return f"{_described(process)} has the port; stop it, or choose another port"
+
+
+def port_holder(protocol: str, port: int) -> str:
+    """Return `python (pid 4711)`, or "another process" if /proc does not show it. `protocol` is udp or tcp."""
+    return _described(_process(protocol, port))
+
+
+def _described(process: Path | None) -> str:
+    return f"{_name(process)} (pid {process.name})" if process is not None else "another process"
+
+
+def _process(protocol: str, port: int) -> Path | None:
+    wanted = {f"socket:[{inode}]" for inode in _inodes(protocol, port)}
+    processes = Path("/proc").glob("[0-9]*")
+    return next((each for each in processes if not wanted.isdisjoint(_open_files(each))), None)
+
+
+def _inodes(protocol: str, port: int) -> Iterator[str]:
+    for table in (Path("/proc/net", protocol), Path("/proc/net", f"{protocol}6")):
+        if not table.exists():
+            continue
+        for line in table.read_text().splitlines()[1:]:
+            columns = line.split()
+            local, state, inode = columns[1], columns[3], columns[9]
+            if state == _BOUND[protocol] and int(local.rpartition(":")[2], 16) == port:
+                yield inode
+
+
+def _open_files(process: Path) -> Iterator[str]:
+    try:
+        descriptors = list((process / "fd").iterdir())
+    except OSError:  # another user's process, or one that has just ended
+        return
+    for descriptor in descriptors:
+        with suppress(OSError):  # closed meanwhile, as the descriptor of the listing itself
+            yield str(descriptor.readlink())
+
+
+def _name(process: Path) -> str:
+    try:
+        return (process / "comm").read_text().strip()
+    except OSError:
+        return "a process"

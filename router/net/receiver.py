@@ -1,13 +1,16 @@
-"""The receive thread: takes datagrams from all listeners and gives each to whoever it is for, until told to stop.
+"""The receive thread: reads datagrams of all listeners and passes each to its receiver.
 
-Where datagrams come thick, it lets some of them gather before it looks again; where they do not, it waits for each.
-Between two datagrams it does what others ask for: so what it calls can be replaced while it runs.
+Where datagrams come densely, the thread lets some of them gather before it reads again, as network cards moderate their
+interrupts: waking up costs more than handling a datagram. Between two datagrams it executes tasks of other threads, so
+that what it calls can be replaced while it runs.
 """
 
 from __future__ import annotations
 
 import ctypes
 import select
+import socket
+import struct
 import sys
 import threading
 import time
@@ -17,28 +20,125 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from time import monotonic_ns
 
-from router.net.coalescing import SAMPLE
-from router.net.reader import TURN, WAIT, Intake, Receive
+from router.engine.dispatch import Receive
 from router.net.udp import Listener
 
-_PATIENCE = 0.25
-"""Seconds for which it waits for a datagram before it looks whether there is something else to do."""
+SAMPLE = 32
+"""Number of datagrams by which their density is measured."""
+
+FOR_SUBSCRIBERS = 8
+"""Datagrams that may gather while a topic has subscribers: ROS queues are commonly ten deep, and a longer burst would
+overflow them."""
+
+FOR_SOCKETS = 32
+"""Datagrams that may gather if they only go to sockets, whose buffers hold hundreds."""
+
+_DENSE = 3
+"""Datagrams in the longest pause, on average, with which pauses begin. With fewer than two in a pause they end."""
+
+_SHORTEST_PAUSE = 150e-6
+"""Seconds. A shorter pause costs as much as the wake-ups that it saves."""
+
+_TURN = 4
+"""The most datagrams of one of several listeners in a row."""
+
+_WAIT = socket.MSG_TRUNC.value
+_DONT_WAIT = _WAIT | socket.MSG_DONTWAIT.value
+
+_TIMEVAL = struct.Struct("@ll")
+
+_TASK_INTERVAL = 0.25
+"""Seconds for which the thread waits for a datagram before it looks for tasks."""
 
 _MOST_WAITING = 1 << 16
-"""Datagrams that are taken from a socket at its end, at most: more than a receive buffer holds."""
+"""The most datagrams that are read when a listener ends: more than a receive buffer holds."""
 
 _ppoll = ctypes.CDLL(None).ppoll
-"""Python's own waits take whole milliseconds, or (select) no descriptor above 1023."""
+"""Python's own functions wait for whole milliseconds, or (select) for no descriptor above 1023."""
 _ppoll.argtypes = (ctypes.c_void_p, ctypes.c_ulong, ctypes.c_void_p, ctypes.c_void_p)
 
 
-class ReceiveThread:
-    """Calls `receive[listener](data, peer)` for each datagram, on one thread of its own.
+class Coalescing:
+    """The length of the pauses of one listener, in seconds; 0 stands for waiting for each datagram.
 
-    `limit` is the longest datagram in bytes that is received whole. A longer one arrives with its true
-    length (MSG_TRUNC), its tail being whatever the memory held: the receiver must refuse it by length.
-    `enough` tells how many datagrams of a listener may gather before they are looked at (see `coalescing`).
-    What `receive` raises goes to `failed`, and receiving goes on.
+    `longest` is the longest pause in ns, 0 for none. `target()` is how many datagrams should gather in a pause.
+    """
+
+    def __init__(self, longest: int, target: Callable[[], int]) -> None:
+        self._longest = longest / 1e9
+        self._target = target
+        self._pause = 0.0
+
+    def first(self, elapsed: int) -> float:
+        """The pause after SAMPLE datagrams that were waited for and came in `elapsed` ns."""
+        self._pause = elapsed / 1e9
+        return self.next(SAMPLE) if self._pause * _DENSE < self._longest * SAMPLE else 0.0
+
+    def next(self, taken: int) -> float:
+        """The pause after one in which `taken` datagrams came."""
+        if taken < 2:
+            return 0.0
+        self._pause = min(self._longest, self._pause * self._target() / taken)
+        return self._pause if self._pause >= min(self._longest, _SHORTEST_PAUSE) else 0.0
+
+
+class _Reader:
+    """Reads one listener's datagrams, each up to `size` bytes. `target` is as in `Coalescing`."""
+
+    def __init__(self, listener: Listener, receive: Receive, size: int, target: Callable[[], int]) -> None:
+        self.listener = listener
+        self.descriptor = listener.socket.fileno()
+        self._socket = listener.socket
+        self.receive_from = listener.socket.recvfrom
+        self.receive = receive
+        self.size = size
+        self.coalescing = Coalescing(listener.coalesce, target)
+        self._taken = 0  # since the clock was read, or since the last pause
+        self._since = 0
+
+    def wait_at_most(self, seconds: float) -> None:
+        """Make a blocking receive raise BlockingIOError after that; Python's own timeout would cost a call of poll."""
+        timeout = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
+
+    def take(self, most: int) -> int:
+        """Read what has arrived, and return how many datagrams: fewer than `most` if there are no more."""
+        receive, receive_from, size, flags = self.receive, self.receive_from, self.size, _DONT_WAIT
+        for taken in range(most):
+            try:
+                data, peer = receive_from(size, flags)
+            except BlockingIOError:  # also for a datagram with a wrong checksum
+                return taken
+            receive(data, peer)
+        return most
+
+    def take_ready(self) -> float:
+        """Read one datagram of a listener that was waited for. Return the pause that follows, in seconds."""
+        pause = 0.0
+        self._taken += self.take(1)
+        if self._taken == SAMPLE:
+            now = monotonic_ns()
+            pause = self.coalescing.first(now - self._since)
+            self._taken, self._since = 0, now
+        return pause
+
+    def take_gathered(self) -> float | None:
+        """Read up to _TURN datagrams after a pause. Return the next pause, or None if there may be more to read."""
+        taken = self.take(_TURN)
+        self._taken += taken
+        if taken == _TURN:
+            return None
+        pause = self.coalescing.next(self._taken)
+        self._taken, self._since = 0, monotonic_ns()
+        return pause
+
+
+class ReceiveThread:
+    """Calls `receive[listener](data, peer)` for each datagram, in a thread of its own.
+
+    `limit` is the longest datagram in bytes that is received whole. A longer one has its true length (MSG_TRUNC) with
+    arbitrary bytes at the end: the receiver must reject it by its length. `coalescing_target()` is how many datagrams
+    of a listener may gather before they are read. `failed` is called with what `receive` raises.
     """
 
     def __init__(
@@ -46,12 +146,12 @@ class ReceiveThread:
         listeners: Sequence[Listener],
         receive: Mapping[str, Receive],
         limit: int,
-        enough: Callable[[], int],
+        coalescing_target: Callable[[], int],
         failed: Callable[[Exception], None],
     ) -> None:
         self._size = limit + 1
-        self._enough = enough
-        self._intakes: list[Intake] = []
+        self._coalescing_target = coalescing_target
+        self._readers: list[_Reader] = []
         self.serve(listeners, receive)
         self._failed = failed
         self._ended = False
@@ -62,61 +162,61 @@ class ReceiveThread:
 
     @property
     def turns(self) -> int:
-        """Grows at least every 250 ms, unless datagrams keep the thread busy or it is stuck."""
+        """A number that grows at least every 250 ms, unless datagrams keep the thread busy or it is stuck."""
         return self._turns
 
     def start(self, first: Callable[[], None] | None = None) -> None:
-        """The thread begins with `first`, which may say again what somebody said while the thread did not run yet."""
+        """Start the thread, which calls `first` before it receives."""
         self._first = first
         self._thread.start()
 
     def serve(self, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
-        """From now on these listeners, each by `receive[listener.name]`. For a task only, once it has started."""
+        """Replace the listeners. Once the thread runs, to be called by a task only."""
         self._listeners = listeners
-        self._intakes = [Intake(each, receive[each.name], self._size, self._enough) for each in listeners]
+        self._readers = [_Reader(each, receive[each.name], self._size, self._coalescing_target) for each in listeners]
 
-    def give_to(self, receive: Mapping[str, Receive]) -> None:
-        """From now on each listener's datagrams go to `receive[listener.name]`. For a task only."""
-        for intake in self._intakes:
-            intake.receive = receive[intake.listener.name]
+    def replace_receivers(self, receive: Mapping[str, Receive]) -> None:
+        """Replace the receivers, by name of listener. To be called by a task only."""
+        for reader in self._readers:
+            reader.receive = receive[reader.listener.name]
 
     def finish(self, listener: Listener) -> None:
-        """Lets nothing new in, and handles what the kernel already holds. For a task, before `serve` without it."""
+        """End a listener's input and handle what the kernel holds. For a task, before `serve` without the listener."""
         listener.end_input()
-        [intake] = (each for each in self._intakes if each.listener is listener)
-        self._empty(intake)
+        [reader] = (each for each in self._readers if each.listener is listener)
+        self._empty(reader)
 
-    def between(self, task: Callable[[], None]) -> None:
-        """Has the thread call `task` between two datagrams, and returns when that is done; raises what it raises.
+    def call_between(self, task: Callable[[], None]) -> None:
+        """Have the thread call `task` between two datagrams; return when that is done, and raise what it raises.
 
-        While the thread does not run, it is called here.
+        If the thread does not run, `task` is called here.
         """
         done: Future[None] = Future()
 
-        def tell() -> None:
+        def call() -> None:
             try:
                 task()
-            except Exception as error:  # noqa: BLE001 raised where it was asked for
+            except Exception as error:  # noqa: BLE001 raised by `done.result`
                 done.set_exception(error)
             else:
                 done.set_result(None)
 
-        self._tasks.append(tell)
+        self._tasks.append(call)
         while not done.done():
             if not self._thread.is_alive():
                 self._do_tasks()
-            wait([done], _PATIENCE)
+            wait([done], _TASK_INTERVAL)
         done.result()
 
     def _do_tasks(self) -> None:
-        with suppress(IndexError):  # another thread may do them as well when this one has ended
+        with suppress(IndexError):  # several threads may do this once the receive thread has ended
             while self._tasks:
                 self._tasks.popleft()()
 
     def stop(self) -> None:
-        """Lets nothing new in, handles what the kernel already holds, and returns when that is done.
+        """End all input, handle what the kernel holds, and wait for the end of the thread.
 
-        What is in a socket that was inherited stays there, for whoever has it next.
+        What is in an inherited socket stays there, for the next process.
         """
         for listener in self._listeners:
             listener.end_input()
@@ -124,17 +224,17 @@ class ReceiveThread:
         self._thread.join()
 
     def _end(self) -> None:
-        for intake in self._intakes:
-            if not intake.listener.is_inherited:
-                self._empty(intake)
+        for reader in self._readers:
+            if not reader.listener.is_inherited:
+                self._empty(reader)
         self._ended = True
 
-    def _empty(self, intake: Intake) -> None:
+    def _empty(self, reader: _Reader) -> None:
         for _ in range(_MOST_WAITING):
             try:
-                if not intake.take(1):
+                if not reader.take(1):
                     return
-            except Exception as error:  # noqa: BLE001 as below
+            except Exception as error:  # noqa: BLE001 as in `_run`
                 self._failed(error)
 
     def _run(self) -> None:
@@ -143,26 +243,26 @@ class ReceiveThread:
                 if self._first is not None:
                     first, self._first = self._first, None
                     first()
-                if len(self._intakes) == 1:
+                if len(self._readers) == 1:
                     self._from_one()
                 else:
                     self._from_many()
                 self._do_tasks()
-            except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, is no reason to stop receiving
+            except Exception as error:  # noqa: BLE001 a bug of the router is reported, and receiving goes on
                 self._failed(error)
         self._do_tasks()
 
     def _from_one(self) -> None:
-        """Until there are tasks. One system call per datagram: a blocking receive is also the wait."""
-        [intake] = self._intakes
-        receive, receive_from, size, tasks = intake.receive, intake.receive_from, intake.size, self._tasks
-        intake.wait_at_most(_PATIENCE)
+        """Serve a single listener until there are tasks, with one system call per datagram: a receive that blocks."""
+        [reader] = self._readers
+        receive, receive_from, size, tasks = reader.receive, reader.receive_from, reader.size, self._tasks
+        reader.wait_at_most(_TASK_INTERVAL)
         while not tasks:
             self._turns += 1
             since = monotonic_ns()
             for _ in range(SAMPLE):
                 try:
-                    data, peer = receive_from(size, WAIT)
+                    data, peer = receive_from(size, _WAIT)
                 except BlockingIOError:
                     break
                 if peer is None:  # input has ended
@@ -170,39 +270,37 @@ class ReceiveThread:
                 receive(data, peer)
                 if tasks:
                     return
-            rest = intake.coalescing.first(monotonic_ns() - since)
-            while rest and not tasks:
+            pause = reader.coalescing.first(monotonic_ns() - since)
+            while pause and not tasks:
                 self._turns += 1
-                time.sleep(rest)
-                rest = intake.coalescing.next(intake.take(sys.maxsize))
+                time.sleep(pause)
+                pause = reader.coalescing.next(reader.take(sys.maxsize))
 
     def _from_many(self) -> None:
-        """The same; few datagrams per listener and turn, so that a flooded one cannot starve the others.
+        """Serve several listeners until there are tasks, with few datagrams per turn, so that none starves the others.
 
-        Those that coalesce are not waited for, but looked at when they have rested.
+        Listeners that pause are not waited for, but read when their pause is over.
         """
         with select.epoll() as waiting:
-            intakes = {intake.descriptor: intake for intake in self._intakes}
-            for descriptor in intakes:
+            readers = {reader.descriptor: reader for reader in self._readers}
+            for descriptor in readers:
                 waiting.register(descriptor, select.EPOLLIN)
             wait_for = _BriefWait(waiting.fileno())
-            looks: dict[int, float] = {}  # of those that coalesce: when, by time.monotonic
+            pauses: dict[int, float] = {}  # by descriptor, when each ends by time.monotonic
             while not self._tasks:
                 self._turns += 1
-                for descriptor in _ready(waiting, looks, wait_for):
-                    _, rest = intakes[descriptor].take_one()
-                    if rest:
+                for descriptor in _ready(waiting, pauses, wait_for):
+                    if pause := readers[descriptor].take_ready():
                         waiting.modify(descriptor, 0)
-                        looks[descriptor] = time.monotonic() + rest
-                for descriptor in _due(looks):
-                    taken, rest = intakes[descriptor].take_some()
-                    if taken == TURN:
+                        pauses[descriptor] = time.monotonic() + pause
+                for descriptor in _due(pauses):
+                    if (next_pause := readers[descriptor].take_gathered()) is None:
                         continue
-                    if rest:
-                        looks[descriptor] = time.monotonic() + rest
+                    if next_pause:
+                        pauses[descriptor] = time.monotonic() + next_pause
                     else:
                         waiting.modify(descriptor, select.EPOLLIN)
-                        del looks[descriptor]
+                        del pauses[descriptor]
 
 
 class _PollFd(ctypes.Structure):
@@ -214,7 +312,7 @@ class _TimeSpec(ctypes.Structure):
 
 
 class _BriefWait:
-    """Waits until `descriptor` is readable, for less than one second. It may end early. For one thread."""
+    """Waits less than one second until `descriptor` is readable. May return early. For one thread."""
 
     def __init__(self, descriptor: int) -> None:
         self._timeout = _TimeSpec()
@@ -226,15 +324,15 @@ class _BriefWait:
         _ppoll(*self._arguments)
 
 
-def _ready(waiting: select.epoll, looks: Mapping[int, float], wait_for: Callable[[float], None]) -> list[int]:
-    """What has something. Waits for that until the next look is due."""
-    if not looks:
-        return [descriptor for descriptor, _ in waiting.poll(_PATIENCE)]
-    if (timeout := min(looks.values()) - time.monotonic()) > 0:
+def _ready(waiting: select.epoll, pauses: Mapping[int, float], wait_for: Callable[[float], None]) -> list[int]:
+    """Wait until the next pause ends; return the descriptors with datagrams that do not pause."""
+    if not pauses:
+        return [descriptor for descriptor, _ in waiting.poll(_TASK_INTERVAL)]
+    if (timeout := min(pauses.values()) - time.monotonic()) > 0:
         wait_for(timeout)
-    return [descriptor for descriptor, _ in waiting.poll(0) if descriptor not in looks]
+    return [descriptor for descriptor, _ in waiting.poll(0) if descriptor not in pauses]
 
 
-def _due(looks: Mapping[int, float]) -> list[int]:
-    now = time.monotonic() if looks else 0.0
-    return [descriptor for descriptor, at in looks.items() if at <= now]
+def _due(pauses: Mapping[int, float]) -> list[int]:
+    now = time.monotonic() if pauses else 0.0
+    return [descriptor for descriptor, at in pauses.items() if at <= now]

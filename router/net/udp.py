@@ -1,52 +1,114 @@
-"""UDP sockets: listeners that own their port and tell what the kernel dropped, senders that lose nothing to old errors.
-
-Knows no envelope, route or counter; what a datagram means is the engine's business.
-"""
+"""UDP sockets: listeners, inherited ones among them, and senders that account for every datagram."""
 
 from __future__ import annotations
 
 import errno
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, MutableMapping
 from contextlib import suppress
+from functools import cache
 
 from router.compiler.program import ListenerPlan, SenderPlan
 from router.errors import SourceSpan, StartError
 from router.log import logger
-from router.net.inherited import inherited
-from router.net.kernel import arrivals, ask_for_receive_buffer, bound_interface, drops, receive_buffer
-from router.net.port_holder import port_taken
+from router.net.kernel import (
+    SO_TIMESTAMPNS,
+    arrivals,
+    ask_for_receive_buffer,
+    bound_interface,
+    drops,
+    port_taken,
+    receive_buffer,
+)
 from router.table.model import Address, bound_to
 
 _NETWORK_CHANGED = (errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL)
-"""What sending says: there was no network when the router started, there is none now, or this computer has no longer
-the address that the socket sends from."""
+"""Errors of sending if there was no network when the socket was connected, there is none now, or this computer has
+lost the address that the socket sends from."""
+
+FIRST_INHERITED = 3
+"""The first descriptor that a service manager hands over; the others follow it."""
+
+
+class Inherited:
+    """UDP sockets that a service manager has bound and handed over, as in sd_listen_fds(3), by what they are bound to.
+
+    They outlive the process, with the datagrams in them. Keys are those of `bound_to`: an address, or an address on an
+    interface.
+    """
+
+    def __init__(self, sockets: Iterable[socket.socket] = ()) -> None:
+        self._sockets = {_bound_to(each): each for each in sockets}
+        self._taken: set[str] = set()
+
+    def take(self, bound: str) -> socket.socket | None:
+        """Return a duplicate of the socket that is bound so, or None. It can be taken again.
+
+        If the socket unit says Timestamping=ns, what waits in it keeps the time at which the kernel got it.
+        """
+        held = self._sockets.get(bound)
+        if held is None or _bound_to(held) != bound:  # the interface may have gone since
+            return None
+        self._taken.add(bound)
+        # Without the option, stamps are read by `arrivals`, and no longer come with each datagram.
+        held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 0)
+        held.setblocking(True)
+        return held.dup()
+
+    def unclaimed(self) -> list[str]:
+        """What no listener has taken: a UDP address, or a description of the socket."""
+        return [name for name in self._sockets if name not in self._taken]
+
+
+@cache
+def inherited() -> Inherited:
+    """The sockets that this process has inherited. Its children inherit none."""
+    return Inherited(socket.socket(fileno=descriptor) for descriptor in _inherited_descriptors(os.environ))
+
+
+def _inherited_descriptors(environment: MutableMapping[str, str]) -> list[int]:
+    """Remove the variables, which are meant for this process only."""
+    pid, count = environment.pop("LISTEN_PID", ""), environment.pop("LISTEN_FDS", "")
+    environment.pop("LISTEN_FDNAMES", None)
+    if pid != str(os.getpid()) or not count.isdecimal():
+        return []
+    descriptors = list(range(FIRST_INHERITED, FIRST_INHERITED + int(count)))
+    for descriptor in descriptors:
+        os.set_inheritable(descriptor, False)
+    return descriptors
+
+
+def _bound_to(held: socket.socket) -> str:
+    if (held.family, held.type) == (socket.AF_INET, socket.SOCK_DGRAM):
+        interface = bound_interface(held)
+        return bound_to(Address(*held.getsockname()), "an interface that has gone" if interface is None else interface)
+    return f"{held.getsockname()}, which is no IPv4 UDP socket"
 
 
 class Listener:
-    """A bound socket. Opening raises StartError, which says where in the table and what to do.
+    """A bound socket: the inherited one with this address and interface if there is one, else a new one.
 
-    Where this process was handed one with the listener's address and interface, it is that one. Then what is not taken
-    from it waits for the next process, and what the kernel dropped was perhaps dropped before this one began.
+    Raises StartError with the position in the table and a remedy. Datagrams that are not received from an inherited
+    socket wait for the next process, and its kernel drops may be older than this process.
     """
 
     def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
         self._plan = plan
-        handed = inherited().take(plan.bound_to)
-        self.is_inherited = handed is not None
-        self.socket = handed or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        handed_over = inherited().take(plan.bound_to)
+        self.is_inherited = handed_over is not None
+        self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            if handed is None:
+            if handed_over is None:
                 if plan.interface is not None:
                     self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, plan.interface.encode())
                 # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
                 self.socket.bind(plan.address)
-            self._want_receive_buffer(plan)
+            self._request_receive_buffer(plan)
             self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
-            raise StartError(f"{span}: {_why_not_bound(plan, error)}") from error
+            raise StartError(f"{span}: {_bind_problem(plan, error)}") from error
         self.address = Address(*self.socket.getsockname())
         self._drops_at_close = 0
 
@@ -60,7 +122,7 @@ class Listener:
 
     @property
     def coalesce(self) -> int:
-        """The longest rest, in ns."""
+        """The longest pause between two reads, in ns."""
         return self._plan.coalesce
 
     @property
@@ -68,32 +130,32 @@ class Listener:
         return self._plan.interface
 
     def has_lost_interface(self) -> bool:
-        """Whether its network interface has gone. It receives nothing then, nor by a later one of the same name."""
+        """Whether its network interface has gone. It receives nothing then, nor from a later one of the same name."""
         return self._plan.interface is not None and bound_interface(self.socket) is None
 
     def follow(self, plan: ListenerPlan) -> None:
-        """Is what another table calls and wants of the same address and interface."""
+        """Adopt name and settings of another table's listener with the same address and interface."""
         if plan.receive_buffer != self._plan.receive_buffer:
-            self._want_receive_buffer(plan)
+            self._request_receive_buffer(plan)
         self._plan = plan
 
     def kernel_drops(self) -> int:
-        """Datagrams that the kernel threw away before anybody received them, since the socket was opened."""
+        """Datagrams that the kernel dropped before they were received, since the socket was opened."""
         return self._drops_at_close if self.socket.fileno() < 0 else drops(self.socket)
 
     def end_input(self) -> None:
-        """Lets nothing new in. What has arrived can still be received; after it comes the end, peer None.
+        """Accept nothing new. What has arrived can still be received, followed by an end with the peer None.
 
-        One that was inherited stays as it is, for whoever has it next: its receiver has to let go of it by himself.
+        An inherited socket is left as it is, for the next process: its receiver has to stop by itself.
 
-        A socket that is connected to itself takes nothing from others, so that a flood cannot keep the
-        receiver busy for ever; shutting down then wakes a receiver that waits.
+        A socket that is connected to itself accepts nothing from others, so that a flood cannot keep the receiver busy
+        for ever; shutting it down wakes a receiver that waits.
         """
         if self.is_inherited:
             return
         host, port = self.address
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)  # or one that has a broadcast address may not
-        # An interface may have lost the address meanwhile: then nothing comes in, and shutting down wakes all the same.
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)  # required for a broadcast address
+        # If the interface has lost the address, connecting fails, but nothing comes in and shutting down still wakes.
         with suppress(OSError):
             self.socket.connect(("127.0.0.1" if host == "0.0.0.0" else host, port))
         with suppress(OSError):
@@ -103,8 +165,8 @@ class Listener:
         self._drops_at_close = self.kernel_drops()
         self.socket.close()
 
-    def _want_receive_buffer(self, plan: ListenerPlan) -> None:
-        """What was inherited may have a larger one, for what comes while no process listens."""
+    def _request_receive_buffer(self, plan: ListenerPlan) -> None:
+        """An inherited socket may have a larger buffer, for what arrives while no process listens."""
         if self.is_inherited and receive_buffer(self.socket) >= plan.receive_buffer:
             return
         if (granted := ask_for_receive_buffer(self.socket, plan.receive_buffer)) >= plan.receive_buffer:
@@ -118,7 +180,7 @@ class Listener:
         )
 
 
-def _why_not_bound(plan: ListenerPlan, error: OSError) -> str:
+def _bind_problem(plan: ListenerPlan, error: OSError) -> str:
     what = f"listener '{plan.name}' cannot use {plan.bound_to}"
     if error.errno == errno.ENODEV:
         return f"{what}: there is no such network interface now; `ip link` lists those that there are"
@@ -136,8 +198,7 @@ def _why_not_bound(plan: ListenerPlan, error: OSError) -> str:
 class Sender:
     """A non-blocking socket, connected to one destination. Opening raises StartError.
 
-    A destination that no network leads to yet (the router may start before the link is up) is warned
-    about and tried again with every datagram.
+    A destination that is unreachable because the link is not up yet is logged, and tried again with every datagram.
     """
 
     def __init__(self, plan: SenderPlan, span: SourceSpan) -> None:
@@ -152,12 +213,12 @@ class Sender:
                 what = f"cannot send to endpoint '{plan.endpoint}' at {plan.address}"
                 raise StartError(f"{span}: {what}: {error.strerror}") from error
             logger.warning("no network leads to this endpoint yet", endpoint=plan.endpoint, address=str(plan.address))
-        self.send = _careful_send(self.socket, plan.address)
+        self.send = _sending(self.socket, plan.address)
 
     def send_and_look(self, data: bytes) -> int:
-        """As `send`, but raises also what is known at once of this datagram: nobody listens there, on this computer.
+        """As `send`, but raise errors of this datagram that are known at once: no process listens on a local port.
 
-        With `send`, the next datagram would stand for that loss, which may be another sender's.
+        With `send`, the next datagram would raise that error, and it may be another user's of this socket.
         """
         sent = self.send(data)
         if error := self.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
@@ -168,18 +229,17 @@ class Sender:
         self.socket.close()
 
 
-def _careful_send(connected: socket.socket, address: Address) -> Callable[[bytes], int]:
-    """`send(data)` returns the bytes sent, or raises OSError: then exactly one datagram is lost.
+def _sending(connected: socket.socket, address: Address) -> Callable[[bytes], int]:
+    """Return a function that sends a datagram and returns its size, or raises OSError: then exactly one is lost.
 
-    "Connection refused" is news about an earlier datagram, which was taken for sent. The kernel gives it
-    instead of sending this one, so this one is sent now, and the error still raised: it stands for the
-    loss of the earlier one. So one is counted as lost for one that is, and the counters balance.
+    "Connection refused" is about an earlier datagram, which was counted as sent. The kernel returns it instead of
+    sending this one; so this one is sent again, and the error raised for the earlier one: the counters balance.
 
-    Where the network has changed, a socket of today is made of `connected` first.
+    If the network has changed, `connected` is connected again first.
     """
     send = connected.send
 
-    def careful_send(data: bytes) -> int:
+    def send_one(data: bytes) -> int:
         try:
             return send(data)
         except ConnectionRefusedError:
@@ -188,14 +248,14 @@ def _careful_send(connected: socket.socket, address: Address) -> Callable[[bytes
         except OSError as error:
             if error.errno not in _NETWORK_CHANGED:
                 raise
-            _connect_anew(connected, address)
+            _reconnect(connected, address)
             return send(data)
 
-    return careful_send
+    return send_one
 
 
-def _connect_anew(connected: socket.socket, address: Address) -> None:
-    """As if it were opened now. Connecting alone would keep the local address that it has, which may have gone."""
+def _reconnect(connected: socket.socket, address: Address) -> None:
+    """Replace the socket by a new one. `connect` alone would keep its local address, which may have gone."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as fresh:
         fresh.setblocking(False)
         fresh.connect(address)

@@ -20,7 +20,7 @@ from router.observe.diagnostics_snapshot import METRICS, SEEN, Look, Situation
 from router.observe.diagnostics_status import statuses
 from router.observe.metrics import PREFIX
 from router.observe.running import Running
-from router.threads.background import background_threads
+from router.threads import background_threads
 
 PERIOD = 1.0
 """Seconds."""

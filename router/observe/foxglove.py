@@ -19,12 +19,12 @@ from google.protobuf.descriptor import Descriptor
 from router.compiler.program import Program
 from router.errors import StartError
 from router.log import logger
-from router.net.port_holder import port_holder
+from router.net.kernel import port_holder
 from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored, first_field
 from router.recording.schemas import descriptor_set
 from router.table.model import Address, Located
-from router.threads.background import background_threads
+from router.threads import background_threads
 from router.types.protobuf import PayloadCase
 
 LOOK_SECONDS = 1.0

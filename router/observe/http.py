@@ -25,7 +25,7 @@ from typing import Any
 
 from router.errors import SourceSpan, StartError
 from router.log import logger
-from router.net.port_holder import port_holder
+from router.net.kernel import port_holder
 from router.observe.http_answers import Answers
 from router.observe.http_callers import is_own_computer
 from router.observe.http_connection import Connection

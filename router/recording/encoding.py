@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 from mcap.opcode import Opcode
 
 from router.engine import MAX_DATAGRAM
-from router.engine.framing import LEN
+from router.engine.slow_path import LEN
 from router.recording.channels import Channels, Peer, varint
 from router.recording.chunk import BEHIND_LENGTH, HEAD, Chunk, ChunkBuilder
 from router.recording.mirror import Classifier, Mirrored

@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 from router.clock import wall_ns
 from router.compiler.network import recognisers
 from router.engine import MAX_DATAGRAM
-from router.engine.framing import restored
+from router.engine.slow_path import restored
 from router.table.model import Framing, RouteTable
 from router.types.protobuf import Envelope, PayloadCase
 

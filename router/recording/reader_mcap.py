@@ -21,7 +21,7 @@ from mcap.records import Channel, Chunk, Header, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
-from router.engine.framing import LEN
+from router.engine.slow_path import LEN
 from router.errors import UsageError
 from router.recording.channels import Holds, varint
 from router.recording.chunk import HEAD

@@ -26,7 +26,7 @@ from router.recording.packed import Packer
 from router.recording.queue import PERIOD, Intake
 from router.recording.saving import RecordError, Saving
 from router.table.model import RecordSettings
-from router.threads.alarm import Alarm
+from router.threads import WakeEvent
 
 __all__ = ["RecordError", "Recorder"]
 
@@ -53,7 +53,7 @@ class Recorder:
         self._packer = Packer()
         self._trips: deque[str] = deque()
         self._saves: deque[tuple[str, Future[Path]]] = deque()
-        self._alarm = Alarm()
+        self._alarm = WakeEvent()
         self._asking = threading.Lock()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="recorder")
@@ -108,7 +108,7 @@ class Recorder:
 
     def _wake(self) -> None:
         with suppress(ValueError):  # it has ended
-            self._alarm.ring()
+            self._alarm.set()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Called by the mirror's thread."""

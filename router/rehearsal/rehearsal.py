@@ -12,13 +12,13 @@ from dataclasses import replace
 
 from router.compiler.metrics import Series
 from router.compiler.program import Program
-from router.engine import Engine, OutboundEngine
-from router.engine.binding import Guarded, Outlets
+from router.engine import InboundEngine, OutboundEngine
+from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, feeder
+from router.engine.delivery import Report
 from router.engine.dispatch import Peer
-from router.engine.machine import Machine, P, R
-from router.engine.outcome import Report
 from router.engine.pacing import Pacer
+from router.engine.timers import P, R, Timer
 from router.rehearsal.events import DeadmanChanged, Dropped, Event, Rejected, event_of, is_told
 
 START = 1_767_225_600_000_000_000
@@ -36,13 +36,13 @@ class Rehearsal:
         self.now = start_ns
         self.events: list[Event] = []
         self._program = program
-        self._machines: list[Machine] = []
+        self._timers: list[Timer] = []
         self._arrived_at: int | None = None
-        outlets = self._outlets(_Counts(program, self._counted))
+        context = self._context(_Counts(program, self._counted))
         arrived_at = {plan.name: self._arrival for plan in program.listeners}
-        inbound = Engine(program, outlets, arrived_at)
+        inbound = InboundEngine(program, context, arrived_at)
         self._receive = {plan.name: inbound.receiver(plan.name) for plan in program.listeners}
-        outbound = OutboundEngine(program, outlets)
+        outbound = OutboundEngine(program, context)
         self._take = {plan.label: outbound.taker(plan.label) for plan in program.subscriptions}
         self._data = b""
 
@@ -59,32 +59,32 @@ class Rehearsal:
         """Has time pass until `to_ns`, with what is due on the way and then. Time that has passed stays passed."""
         while (due := self._next_due()) is not None and due <= to_ns:
             self.now = max(self.now, due)
-            for machine in reversed(self._machines):  # as a Timekeeper: the last may hand on to earlier ones
-                machine.due(self.now)
+            for timer in reversed(self._timers):  # as a TimerThread: the last may hand on to earlier ones
+                timer.due(self.now)
         self.now = max(self.now, to_ns)
 
     def close(self) -> None:
         """The router stops in good order: frames end, what waits is sent, armed deadmen have the last word."""
-        last = [machine for machine in self._machines if isinstance(machine, Deadman)]
-        for machine in [each for each in reversed(self._machines) if each not in last] + last[::-1]:
-            machine.end(self.now)
+        last = [timer for timer in self._timers if isinstance(timer, Deadman)]
+        for timer in [each for each in reversed(self._timers) if each not in last] + last[::-1]:
+            timer.end(self.now)
 
     def _next_due(self) -> int | None:
-        return min((machine.next_due for machine in self._machines if machine.next_due is not None), default=None)
+        return min((timer.next_due for timer in self._timers if timer.next_due is not None), default=None)
 
     def _arrival(self) -> int:
         return self.now if self._arrived_at is None else self._arrived_at
 
-    def _outlets(self, counts: list[int]) -> Outlets:
+    def _context(self, counts: list[int]) -> EngineContext:
         program, send = self._program, {plan.endpoint: self._take_datagram for plan in self._program.senders}
         deadmen = {
             plan.route: Deadman(plan, program.counters, counts, send, self._explain, self._deadman_changed)
             for plan in program.deadmen
         }
         pacers = {plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in program.senders if plan.budget}
-        self._machines += pacers.values()  # before what hands on to them
-        guarded = Guarded(counts, self._guard)
-        return Outlets(
+        self._timers += pacers.values()  # before what hands on to them
+        group = TimerGroup(counts, self._locked)
+        return EngineContext(
             counts=counts,
             send=send,
             publish={plan.label: self._take_message for plan in program.publishers},
@@ -92,15 +92,15 @@ class Rehearsal:
             report=self._explain,
             clock_ns=lambda: self.now,
             wall_ns=lambda: self.now,
-            pacing=guarded,
-            collecting=guarded,
-            feed=feeder(deadmen, self._guard),
+            pacing=group,
+            collecting=group,
+            feed=feeder(deadmen, self._locked),
             pacers=pacers,
         )
 
-    def _guard(self, machine: Machine, call: Callable[P, R]) -> Callable[P, R]:
-        if machine not in self._machines:
-            self._machines.append(machine)
+    def _locked(self, timer: Timer, call: Callable[P, R]) -> Callable[P, R]:
+        if timer not in self._timers:
+            self._timers.append(timer)
         return call
 
     # what happens

@@ -18,7 +18,7 @@ from router.clock import monotonic_ns
 from router.log import logger
 from router.ros.arrivals import Arrivals, RawSubscription
 from router.ros.wait import WaitSet
-from router.threads.parking import parked
+from router.threads import paused
 
 Receive = Callable[[bytes, int], None]
 
@@ -128,7 +128,7 @@ class MessageThread(_WaitThread):
 
     def paused(self) -> AbstractContextManager[None]:
         """The thread takes nothing meanwhile. Raises StuckError."""
-        return parked(self._ask)
+        return paused(self._ask)
 
     def serve(self, receive: Mapping[RawSubscription, Receive]) -> None:
         """From now on these and no others, each by its function. To be called before the start, or while paused.

@@ -14,7 +14,7 @@ from router.compiler.expressions import ExpressionError, ParsedReads, Scope, che
 from router.compiler.expressions.kinds import BoolKind
 from router.compiler.namespace import NAMESPACE
 from router.compiler.source import Source
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, Diagnostic, SourceSpan, UsageError
 from router.table.model import Expression
 from router.table.places import TextPlace

@@ -11,8 +11,7 @@ from contextlib import suppress
 from time import monotonic
 
 from router.compiler.program import Program
-from router.net.kernel import interface_is_up
-from router.net.port_holder import port_holder
+from router.net.kernel import interface_is_up, port_holder
 from router.table.address import LOCATOR, BadAddressError, parse_address
 from router.table.model import Address, Located, Transport, bound_to
 from router.tools.doctor_report import Finding, fine, problem, warning

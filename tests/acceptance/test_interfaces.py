@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from router.net.inherited import Inherited
+from router.net.udp import Inherited
 from tests.acceptance.payloads import WIRE
 from tests.acceptance.site import ROOT, RouterProcess, wait_until
 from tests.acceptance.two_networks import (

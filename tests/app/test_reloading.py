@@ -573,7 +573,7 @@ def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
     with site.router(PH + FROM_ROS) as router:
         site.write(PH + FROM_ROS + turns("1h"))
         with monkeypatch.context() as stuck:
-            stuck.setattr("router.threads.parking.PATIENCE_S", 0.05)
+            stuck.setattr("router.threads.PAUSE_TIMEOUT_S", 0.05)
             stuck.setattr(MessageThread, "_do_tasks", stand_still)
             result = router.reload()
         assert (result.ok, "is stuck" in result.text) == (False, True)

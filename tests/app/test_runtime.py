@@ -22,8 +22,8 @@ from structlog.testing import capture_logs
 from router.app import Router
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.engine.dispatch import Receive
 from router.errors import StartError
-from router.net.reader import Receive
 from router.net.receiver import ReceiveThread
 from router.net.udp import Listener
 from router.recording.recorder import Recorder, RecordError

@@ -16,10 +16,8 @@ from router.app.supervision import Watchdog, reloading, supervised, tell
 from router.clock import wall_ns
 from router.compiler.program import ListenerPlan
 from router.errors import SourceSpan
-from router.net import inherited as inheriting
 from router.net import udp
-from router.net.inherited import Inherited
-from router.net.udp import Listener
+from router.net.udp import Inherited, Listener
 from router.table.model import Address, Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
@@ -206,5 +204,5 @@ def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.Monk
 
 def test_what_is_meant_for_another_process_is_left_alone() -> None:
     environment = {"LISTEN_PID": "1", "LISTEN_FDS": "3", "LISTEN_FDNAMES": "a:b:c"}
-    assert inheriting._descriptors(environment) == []
+    assert udp._inherited_descriptors(environment) == []
     assert environment == {}

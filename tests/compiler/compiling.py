@@ -13,8 +13,8 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.program import Handler, Program
 from router.compiler.source import Source
 from router.engine.binding import bind
+from router.engine.delivery import MAPPING_FAILURES, Report
 from router.engine.freshness import Freshness
-from router.engine.outcome import MAPPING_FAILURES, Report
 from router.errors import Diagnostic, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.places import TextPlace

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from router.compiler.lookup import Definitions
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.types.model import MessageType
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from router.compiler import Checked
 from router.compiler.checked import CheckedRoute
 from router.compiler.program import Program
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import Published, context_of
 from tests.compiler.in_use import INBOUND_CASES

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.errors import MappingError
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same

@@ -16,7 +16,7 @@ from router.compiler.expressions import ExpressionError
 from router.compiler.expressions.kinds import BoolKind, FloatKind, IntKind, Kind, StringKind
 from router.compiler.mapping import build
 from router.compiler.source import Source
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same

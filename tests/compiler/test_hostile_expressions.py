@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from router.compiler.expressions import DEEPEST, ExpressionError
 from router.compiler.source import Source
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String
 from tests.compiler.compiling import SPAN, compiled, scope_of

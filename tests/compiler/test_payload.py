@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, MappingError, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.places import TextPlace

@@ -14,7 +14,7 @@ from router.compiler.cdr import CdrReads
 from router.compiler.lookup import Definitions
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
-from router.engine.outcome import MAPPING_FAILURES
+from router.engine.delivery import MAPPING_FAILURES
 from router.errors import MappingError
 from router.table.model import FieldMap
 from router.types.model import MessageType

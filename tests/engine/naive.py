@@ -7,21 +7,21 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 
 from router.engine import MAX_DATAGRAM
 from router.engine.binding import bind
-from router.engine.framing import restored
 from router.engine.freshness import Freshness
+from router.engine.slow_path import restored
 from router.table.model import Framing
 from tests.engine.rig import Rig
 
 
 class Naive:
-    """Stands in for the engine of a rig: same handlers, outlets and counters, another way to get there."""
+    """Stands in for the engine of a rig: same handlers, context and counters, another way to get there."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.program = rig.program
         handlers = [(number, handler) for number, [handler] in self.program.inbound.items()]
         self.handles = {
-            number: bind(handler, self.program.counters, rig.outlets, Freshness()) for number, handler in handlers
+            number: bind(handler, self.program.counters, rig.context, Freshness()) for number, handler in handlers
         }
 
     def receive(self, data: bytes, peer: tuple[str, int], listener: str) -> None:

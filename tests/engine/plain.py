@@ -1,4 +1,4 @@
-"""Outlets without threads: for an engine whose machines nobody serves."""
+"""EngineContext without threads: for an engine whose machines nobody serves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 from router.compiler.metrics import Counters
 from router.engine import Report
-from router.engine.binding import Guarded, Outlets
+from router.engine.binding import EngineContext, TimerGroup
 
 
 def plain_outlets(
@@ -17,11 +17,11 @@ def plain_outlets(
     wall_ns: int = 0,
     counts: list[int] | None = None,
     publish_errors: tuple[type[Exception], ...] = (),
-) -> Outlets:
+) -> EngineContext:
     """Everybody listens on every topic, the clocks stand still, and no deadman ever trips."""
     counts = counters.fresh_counts() if counts is None else counts
-    unguarded = Guarded(counts, lambda _, call: call)
-    return Outlets(
+    ungrouped = TimerGroup(counts, lambda _, call: call)
+    return EngineContext(
         counts=counts,
         send=send,
         publish=publish,
@@ -29,8 +29,8 @@ def plain_outlets(
         report=report,
         clock_ns=lambda: 0,
         wall_ns=lambda: wall_ns,
-        pacing=unguarded,
-        collecting=unguarded,
+        pacing=ungrouped,
+        collecting=ungrouped,
         feed=lambda *_: lambda _: None,
         publish_errors=publish_errors,
     )

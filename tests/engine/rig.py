@@ -10,11 +10,11 @@ from typing import ParamSpec, TypeVar
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
-from router.engine import Engine, OutboundEngine, Report
-from router.engine.binding import Guarded, Outlets
+from router.engine import InboundEngine, OutboundEngine, Report
+from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, feeder
-from router.engine.machine import Machine
 from router.engine.pacing import Pacer
+from router.engine.timers import Timer
 from tests.engine.ledger import Ledger
 from tests.tables import PROTOS
 
@@ -89,16 +89,16 @@ class Rig:
         self.reports: list[Report] = []
         self.failures: dict[str, Exception] = {}
         self.wanted = {plan.label: [plan.label not in unwanted] for plan in made.publishers}
-        self.machines: list[Machine] = []
-        guarded = Guarded(self.counts, self._guard)
+        self.timers: list[Timer] = []
+        group = TimerGroup(self.counts, self._locked)
         send = {plan.endpoint: self._sender(plan.endpoint) for plan in made.senders}
         pacers = {plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in made.senders if plan.budget}
         deadmen = {
             plan.route: Deadman(plan, made.counters, self.counts, send, self.reports.append, self._changed)
             for plan in made.deadmen
         }
-        self.machines += pacers.values()
-        self.outlets = Outlets(
+        self.timers += pacers.values()
+        self.context = EngineContext(
             counts=self.counts,
             send=send,
             publish={plan.label: self._outlet(plan.label, self.published) for plan in made.publishers},
@@ -106,17 +106,17 @@ class Rig:
             report=self.reports.append,
             clock_ns=lambda: self.now,
             wall_ns=lambda: self.WALL + self.now,
-            pacing=guarded,
-            collecting=guarded,
-            feed=feeder(deadmen, self._guard),
+            pacing=group,
+            collecting=group,
+            feed=feeder(deadmen, self._locked),
             publish_errors=(PublishError,),
             pacers=pacers,
         )
         self.arrived_before = 0
         arrived_at = {plan.name: lambda: self.WALL + self.now - self.arrived_before for plan in made.listeners}
-        engine = Engine(made, self.outlets, arrived_at)
+        engine = InboundEngine(made, self.context, arrived_at)
         self.receivers = {plan.name: engine.receiver(plan.name) for plan in made.listeners}
-        outbound = OutboundEngine(made, self.outlets)
+        outbound = OutboundEngine(made, self.context)
         self.takers = {plan.label: outbound.taker(plan.label) for plan in made.subscriptions}
         self.changes: list[tuple[str, bool]] = []
 
@@ -128,20 +128,20 @@ class Rig:
         self.takers[topic](cdr, self.WALL + self.now - self.arrived_before)
 
     def pass_time(self, ns: int) -> None:
-        """Moves the clocks, and serves machines when they are due."""
+        """Moves the clocks, and serves timers when they are due."""
         until = self.now + ns
         while (next_due := self._next_due()) is not None and next_due <= until:
             self.now = max(self.now, next_due)
-            for machine in self.machines:
-                machine.due(self.now)
+            for timer in self.timers:
+                timer.due(self.now)
         self.now = until
 
     def _next_due(self) -> int | None:
-        return min((machine.next_due for machine in self.machines if machine.next_due is not None), default=None)
+        return min((timer.next_due for timer in self.timers if timer.next_due is not None), default=None)
 
-    def _guard(self, machine: Machine, call: Callable[P, R]) -> Callable[P, R]:
-        if machine not in self.machines:
-            self.machines.append(machine)
+    def _locked(self, timer: Timer, call: Callable[P, R]) -> Callable[P, R]:
+        if timer not in self.timers:
+            self.timers.append(timer)
         return call
 
     def _changed(self, route: str, active: bool) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from router.compiler.metrics import DROP_REASONS, Counters
 from router.compiler.program import TargetPlan
-from router.engine.outcome import FrameOutcome, Outcome, Report
+from router.engine.delivery import FrameOutcome, Outcome, Report
 
 
 class _Target:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from router.engine import collecting
 from router.engine.collecting import MOST_CLOSED, MOST_FRAMES, MOST_PARTS, Collector
-from router.engine.limiter import NS
+from router.engine.pacing import NS
 from router.errors import MappingError
 from tests.engine.served import serve
 from tests.engine.target import Topic

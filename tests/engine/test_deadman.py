@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
 from router.engine.deadman import GREETING, START, Deadman, feeder
-from router.engine.machine import Machine
-from router.engine.outcome import Report
+from router.engine.delivery import Report
+from router.engine.timers import Timer
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -171,7 +171,7 @@ def test_at_the_end_it_sends_once_more_and_then_nothing(now: int) -> None:
 def test_who_takes_over_disarms_it_until_its_own_next_command() -> None:
     watched = Watched()
     watched.feed(0)
-    watched.deadman.relieve(TIMEOUT - 1)
+    watched.deadman.disarm(TIMEOUT - 1)
     watched.due(10 * TIMEOUT)
     watched.deadman.end(0)
     assert (watched.deadman.next_due, watched.sent, watched.told) == (None, [], [])
@@ -184,7 +184,7 @@ def test_who_takes_over_releases_it_when_it_has_tripped() -> None:
     watched = Watched()
     watched.feed(0)
     watched.run(TIMEOUT + REPEAT)
-    watched.deadman.relieve(TIMEOUT + REPEAT + 1)
+    watched.deadman.disarm(TIMEOUT + REPEAT + 1)
     watched.run(10**6)
     assert watched.times() == [TIMEOUT, TIMEOUT + REPEAT]
     assert [told[:2] for told in watched.told] == [("drive", True), ("drive", False)]
@@ -192,17 +192,17 @@ def test_who_takes_over_releases_it_when_it_has_tripped() -> None:
 
 
 @pytest.mark.parametrize(("told", "armed"), [(["a"], {"a"}), (["a", "b", "c"], {"a"}), (["b", "c"], set())])
-def test_one_call_feeds_the_own_deadman_and_relieves_the_others(told: list[str], armed: set[str]) -> None:
+def test_one_call_feeds_the_own_deadman_and_disarms_the_others(told: list[str], armed: set[str]) -> None:
     deadmen = {name: Watched().deadman for name in "abc"}
     for name in "bc":
         deadmen[name].feed(0)
-    served: list[Machine] = []
+    served: list[Timer] = []
 
-    def guard(machine: Machine, call: Callable[P, R], /) -> Callable[P, R]:
-        served.append(machine)
+    def locked(timer: Timer, call: Callable[P, R], /) -> Callable[P, R]:
+        served.append(timer)
         return call
 
-    feeder(deadmen, guard)("a", told)(TIMEOUT)
+    feeder(deadmen, locked)("a", told)(TIMEOUT)
     assert served == [deadmen[told[0]]]
     assert {name for name in told if deadmen[name].next_due is not None} == armed
 
@@ -253,7 +253,7 @@ def succession(before: Watched, plan: DeadmanPlan) -> Watched:
     """One whose endpoints are the same but for the arm board, and which takes the place of `before`."""
     after = Watched(plan)
     after.deadman._destinations[0] = before.deadman._destinations[0]
-    after.deadman.inherit(before.deadman)
+    after.deadman.replace(before.deadman)
     return after
 
 
@@ -282,14 +282,14 @@ def test_a_command_that_waited_since_before_a_reload_feeds_the_one_that_acts_now
     for number, deadman in enumerate((before.deadman, between.deadman, after.deadman)):
         deadman.feed(number)
         assert after.deadman.next_due == number + 2 * TIMEOUT
-    before.deadman.relieve(0)
+    before.deadman.disarm(0)
     assert [each.deadman.next_due for each in (before, between, after)] == [None, None, None]
 
 
 def test_at_the_start_it_sends_once_and_is_neither_armed_nor_tripped() -> None:
     watched = Watched()
     watched.failures["arm_board"] = FAULT
-    assert watched.deadman.begin() == ["driving_board"]
+    assert watched.deadman.start() == ["driving_board"]
     watched.run(10**12)
     watched.deadman.end(0)
     assert watched.sent == [(0, "driving_board", b"brake")]
@@ -299,20 +299,20 @@ def test_at_the_start_it_sends_once_and_is_neither_armed_nor_tripped() -> None:
 
 def test_one_that_is_silent_at_the_start_sends_nothing() -> None:
     watched = Watched(replace(PLAN, at_start=False))
-    assert watched.deadman.begin() == []
-    watched.deadman.wait_to_meet(0)
-    assert watched.deadman.meet(1) == []
+    assert watched.deadman.start() == []
+    watched.deadman.await_subscribers(0)
+    assert watched.deadman.greet(1) == []
     assert (watched.sent, watched.deadman.next_due) == ([], None)
 
 
 def test_shortly_after_the_start_each_new_subscriber_is_sent_to_twice_until_a_command_comes() -> None:
     watched = Watched()
-    watched.deadman.wait_to_meet(0)
+    watched.deadman.await_subscribers(0)
     meetings = (5, START - 1, START, START + 1)
     for now in meetings:
         watched.run(now)
         watched.now = now
-        watched.deadman.meet(now)
+        watched.deadman.greet(now)
     watched.run(10 * START)
     assert watched.times() == [5, 5 + GREETING, START - 1, START - 1 + GREETING]
     assert watched.told == []
@@ -320,10 +320,10 @@ def test_shortly_after_the_start_each_new_subscriber_is_sent_to_twice_until_a_co
 
 def test_a_command_ends_the_meetings_of_the_start() -> None:
     watched = Watched()
-    watched.deadman.wait_to_meet(0)
-    watched.deadman.meet(5)
+    watched.deadman.await_subscribers(0)
+    watched.deadman.greet(5)
     watched.feed(10)
-    assert watched.deadman.meet(20) == []
+    assert watched.deadman.greet(20) == []
     watched.run(10 + TIMEOUT)
     assert watched.times() == [0, 10 + TIMEOUT]
     assert watched.count("deadman_trips") == 1
@@ -332,12 +332,12 @@ def test_a_command_ends_the_meetings_of_the_start() -> None:
 @pytest.mark.parametrize("is_replaced", [False, True])
 def test_at_the_end_a_meeting_is_no_command(is_replaced: bool) -> None:
     watched = Watched()
-    watched.deadman.wait_to_meet(0)
-    watched.deadman.meet(5)
+    watched.deadman.await_subscribers(0)
+    watched.deadman.greet(5)
     if is_replaced:
         after = succession(watched, PLAN).deadman
         assert (after.next_due, watched.deadman.next_due) == (None, None)
-        assert after.meet(10) == ["driving_board", "arm_board"]
+        assert after.greet(10) == ["driving_board", "arm_board"]
     watched.sent.clear()
     watched.deadman.end(20)
     assert (watched.sent, watched.deadman.next_due) == ([], None)

@@ -112,8 +112,8 @@ def test_a_deadman_that_has_tripped_is_released_by_who_takes_over(rig: Rig) -> N
 def test_at_the_end_only_the_deadman_of_who_drives_has_a_last_word(rig: Rig) -> None:
     operator_drives(rig, SECOND)
     software_drives(rig, SECOND)
-    for machine in rig.machines:
-        machine.end(rig.now)
+    for timer in rig.timers:
+        timer.end(rig.now)
 
     assert brakes(rig) == 1
     assert rig.count("deadman_datagrams_sent", "drive_motor", "driving_board") == 1

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.engine.delivery import immediately
-from router.engine.latest import Latest
-from router.engine.limiter import NS
+from router.engine.pacing import NS, Latest
 from tests.engine.served import play, serve
 from tests.engine.target import Destination
 

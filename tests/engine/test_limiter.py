@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine.limiter import NS, RateLimit
+from router.engine.pacing import NS, RateLimit
 
 rates = st.integers(1, 1000) | st.floats(0.5, 1000)
 

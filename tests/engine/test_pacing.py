@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.engine import MAX_DATAGRAM
-from router.engine.limiter import NS
-from router.engine.pacing import BURST, LEAST_OVERDRAFT, LEAST_QUEUE, OVERDRAFT, Pacer
+from router.engine.pacing import BURST, LEAST_OVERDRAFT, LEAST_QUEUE, NS, OVERDRAFT, Pacer
 from router.table.model import Priority
 from tests.engine.served import play, serve
 from tests.engine.target import Destination

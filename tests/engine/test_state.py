@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from router.engine.state import State
+from router.engine.binding import State
 
 
 def test_what_has_the_same_key_is_the_same_object_in_the_next_program() -> None:
@@ -13,8 +13,8 @@ def test_what_has_the_same_key_is_the_same_object_in_the_next_program() -> None:
     then = State(first)
     assert then.keep(("limit", 1), object) is limit
     new = then.keep(("limit", 3), object)
-    assert list(then.made()) == [new]
+    assert list(then.added()) == [new]
     assert list(then.left()) == [gone]
-    then.settle()
+    then.forget_previous()
     assert list(then.left()) == []
     assert then.keep(("limit", 1), object) is limit

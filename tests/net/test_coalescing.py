@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from router.net.coalescing import FOR_SOCKETS, FOR_SUBSCRIBERS, SAMPLE, Coalescing
+from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, SAMPLE, Coalescing
 
 LONGEST = 1_000_000
 HANDLING = 6e-6

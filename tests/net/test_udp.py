@@ -20,10 +20,9 @@ from structlog.testing import capture_logs
 from router.clock import wall_ns
 from router.compiler.program import ListenerPlan, SenderPlan
 from router.errors import SourceSpan, StartError
-from router.net import reader as intake
-from router.net.coalescing import FOR_SOCKETS, SAMPLE, Coalescing
+from router.net import receiver
 from router.net.kernel import SO_RCVBUFFORCE
-from router.net.receiver import ReceiveThread
+from router.net.receiver import FOR_SOCKETS, SAMPLE, Coalescing, ReceiveThread
 from router.net.udp import Listener, Sender
 from router.table.model import Address, Framing
 
@@ -66,7 +65,7 @@ def rests(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
             told.append((taken, super().next(taken)))
             return told[-1][1]
 
-    monkeypatch.setattr(intake, "Coalescing", Watched)
+    monkeypatch.setattr(receiver, "Coalescing", Watched)
     return told
 
 
@@ -132,7 +131,7 @@ def test_what_is_called_can_be_replaced_between_two_datagrams(several: list[List
     assert receiving.got.get(timeout=5)[1] == b"old"
     new: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     functions = {listener.name: lambda data, _: new.put(data) for listener in several}
-    receiving.thread.between(lambda: receiving.thread.give_to(functions))
+    receiving.thread.call_between(lambda: receiving.thread.replace_receivers(functions))
     peer.sendto(b"new", several[0].address)
     assert new.get(timeout=5) == b"new"
     receiving.thread.stop()
@@ -149,11 +148,11 @@ def test_a_task_runs_on_the_thread_and_raises_where_it_was_asked_for(several: li
 
     for _ in range(2):
         with pytest.raises(LookupError, match="a bug"):
-            receiving.thread.between(task)
+            receiving.thread.call_between(task)
         receiving.thread.start() if len(ran) == 1 else None
     receiving.thread.stop()
     with pytest.raises(LookupError, match="a bug"):
-        receiving.thread.between(task)
+        receiving.thread.call_between(task)
     assert [name == "receive" for name in ran] == [False, True, False]
 
 
@@ -214,7 +213,7 @@ def test_a_listener_may_come_when_more_than_a_thousand_descriptors_are_open(
         continue
     late = listen(stack, "late")
     both = {listener.name: receiving._into_queue(listener.name) for listener in (early, late)}
-    receiving.thread.between(lambda: receiving.thread.serve([early, late], both))
+    receiving.thread.call_between(lambda: receiving.thread.serve([early, late], both))
     sent = pour(peer, late, 6000, 3000)
     receiving.thread.stop()
     assert receiving.failures.empty()

@@ -10,7 +10,7 @@ from contextlib import suppress
 
 from router.errors import StartError
 from router.log import logger
-from router.net.port_holder import port_taken
+from router.net.kernel import port_taken
 from router.table.model import Address
 
 RETRY_SECONDS = 1.0

@@ -31,7 +31,7 @@ from router.gateway.transport.zenoh_session import (
 )
 from router.log import logger
 from router.table.model import Address, ZenohSettings
-from router.threads.daemon_thread import DaemonThread
+from router.threads import DaemonThread
 
 MOST = 16 << 20
 """Bytes that are received as one, unless said otherwise."""

@@ -17,7 +17,7 @@ import zenoh
 from router.clock import wall_ns
 from router.compiler.zenoh_config import is_default, library_config, reason
 from router.errors import StartError
-from router.net.port_holder import port_taken
+from router.net.kernel import port_taken
 from router.table.model import ZenohSettings
 
 LARGE_MESSAGE_US = 2_000_000

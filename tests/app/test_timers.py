@@ -1,4 +1,4 @@
-"""The thread that serves machines: what is due is done, in order and one at a time, whatever a machine raises."""
+"""The threads that serve timers: what is due is done, in order and one at a time, whatever a timer raises."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from time import monotonic_ns
 
 import pytest
 
-from router.threads.timekeeper import Timekeeper
+from router.app.timers import TimerThread
 
 MS = 1_000_000
 HOUR = 3600 * 1000 * MS
@@ -23,7 +23,7 @@ PATIENCE = 10
 
 
 class Bell:
-    """A machine that rings into a queue when it is due, once each time it was set."""
+    """A timer that rings into a queue when it is due, once each time it was set."""
 
     def __init__(self, rung: queue.SimpleQueue[str], name: str = "bell") -> None:
         self.next_due: int | None = None
@@ -56,136 +56,136 @@ class Bell:
             raise self.error
 
 
-class Keeping:
-    """A running timekeeper and what came of it."""
+class Running:
+    """A running timer thread and what came of it."""
 
     def __init__(self, stack: ExitStack) -> None:
         self.rung: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.failures: queue.SimpleQueue[Exception] = queue.SimpleQueue()
-        self.keeper = Timekeeper("test", monotonic_ns, self.failures.put)
+        self.thread = TimerThread("test", monotonic_ns, self.failures.put)
         self._stack = stack
 
     def start(self) -> None:
-        self.keeper.start()
-        self._stack.callback(self.keeper.stop)
+        self.thread.start()
+        self._stack.callback(self.thread.stop)
 
     def heard(self) -> str:
         return self.rung.get(timeout=PATIENCE)
 
 
 @pytest.fixture
-def keeping() -> Iterator[Keeping]:
+def running() -> Iterator[Running]:
     with ExitStack() as stack:
-        yield Keeping(stack)
+        yield Running(stack)
 
 
-def test_what_is_due_at_the_start_is_done(keeping: Keeping) -> None:
-    bell = Bell(keeping.rung)
+def test_what_is_due_at_the_start_is_done(running: Running) -> None:
+    bell = Bell(running.rung)
     bell.next_due = monotonic_ns()
-    keeping.keeper.add(bell)
-    keeping.start()
-    assert keeping.heard() == "bell"
+    running.thread.add(bell)
+    running.start()
+    assert running.heard() == "bell"
 
 
-def test_a_guarded_call_that_brings_something_nearer_wakes_the_thread(keeping: Keeping) -> None:
-    bell = Bell(keeping.rung)
-    ring_at = keeping.keeper.guard(bell, bell.ring_at)
+def test_a_locked_call_that_brings_something_nearer_wakes_the_thread(running: Running) -> None:
+    bell = Bell(running.rung)
+    ring_at = running.thread.locked(bell, bell.ring_at)
     ring_at(monotonic_ns() + HOUR)
-    keeping.start()
+    running.start()
     for _ in range(50):
         ring_at(monotonic_ns() + HOUR)
         ring_at(monotonic_ns())
-        assert keeping.heard() == "bell"
-    assert keeping.failures.empty()
+        assert running.heard() == "bell"
+    assert running.failures.empty()
 
 
-def test_what_another_machine_is_handed_wakes_the_thread_too(keeping: Keeping) -> None:
+def test_what_another_timer_is_handed_wakes_the_thread_too(running: Running) -> None:
     """As with a limit in front of an endpoint's budget."""
-    first, second = Bell(keeping.rung, "first"), Bell(keeping.rung, "second")
-    keeping.keeper.add(second)
-    hand_on = keeping.keeper.guard(first, second.ring_at)
-    keeping.start()
+    first, second = Bell(running.rung, "first"), Bell(running.rung, "second")
+    running.thread.add(second)
+    hand_on = running.thread.locked(first, second.ring_at)
+    running.start()
     hand_on(monotonic_ns())
-    assert keeping.heard() == "second"
+    assert running.heard() == "second"
 
 
-def test_what_a_machine_hands_on_when_it_is_due_is_seen_to(keeping: Keeping) -> None:
+def test_what_a_timer_hands_on_when_it_is_due_is_seen_to(running: Running) -> None:
     """It was added after the one that it hands on to, as whoever wires them up has it at hand by then."""
-    second = Bell(keeping.rung, "second")
+    second = Bell(running.rung, "second")
 
     class HandsOn(Bell):
         def due(self, now: int) -> None:
             super().due(now)
             second.ring_at(now)
 
-    first = HandsOn(keeping.rung, "first")
+    first = HandsOn(running.rung, "first")
     first.next_due = monotonic_ns()
-    keeping.keeper.add(second)
-    keeping.keeper.add(first)
-    keeping.start()
-    assert [keeping.heard(), keeping.heard()] == ["first", "second"]
+    running.thread.add(second)
+    running.thread.add(first)
+    running.start()
+    assert [running.heard(), running.heard()] == ["first", "second"]
 
 
-def test_machines_are_served_in_the_order_of_their_times(keeping: Keeping) -> None:
+def test_timers_are_served_in_the_order_of_their_times(running: Running) -> None:
     names = ["third", "first", "second"]
     now = monotonic_ns()
     for name, delay in zip(names, (200, 40, 120), strict=True):
-        bell = Bell(keeping.rung, name)
-        keeping.keeper.guard(bell, bell.ring_at)(now + delay * MS)
-    keeping.start()
-    assert [keeping.heard() for _ in names] == ["first", "second", "third"]
+        bell = Bell(running.rung, name)
+        running.thread.locked(bell, bell.ring_at)(now + delay * MS)
+    running.start()
+    assert [running.heard() for _ in names] == ["first", "second", "third"]
 
 
-def test_nothing_is_done_before_its_time(keeping: Keeping) -> None:
+def test_nothing_is_done_before_its_time(running: Running) -> None:
     """The bell checks the time it is told, this the time that has passed."""
-    bell = Bell(keeping.rung)
-    ring_at = keeping.keeper.guard(bell, bell.ring_at)
-    keeping.start()
+    bell = Bell(running.rung)
+    ring_at = running.thread.locked(bell, bell.ring_at)
+    running.start()
     for delay in (0, 1, 10, 50):
         time = monotonic_ns() + delay * MS
         ring_at(time)
-        keeping.heard()
+        running.heard()
         assert monotonic_ns() >= time
 
 
-def test_a_failure_is_handed_over_and_the_other_machines_are_served(keeping: Keeping) -> None:
-    broken, sound = Bell(keeping.rung, "broken"), Bell(keeping.rung, "sound")
+def test_a_failure_is_handed_over_and_the_other_timers_are_served(running: Running) -> None:
+    broken, sound = Bell(running.rung, "broken"), Bell(running.rung, "sound")
     broken.error = LookupError("a bug")
     broken.next_due = sound.next_due = monotonic_ns()
-    keeping.keeper.add(sound)
-    keeping.keeper.add(broken)
-    keeping.start()
-    assert [keeping.heard(), keeping.heard()] == ["broken", "sound"]
-    assert keeping.failures.get(timeout=PATIENCE) is broken.error
+    running.thread.add(sound)
+    running.thread.add(broken)
+    running.start()
+    assert [running.heard(), running.heard()] == ["broken", "sound"]
+    assert running.failures.get(timeout=PATIENCE) is broken.error
 
 
-def test_a_machine_that_failed_is_tried_again_but_not_all_the_time(keeping: Keeping) -> None:
-    broken = Bell(keeping.rung)
+def test_a_timer_that_failed_is_tried_again_but_not_all_the_time(running: Running) -> None:
+    broken = Bell(running.rung)
     broken.error = LookupError("a bug")
     broken.next_due = begun = monotonic_ns()
-    keeping.keeper.add(broken)
-    keeping.start()
+    running.thread.add(broken)
+    running.start()
     for _ in range(3):
-        assert isinstance(keeping.failures.get(timeout=PATIENCE), LookupError)
+        assert isinstance(running.failures.get(timeout=PATIENCE), LookupError)
     broken.error = None
-    keeping.keeper.stop()
-    assert 3 + keeping.failures.qsize() <= 1 + (monotonic_ns() - begun) / (100 * MS)
+    running.thread.stop()
+    assert 3 + running.failures.qsize() <= 1 + (monotonic_ns() - begun) / (100 * MS)
 
 
-def test_a_guarded_call_returns_and_raises_what_the_call_does(keeping: Keeping) -> None:
-    bell = Bell(keeping.rung)
-    keeping.start()
-    divided = keeping.keeper.guard(bell, divmod)
+def test_a_locked_call_returns_and_raises_what_the_call_does(running: Running) -> None:
+    bell = Bell(running.rung)
+    running.start()
+    divided = running.thread.locked(bell, divmod)
     assert divided(7, 2) == (3, 1)
     with pytest.raises(ZeroDivisionError):
         divided(7, 0)
     assert divided(4, 2) == (2, 0)
 
 
-def test_no_two_calls_happen_at_once(keeping: Keeping) -> None:
-    bells = [Bell(keeping.rung, name) for name in ("left", "right")]
-    ring_at = [keeping.keeper.guard(bell, bell.ring_at) for bell in bells]
-    keeping.start()
+def test_no_two_calls_happen_at_once(running: Running) -> None:
+    bells = [Bell(running.rung, name) for name in ("left", "right")]
+    ring_at = [running.thread.locked(bell, bell.ring_at) for bell in bells]
+    running.start()
 
     def hammer(index: int) -> None:
         for _ in range(2000):
@@ -199,34 +199,34 @@ def test_no_two_calls_happen_at_once(keeping: Keeping) -> None:
     for thread in threads:
         thread.join()
     sys.setswitchinterval(interval)
-    assert keeping.failures.empty()
+    assert running.failures.empty()
     assert [bell.calls for bell in bells] == [4000, 4000]
 
 
 @pytest.mark.parametrize("due", [None, HOUR], ids=["nothing due", "something far away"])
-def test_stopping_does_not_wait_for_what_is_due_later(keeping: Keeping, due: int | None) -> None:
-    bell = Bell(keeping.rung)
-    ring_at = keeping.keeper.guard(bell, bell.ring_at)
-    keeping.keeper.start()
+def test_stopping_does_not_wait_for_what_is_due_later(running: Running, due: int | None) -> None:
+    bell = Bell(running.rung)
+    ring_at = running.thread.locked(bell, bell.ring_at)
+    running.thread.start()
     if due is not None:
         ring_at(monotonic_ns() + due)
-    keeping.keeper.stop()
+    running.thread.stop()
     ring_at(monotonic_ns())  # can still be called, and nothing comes of it
-    assert (keeping.heard(), keeping.rung.empty()) == ("bell ends", True)
+    assert (running.heard(), running.rung.empty()) == ("bell ends", True)
 
 
 @pytest.mark.parametrize("is_started", [False, True])
-def test_stopping_ends_all_machines_whatever_one_of_them_raises(keeping: Keeping, is_started: bool) -> None:
+def test_stopping_ends_all_timers_whatever_one_of_them_raises(running: Running, is_started: bool) -> None:
     """The last that was added comes first: it may hand on to earlier ones."""
     for name in ("pacer", "broken", "latest"):
-        bell = Bell(keeping.rung, name)
+        bell = Bell(running.rung, name)
         bell.error = LookupError("a bug") if name == "broken" else None
-        keeping.keeper.add(bell)
+        running.thread.add(bell)
     if is_started:
-        keeping.keeper.start()
-    keeping.keeper.stop()
-    assert [keeping.heard() for _ in range(3)] == ["latest ends", "broken ends", "pacer ends"]
-    assert isinstance(keeping.failures.get_nowait(), LookupError)
+        running.thread.start()
+    running.thread.stop()
+    assert [running.heard() for _ in range(3)] == ["latest ends", "broken ends", "pacer ends"]
+    assert isinstance(running.failures.get_nowait(), LookupError)
 
 
 SET_BACK = """\
@@ -255,11 +255,11 @@ def test_a_wall_clock_that_is_set_back_delays_nothing(tmp_path: Path) -> None:
 def wait_for_a_bell() -> None:
     """In a process of its own, without queues: they wait as locks do."""
     with ExitStack() as stack:
-        keeping = Keeping(stack)
-        bell = Bell(keeping.rung)
+        running = Running(stack)
+        bell = Bell(running.rung)
         bell.next_due = monotonic_ns() + 10 * MS
-        keeping.keeper.add(bell)
-        keeping.start()
+        running.thread.add(bell)
+        running.start()
         deadline = monotonic_ns() + PATIENCE * 1000 * MS
-        while keeping.rung.empty():
+        while running.rung.empty():
             assert monotonic_ns() < deadline, "it never rang"

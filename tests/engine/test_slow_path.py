@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from router.engine.framing import restored
+from router.engine.slow_path import restored
 from tests.engine.wire import LEN, damaged, envelopes, framed, rover_envelope, tag, unknown_fields, varint
 
 LIMIT = 16 * 1024

@@ -1,0 +1,145 @@
+"""Wake-up events, background scheduling, an executor that never delays the end of the process, and pauses."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager
+from queue import SimpleQueue
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_LONGEST_WAIT_MS = 3_600_000
+
+PAUSE_TIMEOUT_S = 1.0
+"""Seconds within which a thread has to pause. No datagram is routed meanwhile, and the watchdog is not fed."""
+
+
+class WakeEvent:
+    """An event with a monotonic timeout, for one waiting thread.
+
+    `threading.Condition` measures its timeout by the wall clock where Python was built for a C library older than glibc
+    2.30, as many portable builds are: when that clock is set back by an hour, the wait lasts an hour longer.
+    """
+
+    def __init__(self) -> None:
+        self._event = os.fdopen(os.eventfd(0), "r+b", buffering=0)
+        self._poll = select.poll()
+        self._poll.register(self._event, select.POLLIN)
+
+    def wait(self, nanoseconds: int) -> None:
+        """Return when the event is set, or was since the last wait; at the latest after `nanoseconds` or an hour."""
+        if self._poll.poll(min(max(0, nanoseconds) / 1e6, _LONGEST_WAIT_MS)):
+            self._event.read(8)
+
+    def set(self) -> None:
+        self._event.write((1).to_bytes(8, sys.byteorder))
+
+    def close(self) -> None:
+        """Idempotent. Neither `wait` nor `set` may be called afterwards."""
+        self._event.close()
+
+
+@contextmanager
+def background_threads() -> Iterator[None]:
+    """Threads started inside, by any library, do not preempt other threads when they wake up.
+
+    They inherit Linux's batch scheduling: the same share of the processor without wake-up preemption. Fast DDS wakes a
+    thread of its own several times per reliable message; on a processor shared with the receive thread, that cost half
+    of all context switches and about a tenth of the time. A policy other than the default is left as it is.
+    """
+    if os.sched_getscheduler(0) != os.SCHED_OTHER:
+        yield
+        return
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+class _Call(NamedTuple):
+    done: Future[Any]
+    work: Callable[[], Any]
+
+    def run(self) -> None:
+        if not self.done.set_running_or_notify_cancel():
+            return
+        try:
+            result = self.work()
+        except BaseException as error:  # noqa: BLE001 - raised by `Future.result`
+            self.done.set_exception(error)
+        else:
+            self.done.set_result(result)
+
+
+class DaemonThread(Executor):
+    """An executor with one daemon thread, for calls that may block without end.
+
+    The interpreter waits at exit for all threads of a ThreadPoolExecutor, but not for this one. The thread starts with
+    the first call.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._calls: SimpleQueue[_Call | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._is_shut_down = False
+        self._lock = threading.Lock()
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Raises RuntimeError after `shutdown`."""
+        done: Future[T] = Future()
+        with self._lock:
+            if self._is_shut_down:
+                raise RuntimeError(f"the thread '{self._name}' takes no more")
+            self._calls.put(_Call(done, lambda: fn(*args, **kwargs)))
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._thread.start()
+        return done
+
+    def shutdown(self, wait: bool = False, *, cancel_futures: bool = True) -> None:
+        """Cancel all calls that have not started. Never waits for the one that runs, whatever the arguments."""
+        with self._lock:
+            self._is_shut_down = True
+            while not self._calls.empty():
+                if (call := self._calls.get()) is not None:
+                    call.done.cancel()
+            self._calls.put(None)
+
+    def _run(self) -> None:
+        while (call := self._calls.get()) is not None:
+            call.run()
+            del call  # or its arguments and result would live until the next call
+
+
+class StuckError(RuntimeError):
+    """A thread did not pause in time, and nothing was changed."""
+
+
+@contextmanager
+def paused(submit: Callable[[Callable[[], None]], None]) -> Iterator[None]:
+    """Pause a thread between two iterations of its loop, to change what it uses. Raises StuckError after a timeout.
+
+    `submit(task)` makes the thread call `task` between two iterations, and returns at once.
+    """
+    has_paused, resume = threading.Event(), threading.Event()
+
+    def pause() -> None:
+        has_paused.set()
+        resume.wait()
+
+    try:
+        submit(pause)
+        if not has_paused.wait(PAUSE_TIMEOUT_S):
+            raise StuckError("a thread of the router is stuck, or has too much to do: try again")
+        yield
+    finally:
+        resume.set()

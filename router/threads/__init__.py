@@ -1,1 +1,0 @@
-"""Threads, wake events, and locks with timers."""
