@@ -1,7 +1,6 @@
 """What a reload changes, in a line, and what of it a running router cannot take over.
 
-Names what is written in another way, which is what is wired anew; `compiler/differences` tells what a table does in
-another way, and how.
+Names what is written in another way, which is what is wired anew; `router explain --diff` shows how.
 """
 
 from __future__ import annotations

@@ -111,15 +111,3 @@ def test_a_source_is_told_with_the_listener_that_believes_it(table: Path, capsys
     assert "  source: sensor_board (127.0.0.30 by listener rover)\n" in explained(
         capsys, table, "imu_info", "--no-code"
     )
-
-
-def test_another_interface_or_listener_is_a_difference(
-    table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    new = tmp_path / "new.yaml"
-    parts = "listen: {rover: {interface: lo}}\nendpoints: {laptop: {listener: rover}}\n"
-    new.write_text(f"version: 1\nextends: {table}\n{parts}")
-    main(["explain", "--diff", str(table), str(new)])
-    out = capsys.readouterr().out
-    assert "interface is lo, was none" in out
-    assert "listener is rover, was none" in out

@@ -1,0 +1,384 @@
+"""What `router explain` says: routes and gateways as the router understands them, and two tables compared."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from time import sleep
+
+from router.compiler import Checked
+from router.compiler.cdr import message_size
+from router.compiler.checked import CheckedGateway, CheckedInbound, CheckedRoute, CheckedTarget
+from router.compiler.mapping import Row
+from router.compiler.plan import Each, Items, Plan, Record, Unset
+from router.compiler.selection import TopicSelector
+from router.compiler.topics import qos_of, resolved
+from router.errors import StartError, shown_path
+from router.gateway.following import by_frequency
+from router.ros.environment import check_environment, ros_remedy
+from router.table.model import (
+    ANY,
+    EACH,
+    ROS,
+    Destination,
+    Gateway,
+    GatewayFormat,
+    IgnoredGateway,
+    Route,
+    RouteTable,
+    Topic,
+    TopicPattern,
+    Transport,
+    ZenohSettings,
+)
+from router.table.quantities import duration
+from router.tools.settings_text import field_map, flat
+from router.types.sizes import framed_size
+
+_WIDEST_CELL = 48
+
+# Routes
+
+
+def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
+    route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
+    assert table is not None  # noqa: S101 - a table without errors is one
+    assert envelope is not None  # noqa: S101 - and has one
+    yield f"{route.name}: {case.type.name}, field {case.number} of {envelope.name}  ({route.span})"
+    if case.max_size is not None:
+        datagram = framed_size(case.number, case.max_size)
+        yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
+    if route.ignore is not None:
+        yield f"  ignored: {route.ignore.value}"
+        return
+    yield f"  source: {', '.join(_source(source.value, table) for source in route.sources)}"
+    yield from _settings(checked)
+    for served in checked.targets:
+        yield ""
+        yield from _topic(served) if served.topic else _destination(served, checked.route, table, "unchanged")
+    for feed in checked.feeds:
+        yield ""
+        yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
+        yield _quality(feed.topic)
+        if feed.topic.when is not None:
+            yield f"    when {feed.topic.when.text}"
+        for served in feed.targets:
+            yield ""
+            yield from _destination(served, route, table, f"from topic {feed.topic.topic.value}")
+
+
+def _settings(checked: CheckedRoute) -> Iterator[str]:
+    """What holds for the whole route."""
+    route, deadman = checked.route, checked.deadman
+    if route.ttl is not None:
+        yield f"  dropped when older than {duration(route.ttl.value)}"
+    if route.for_each is not None:
+        yield f"  one datagram for each of {route.for_each.text}"
+    if route.collect is not None:
+        collect = route.collect
+        yield (
+            f"  frames by {collect.by.text}, of {collect.count.text} datagrams in the order of {collect.order.text}, "
+            f"complete within {duration(collect.timeout.value)}"
+        )
+    if deadman is not None:
+        yield (
+            f"  deadman: {_sent(route)} to {', '.join(deadman.to)} when no command came for "
+            f"{duration(deadman.timeout)}, again every {duration(deadman.repeat)}, {_at_start(deadman.at_start)}"
+        )
+        if deadman.hands_over_to:
+            yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
+    if route.no_deadman is not None:
+        yield f"  no deadman: {route.no_deadman.value}"
+
+
+def _sent(route: Route) -> str:
+    """What the deadman of a route sends."""
+    assert route.deadman is not None  # noqa: S101 - the caller's choice
+    fields = route.deadman.fields
+    return f"{route.deadman.case.value} {field_map(fields)}" if fields.entries else route.deadman.case.value
+
+
+def _source(name: str, table: RouteTable) -> str:
+    if name in (ANY, ROS):
+        return name
+    endpoint = table.endpoints[name]
+    port = f":{endpoint.source_port.value}" if endpoint.source_port else ""
+    by = f" by listener {endpoint.listener.value}" if endpoint.listener else ""
+    return f"{name} ({endpoint.address.value.host}{port}{by})"
+
+
+def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:
+    target = served.target
+    endpoint = table.endpoints[target.name]
+    trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
+    yield f"  destination {target.name} ({endpoint.address.value}): {how}{trimmed}  ({target.span})"
+    if endpoint.budget is not None:
+        yield f"    {target.priority.value} within a budget of {endpoint.budget.value} bytes/s"
+    if others := [other for other in target.deadmen if other != route.name]:
+        yield f"    disarms the deadman of {', '.join(others)}"
+    named = next(each for each in route.destinations if each.endpoint.value == target.name)
+    yield from _served(served, named)
+
+
+def _topic(served: CheckedTarget) -> Iterator[str]:
+    target, topic = served.target, served.topic
+    assert topic is not None  # noqa: S101 - the caller's choice
+    yield f"  topic {target.name}: {topic.type.value}  ({target.span})"
+    yield _quality(topic)
+    if target.plan is not None:
+        size, exact = message_size(target.plan)
+        yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
+    yield from _served(served, topic)
+
+
+def _served(served: CheckedTarget, named: Destination | Topic) -> Iterator[str]:
+    """What a target is served with, and when."""
+    target = served.target
+    if named.when is not None:
+        yield f"    when {named.when.text}"
+    if target.max_rate is not None:
+        yield f"    at most {target.max_rate:g} Hz, keeping the {target.keep.value}"
+    yield from _mapping(served.rows)
+    if target.plan is not None and (unset := list(_unset(target.plan, ""))):
+        yield f"    left at their defaults: {', '.join(unset)}"
+
+
+def _mapping(rows: Sequence[Row]) -> Iterator[str]:
+    """One line a field; an expression that is long pushes only what stands behind it."""
+    cells = [(row.target, row.target_type, row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
+    widths = [min(max(map(len, column)), _WIDEST_CELL) for column in zip(*cells, strict=True)]
+    for target, type_, expression, kind, automatic in (
+        [text.ljust(width) for text, width in zip(cell, widths, strict=True)] for cell in cells
+    ):
+        yield f"    {target}  {type_}  <-  {expression}  {kind}  {automatic}".rstrip()
+
+
+def _unset(plan: Plan, prefix: str) -> Iterator[str]:
+    """The fields that nothing fills; a message of which nothing is filled counts as one."""
+    match plan:
+        case Unset():
+            yield prefix
+        case Record():
+            for member, inner in plan.members:
+                yield from _unset(inner, f"{prefix}.{member.name}" if prefix else member.name)
+        case Items():
+            for index, inner in enumerate(plan.items):
+                yield from _unset(inner, f"{prefix}[{index}]")
+        case Each():
+            yield from _unset(plan.element, f"{prefix}[]")
+
+
+def _quality(topic: Topic) -> str:
+    """A line with the whole QoS of a topic."""
+    qos = {name: value for name, value in asdict(qos_of(topic)).items() if value is not None}
+    return f"    qos: {', '.join(f'{name} {value}' for name, value in qos.items())}"
+
+
+def _at_start(sends: bool) -> str:
+    """What a deadman does when the router starts."""
+    return "and once when the router starts" if sends else "but not when the router starts"
+
+
+# Gateways
+
+
+def explained_gateway(checked: CheckedGateway, topics: Topics) -> Iterator[str]:
+    gateway = checked.settings
+    yield f"{gateway.name}: gateway, {_transport(gateway)}, {gateway.format.value}  ({gateway.span})"
+    yield f"  {_period(gateway.publish_period)}; {_regularly(gateway)}"
+    yield f"  messages of up to {gateway.max_message} bytes{_sizes(gateway)}"
+    yield from _patterns(gateway)
+    yield from _matched(TopicSelector(gateway, [entry.topic for entry in checked.inbound]), topics)
+    for entry in checked.inbound:
+        yield ""
+        yield from _inbound(entry)
+
+
+def ignored_gateway(gateway: IgnoredGateway) -> Iterator[str]:
+    yield f"{gateway.name}: gateway  ({gateway.span})"
+    yield f"  ignored: {gateway.reason}"
+
+
+def _transport(gateway: Gateway) -> str:
+    if gateway.zenoh is not None:
+        places = [f"connects to {', '.join(gateway.zenoh.connect)}"] if gateway.zenoh.connect else []
+        places += [f"listens on {', '.join(gateway.zenoh.listen)}"] if gateway.zenoh.listen else []
+        places += _configured(gateway.zenoh)
+        return ", ".join([f"zenoh {gateway.zenoh.mode} under {gateway.zenoh.key.value}", *places])
+    assert gateway.address is not None  # noqa: S101 - only Zenoh has none
+    if gateway.transport.value is not Transport.UDP:
+        most = f"{gateway.max_clients} clients at most, {gateway.max_clients_per_host} from one host"
+        return f"{gateway.transport.value.value} on {gateway.address.value}, {most}"
+    heard = f"on {gateway.receive.value}" if gateway.receive else "from any port"
+    return f"udp to {gateway.address.value} {heard}"
+
+
+def _configured(zenoh: ZenohSettings) -> list[str]:
+    """By what: never the values, of which some are secret."""
+    if zenoh.config is None:
+        return []
+    if zenoh.config.path is not None:
+        return [f"configured by {shown_path(zenoh.config.path)}"]
+    return [f"configures {' and '.join(str(path[0]) for path in zenoh.config.places if len(path) == 1)}"]
+
+
+def _period(period: int) -> str:
+    return "every message" if period == EACH else f"the latest value every {duration(period)}"
+
+
+def _regularly(gateway: Gateway) -> str:
+    again = f"schemas again every {duration(gateway.schema_period)}, "
+    connected = gateway.transport.value in (Transport.TCP, Transport.WEBSOCKET)
+    return f"{'' if connected else again}looks for topics every {duration(gateway.discovery_period)}"
+
+
+def _sizes(gateway: Gateway) -> str:
+    compressed = f", compressed with zstd {gateway.compression}" if gateway.compression else ""
+    datagrams = f", in datagrams of up to {gateway.max_datagram} bytes"
+    return compressed + (datagrams if gateway.format is GatewayFormat.GATEWAY_V2 else "")
+
+
+def _patterns(gateway: Gateway) -> Iterator[str]:
+    include = ", ".join(map(_pattern, gateway.include)) or "every topic that is not hidden"
+    exclude = f", but not {', '.join(map(_pattern, gateway.exclude))}" if gateway.exclude else ""
+    yield f"  sends {include}{exclude}"
+    for rate in gateway.rates:
+        yield f"    {_pattern(rate.pattern)}: {_period(rate.period)}"
+
+
+def _pattern(pattern: TopicPattern) -> str:
+    return f"regex {pattern.text}" if pattern.is_regex else pattern.text
+
+
+def _matched(selector: TopicSelector, topics: Topics) -> Iterator[str]:
+    rows = []
+    for name in sorted(topics):
+        if chosen := selector.chosen_by(name):
+            rated = selector.rated_by(name)
+            why = _pattern(chosen) + (f", rate of {_pattern(rated)}" if rated else "")
+            rows.append((name, topics[name], _period(selector.period(name)), why))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        name, types, period, why = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        yield f"  ~ {name}  {types}  {period}  by {why}".rstrip()
+
+
+def _inbound(entry: CheckedInbound) -> Iterator[str]:
+    inbound = entry.inbound
+    yield f"  from clients {entry.topic}: {entry.type}  ({inbound.span})"
+    yield _quality(inbound.topic)
+    if inbound.ttl is not None:
+        yield f"    dropped when older than {duration(inbound.ttl.value)}"
+    if inbound.max_rate is not None:
+        yield f"    at most {inbound.max_rate.value:g} Hz"
+    if inbound.deadman is not None and entry.stop is not None:
+        timeout, repeat = duration(inbound.deadman.timeout.value), duration(inbound.deadman.repeat.value)
+        start = _at_start(inbound.deadman.at_start)
+        yield f"    deadman: {_constants(entry)} when no message came for {timeout}, again every {repeat}, {start}"
+
+
+def _constants(entry: CheckedInbound) -> str:
+    assert entry.inbound.deadman is not None  # noqa: S101 - the caller's choice
+    entries = entry.inbound.deadman.fields.entries
+    return ", ".join(f"{'.'.join(each.path)} {each.value.text}" for each in entries) or "all fields at their defaults"
+
+
+Topics = Mapping[str, str]
+"""What is known of topics, by absolute name: types, and how many publish them where somebody looked."""
+
+
+def known_topics(table: RouteTable) -> Topics:
+    """What routes and gateways of the table publish or subscribe to."""
+    topics = [topic for route in table.routes for topic in route.topics]
+    topics += [inbound.topic for gateway in table.gateways.values() for inbound in gateway.inbound]
+    return {resolved(topic.topic.value, table.node): topic.type.value for topic in topics}
+
+
+def seen_topics(table: RouteTable, seconds: float) -> Topics:
+    """The same with all that a node has discovered after so long. Raises StartError."""
+    check_environment(os.environ)
+    try:
+        from router.ros.node import close_node, open_node
+        from router.ros.topics import RosTopics
+    except ImportError as error:
+        raise StartError(f"--live needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
+    node = open_node("router_explain")
+    try:
+        sleep(seconds)
+        topics = RosTopics(node)
+        seen = {name: [publisher.type_name for publisher in topics.publishers(name)] for name in topics.names()}
+    finally:
+        close_node(node)
+    known = {name: f"{type_name}, no publisher" for name, type_name in known_topics(table).items()}
+    return known | {name: _publishers(types) for name, types in seen.items() if types}
+
+
+def _publishers(types: Iterable[str]) -> str:
+    """That which gateways choose first."""
+    return ", ".join(f"{name} of {times}" for name, times in by_frequency(types).items())
+
+
+# Two tables
+
+
+def diff(old: Checked, new: Checked) -> Iterator[str]:
+    """A unified diff of what is said of two tables without errors, a hunk for each part that differs.
+
+    Places and the width of columns are not compared, addresses only where endpoints are.
+    """
+    before, after = _parts(old), _parts(new)
+    for name in dict.fromkeys((*after, *before)):
+        hunks = difflib.unified_diff(before.get(name, ()), after.get(name, ()), lineterm="", n=1)
+        for number, line in enumerate(hunks):
+            if number >= 2:  # behind the names of the files
+                yield f"{line} {name}" if line.startswith("@@") else line
+
+
+_PLACE = re.compile(r"  \(\S+:\d+:\d+\)$")
+_ADDRESS = re.compile(r" \(\d+(?:\.\d+){3}[^)]*\)")
+_GAP = re.compile(r"(?<=\S)(?: {2,}|\s*\n\s*)")
+
+
+def _parts(checked: Checked) -> dict[str, list[str]]:
+    """The lines that are compared, of each route, gateway, listener and endpoint, and of the rest of the table."""
+    table = checked.table
+    assert table is not None  # noqa: S101 - a table without errors is one
+    settings = {
+        "node": {"name": table.node.name, "namespace": table.node.namespace},
+        "node.diagnostics": table.node.diagnostics is not None,
+        "reload.on_change": table.reload_on_change,
+        "metrics.address": table.metrics,
+        "foxglove.address": table.foxglove,
+        "record": table.record,
+    }
+    parts = {"table": _settings_lines(settings)}
+    parts |= {f"listener {name}": _settings_lines(each) for name, each in table.listeners.items()}
+    parts |= {f"endpoint {name}": _settings_lines(each) for name, each in table.endpoints.items()}
+    for route in checked.routes:
+        parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked))
+    for gateway in checked.gateways:
+        parts[f"gateway {gateway.settings.name}"] = [
+            *_comparable(explained_gateway(gateway, {})),
+            *_zenoh_config(gateway.settings),
+        ]
+    for ignored in table.ignored_gateways.values():
+        parts[f"gateway {ignored.name}"] = _comparable(ignored_gateway(ignored))
+    return parts
+
+
+def _settings_lines(settings: object) -> list[str]:
+    return [f"  {key}: {' '.join(text.split())}" for key, text in flat(settings).items() if key != "name"]
+
+
+def _comparable(lines: Iterable[str]) -> list[str]:
+    return [_GAP.sub("  ", _ADDRESS.sub("", _PLACE.sub("", line))) for line in lines if line]
+
+
+def _zenoh_config(gateway: Gateway) -> Iterator[str]:
+    """A checksum that differs for different configurations: what is in them may be secret."""
+    if gateway.zenoh is not None and gateway.zenoh.config is not None:
+        config = gateway.zenoh.config
+        yield f"  zenoh.config: {config.path or 'here'} ({hash(config.text) & 0xFFFFFF:06x})"
