@@ -232,7 +232,7 @@ def ready(url: str) -> None:
 
 def reloaded(url: str) -> None:
     if not (answer := post(url, "/-/reload", 10)).ok:
-        raise RouterError(str(answer.said))
+        raise RouterError(str(answer.body))
 
 
 def tapped(url: str) -> None:

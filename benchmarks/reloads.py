@@ -152,7 +152,7 @@ class RunningRouter:
     def reload(self) -> None:
         answer = post(self._url, "/-/reload", 60)
         if not answer.ok:
-            raise SystemExit(f"a reload failed: {answer.said}")
+            raise SystemExit(f"a reload failed: {answer.body}")
 
     def memory_kb(self) -> int:
         """Resident, of this process alone."""

@@ -17,10 +17,10 @@ from demo.recorded import first_of, recordings
 from demo.screen import open_screen
 from demo.verdict import Finding, judge
 from router.errors import RouterError, TransportError
+from router.observe.snapshot import Snapshot, parse_metrics
 from router.table.model import RouteTable
-from router.tools.live import Snapshot, parse_metrics, view
-from router.tools.live_window import Window
 from router.tools.running_router import metrics, url_of
+from router.tools.top import Window, view
 
 TABLE = Path("routes/sim.yaml")
 DURATION = 12.0

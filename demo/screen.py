@@ -13,8 +13,8 @@ from rich.text import Text
 from demo.expected import active_routes
 from demo.verdict import Said, arrival_count, topic_count
 from router.table.model import RouteTable
-from router.tools.live import RouteRow, View
-from router.tools.live_view import route_table, summary_line
+from router.tools.top import RouteRow, View
+from router.tools.top_view import route_table, summary_line
 
 LINE_INTERVAL = 3.0
 """Seconds between two lines where there is no terminal."""

@@ -141,9 +141,6 @@ class Router:
     def collect(self) -> Iterator[Family]:
         return self._collector.collect()
 
-    def samples(self) -> Iterator[tuple[str, dict[str, str], float]]:
-        return ((sample.name, sample.labels, sample.value) for family in self.collect() for sample in family.samples)
-
     def reload(self) -> ReloadResult:
         """Reads the table again and takes it over between two datagrams; one that is no good changes nothing."""
         return self._reloader.reload()

@@ -47,9 +47,9 @@ def _save_last(args: argparse.Namespace) -> int:
 
     answer = post(running_url(args), "/record/save", patience=60)
     if not answer.ok:
-        print(f"router record: {answer.said.get('text', answer.said)}", file=sys.stderr)
+        print(f"router record: {answer.body.get('text', answer.body)}", file=sys.stderr)
         return FAILED
-    print(answer.said["file"])
+    print(answer.body["file"])
     return OK
 
 

@@ -30,9 +30,9 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.running_router import post
 
     answer = post(running_url(args), "/-/reload", PATIENCE)
-    for finding in answer.said.get("findings", ()):
+    for finding in answer.body.get("findings", ()):
         print(finding, file=sys.stderr)
-    text = answer.said.get("text", "")
+    text = answer.body.get("text", "")
     if not answer.ok:
         print(f"router reload: nothing has changed: {text}", file=sys.stderr)
         return BAD_TABLE

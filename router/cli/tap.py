@@ -17,7 +17,7 @@ from router.ros.environment import check_environment, ros_remedy
 if TYPE_CHECKING:
     from router.engine.wire import Wire
     from router.table.model import RouteTable
-    from router.tools.tapping import Heard, HeardMessage
+    from router.tools.tap import Heard, HeardMessage
 
 _DESCRIPTION = """\
 Print what a running router receives, before it routes it, one line for each datagram: the fields that are not default.
@@ -118,7 +118,7 @@ def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> 
     from router.tools.conditions import Condition
     from router.tools.places import peer_names
     from router.tools.running_router import tap
-    from router.tools.running_tap import RunningTap
+    from router.tools.tap import RunningTap
 
     cases = [wire.case(word) for word in args.words]
     condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
@@ -142,7 +142,7 @@ def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> 
 @contextmanager
 def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Iterator[Iterator[Heard]]:
     from router.tools import places
-    from router.tools.tapping import listen
+    from router.tools.tap import listen
 
     place = args.words[0]
     with places.open_udp(places.listening(place, table), place) as receiver:
@@ -160,7 +160,7 @@ def _topic(args: argparse.Namespace) -> Iterator[Iterator[HeardMessage]]:
         raise UsageError(str(error)) from error
     except ImportError as error:
         raise UsageError(f"a topic needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
-    from router.tools.tapping import listen_to_topic
+    from router.tools.tap import listen_to_topic
 
     if args.type is None:
         _say(f"waiting for a publisher of {args.topic}; Ctrl-C ends it")

@@ -12,7 +12,7 @@ from router.cli.tool_options import add_router_options, explained, positive, run
 from router.errors import TransportError
 
 if TYPE_CHECKING:
-    from router.tools.live import Snapshot
+    from router.observe.snapshot import Snapshot
     from router.tools.top import Order
 
 ORDERS = ("table", "rate", "drops", "age", "latency")
@@ -43,31 +43,31 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def _look(url: str) -> Snapshot:
-    from router.tools.live import parse_metrics
+def _snapshot(url: str) -> Snapshot:
+    from router.observe.snapshot import parse_metrics
     from router.tools.running_router import metrics
 
     text, at = metrics(url)
     try:
-        look = parse_metrics(text, at)
+        found = parse_metrics(text, at)
     except (ValueError, KeyError) as error:
         raise TransportError(f"what answers at {url}/metrics is no router") from error
-    if not look.values:
+    if not found.values:
         raise TransportError(f"what answers at {url}/metrics is no router: it has no metrics of one")
-    return look
+    return found
 
 
 def _show_once(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
 
-    from router.tools.top import top
+    from router.tools.top import view
     from router.tools.top_view import page
 
-    before = _look(url)
+    before = _snapshot(url)
     time.sleep(interval)
-    after = _look(url)
+    after = _snapshot(url)
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-    console.print(page(top(before, after, after.at, order)))
+    console.print(page(view(before, after), order))
 
 
 _PLAIN_WIDTH = 160
@@ -79,29 +79,27 @@ def _show(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from router.tools.live_window import Window
-    from router.tools.top import Order, top
-    from router.tools.top_keys import Keys
-    from router.tools.top_view import screen
+    from router.tools.top import Order, Window, view
+    from router.tools.top_view import Keys, screen
 
     console, orders = Console(), {each.key: each for each in Order}
-    looks, note = Window(), ""
-    looks.add(_look(url))
+    window, note = Window(), ""
+    window.add(_snapshot(url))
     with Live(console=console, screen=True, auto_refresh=False) as live, Keys() as keys:
         key, due = "", 0.0
         while key != "q":
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 try:
-                    look = _look(url)
+                    newest = _snapshot(url)
                 except TransportError as error:
                     note = str(error)
                 else:
                     if note:
-                        looks.clear()
-                    looks.add(look)
+                        window.clear()
+                    window.add(newest)
                     note = ""
-            shown = top(*looks.ends, time.time(), order)
+            shown = view(*window.ends, time.time())
             live.update(screen(shown, f"router top {url}", order, console.height, note), refresh=True)
             try:
                 key = keys.wait(max(due - time.monotonic(), 0.0))

@@ -1,1 +1,1 @@
-"""What a running router shows: metrics, status, HTTP with its pages, tap, Foxglove, /diagnostics."""
+"""What a running router shows: metrics, HTTP with the status page, tap, Foxglove, `/diagnostics`."""

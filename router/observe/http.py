@@ -4,41 +4,81 @@
     GET  /metrics      for Prometheus
     GET  /healthz      200 while datagrams are received or could be, 503 where the receive thread is stuck
     GET  /ready        200 while everything is open
-    GET  /tap          what is received, before routing (see tap_stream): ?case=NAME&from=ENDPOINT, each several times
+    GET  /tap          what is received, before routing (see tap): ?case=NAME&from=ENDPOINT, each several times
     POST /-/reload     {"ok", "text", "findings"}: 200, or 422 where nothing was changed
     POST /record/save  {"ok", "file"}: 200; {"ok", "text"}: 409 where it failed, 404 where nothing is kept
 
-Each connection has a thread, which has no right to interrupt one that routes.
+Each connection has a thread of low priority. Connections, sizes and times are bounded here; `responses` has what is
+answered.
 """
 
 from __future__ import annotations
 
 import errno
+import ipaddress
+import re
 import socket
+import struct
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, contextmanager, suppress
+from email.message import Message
+from enum import IntEnum
 from functools import partial
-from http.server import ThreadingHTTPServer
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
 from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
+from urllib.parse import parse_qs
+
+from prometheus_client.exposition import gzip_accepted
 
 from router.errors import SourceSpan, StartError
 from router.log import logger
 from router.net.kernel import port_holder
-from router.observe.http_answers import Answers
-from router.observe.http_callers import is_own_computer
-from router.observe.http_connection import Connection
-from router.observe.http_places import OWN_COMPUTER, Places
+from router.observe.responses import Responder, Response, plain
 from router.observe.running import Running
 from router.observe.status import Status
+from router.observe.tap import CONTENT_TYPE, Tap, TapRequestError, wanted
 from router.table.model import Address
+
+MAX_PER_HOST = 16
+"""Connections. The router's own computer counts as one host, whatever its addresses."""
+MAX_FROM_OTHERS = 48
+"""Connections of all other computers together: what they do leaves those of the router's own computer alone."""
+MAX_TAPS = 6
+MAX_ANSWERING = 4
+MAX_ORDERS = 4
+MAX_REQUEST = 1 << 14
+MAX_IN_QUERY = 200
+MAX_IN_KERNEL = 1 << 17
+"""Bytes that wait there for a slow client."""
+
+IDLE_SECONDS = 30.0
+"""A connection ends when there is no whole request for so long, or nothing is taken of a tap."""
+RESPONSE_SECONDS = 10.0
+"""A connection ends when a response is not taken as a whole within so long."""
+STALLED_SECONDS = 3.0
+"""A tap, which sends something each second, is ended for another connection if nothing is taken for so long."""
+REST_SECONDS = 0.05
+"""Between two requests on a connection, so that who asks without end costs routing little."""
+EVICTION_SECONDS = 0.003
+"""After a connection was ended for another one, which so has time to send its request."""
+
+OWN_COMPUTER = "own"
+
+_END = re.compile(rb"\r?\n\r?\n")
+_RESET = struct.pack("ii", 1, 0)
+_BY_BROWSERS = ("Origin", "Sec-Fetch-Site", "Sec-Fetch-Mode")
 
 
 class HttpServer:
-    """Answers at `address` until closed. `save` writes the last datagrams to a file; None where none are kept.
+    """Serves at `address` until closed. `save` writes the last datagrams to a file; None where none are kept.
 
-    Raises StartError where it cannot be opened.
+    Raises StartError where the address cannot be opened.
     """
 
     def __init__(
@@ -46,7 +86,7 @@ class HttpServer:
     ) -> None:
         self._status = Status(running)
         try:
-            self._server = _Server(address, Answers(running, self._status, save))
+            self._server = _Server(address, Responder(running, self._status, save))
         except OSError as error:
             in_use = error.errno == errno.EADDRINUSE
             why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
@@ -62,21 +102,21 @@ class HttpServer:
         self._server.socket.shutdown(socket.SHUT_RDWR)
         self._server.shutdown()
         self._thread.join()
-        self._server.places.end_all()
+        self._server.connections.end_all()
         self._server.server_close()
         self._status.close()
 
 
 class _Server(ThreadingHTTPServer):
-    """A thread for each connection that has one of `Places`; others are closed at once."""
+    """A thread for each connection that is admitted; others are closed at once."""
 
     daemon_threads = True
     block_on_close = False
     request_queue_size = 256
 
-    def __init__(self, address: Address, answers: Answers) -> None:
-        self.places = Places()
-        super().__init__(address, partial(Connection, answers, self.places))
+    def __init__(self, address: Address, responder: Responder) -> None:
+        self.connections = Connections()
+        super().__init__(address, partial(_Handler, responder, self.connections))
 
     def server_bind(self) -> None:
         """As HTTPServer does, but without asking the network for this computer's name."""
@@ -87,14 +127,322 @@ class _Server(ThreadingHTTPServer):
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         is_own = is_own_computer(client_address[0], request.getsockname()[0])
-        return self.places.enter(request, OWN_COMPUTER if is_own else client_address[0])
+        return self.connections.admit(request, OWN_COMPUTER if is_own else client_address[0])
 
     def shutdown_request(self, request: Any) -> None:
-        self.places.leave(request)
+        self.connections.remove(request)
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Called in an except block. Callers come and go as they like; the rest is our own fault."""
+        """Called in an except block. Clients that leave are no error."""
         error = sys.exc_info()[1]
         if not isinstance(error, (ConnectionError, TimeoutError)):
             logger.critical("a fault in the router itself lost an answer over HTTP; please report it", exc_info=error)
+
+
+class _Stage(IntEnum):
+    """In the order in which connections are ended for new ones."""
+
+    ANSWERED = 0
+    NEW = 1
+    ASKING = 2
+
+
+class Connections:
+    """Those that are open, and how many each host may have. Thread-safe.
+
+    A new one is admitted even where its host has all that it may have: of the connections that share its limit, one is
+    ended that was answered, or else one that has not asked, or else one that waits for its answer; of these the one
+    without progress for longest.
+    """
+
+    def __init__(self) -> None:
+        self._host: dict[socket.socket, str] = {}
+        self._progress: dict[socket.socket, float] = {}  # monotonic, s; longest without progress first
+        self._stage: dict[socket.socket, _Stage] = {}
+        self._busy: set[socket.socket] = set()
+        self._taps: set[socket.socket] = set()
+        self._lock = threading.Lock()
+
+    def admit(self, connection: socket.socket, host: str) -> bool:
+        """Return whether there is room. `host` is OWN_COMPUTER or an IP address.
+
+        Sleeps for EVICTION_SECONDS where another connection was ended.
+        """
+        with self._lock:
+            before = len(self._host)
+            is_own = host == OWN_COMPUTER
+            has_room = self._makes_room(self._of(lambda other: other == host), MAX_PER_HOST) and (
+                is_own or self._makes_room(self._of(lambda other: other != OWN_COMPUTER), MAX_FROM_OTHERS)
+            )
+            has_evicted = len(self._host) < before
+            if has_room:
+                self._host[connection] = host
+                self._progress[connection] = monotonic()
+                self._stage[connection] = _Stage.NEW
+        if has_evicted:
+            sleep(EVICTION_SECONDS)
+        return has_room
+
+    def admit_tap(self, connection: socket.socket) -> bool:
+        """Return whether a connection may become a tap."""
+        with self._lock:
+            if not self._makes_room(self._taps, MAX_TAPS):
+                return False
+            self._taps.add(connection)
+            return True
+
+    def note_request(self, connection: socket.socket) -> bool:
+        """Note that there is a whole request. Return whether the connection is still open."""
+        return self._proceeds(connection, _Stage.ASKING)
+
+    def note_response(self, connection: socket.socket) -> None:
+        """Note that a response begins, or that some of it was taken."""
+        self._proceeds(connection, _Stage.ANSWERED)
+
+    def _proceeds(self, connection: socket.socket, stage: _Stage) -> bool:
+        with self._lock:
+            if self._progress.pop(connection, None) is None:
+                return False
+            self._progress[connection] = monotonic()
+            self._stage[connection] = stage
+            return True
+
+    @contextmanager
+    def busy(self, connection: socket.socket) -> Iterator[None]:
+        """Inside, the client waits for the router: the connection is not ended for others."""
+        with self._lock:
+            self._busy.add(connection)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._busy.discard(connection)
+
+    def remove(self, connection: socket.socket) -> None:
+        with self._lock:
+            self._forget(connection)
+
+    def end_all(self) -> None:
+        with self._lock:
+            for each in self._host:
+                with suppress(OSError):  # the client has left already
+                    each.shutdown(socket.SHUT_RDWR)
+
+    def _of(self, is_meant: Callable[[str], bool]) -> frozenset[socket.socket]:
+        return frozenset(each for each, host in self._host.items() if is_meant(host))
+
+    def _makes_room(self, among: Collection[socket.socket], most: int) -> bool:
+        if len(among) < most:
+            return True
+        can_end = [each for each in self._progress if each in among and not self._is_kept(each)]
+        longest = min(can_end, key=self._stage.__getitem__, default=None)  # the first of equals
+        if longest is None:
+            return False
+        self._forget(longest)
+        _reset(longest)
+        with suppress(OSError):  # the client has left already
+            longest.shutdown(socket.SHUT_RDWR)
+        return True
+
+    def _is_kept(self, connection: socket.socket) -> bool:
+        if connection in self._taps:
+            return monotonic() - self._progress[connection] < STALLED_SECONDS
+        return connection in self._busy
+
+    def _forget(self, connection: socket.socket) -> None:
+        self._host.pop(connection, None)
+        self._progress.pop(connection, None)
+        self._stage.pop(connection, None)
+        self._taps.discard(connection)
+
+
+def _reset(connection: socket.socket) -> None:
+    """Have the kernel drop, when the connection is closed, what the client has not taken."""
+    with suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection, in a thread of its own until the client leaves.
+
+    A request is read as a whole, then answered into memory, which at most MAX_ANSWERING threads do at a time, and then
+    sent: a slow client holds up its own connection only.
+    """
+
+    protocol_version = "HTTP/1.1"
+
+    _answering = threading.BoundedSemaphore(MAX_ANSWERING)
+    _ordering = threading.BoundedSemaphore(MAX_ORDERS)
+
+    def __init__(self, responder: Responder, connections: Connections, *connection: Any) -> None:
+        self._responder = responder
+        self._connections = connections
+        self._ahead = bytearray()
+        self._out = BytesIO()
+        self._slow: Callable[[], None] | None = None  # what is done outside of `_answering`
+        super().__init__(*connection)
+
+    def setup(self) -> None:
+        self.connection = self.request
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_IN_KERNEL)
+
+    def finish(self) -> None:
+        """There is nothing to flush."""
+
+    def handle(self) -> None:
+        self.close_connection = False
+        while (request := self._request()) is not None:
+            self.rfile = BytesIO(request)
+            self.wfile = self._out = BytesIO()
+            self._connections.note_request(self.connection)
+            with self._answering:
+                if not self._connections.note_request(self.connection):
+                    return  # ended for another one meanwhile
+                self.handle_one_request()
+            if (slow := self._slow) is not None:
+                self._slow = None
+                slow()
+            self._send()
+            if self.close_connection:
+                return
+            sleep(REST_SECONDS)
+
+    def _request(self) -> bytes | None:
+        """The lines of the next request; None where no whole one comes, or one beyond MAX_REQUEST."""
+        deadline, looked_at = monotonic() + IDLE_SECONDS, 0
+        while (end := _END.search(self._ahead, looked_at)) is None:
+            if len(self._ahead) > MAX_REQUEST:
+                return None
+            looked_at = max(0, len(self._ahead) - 3)
+            self.connection.settimeout(max(0.001, deadline - monotonic()))
+            if not (piece := self.connection.recv(MAX_REQUEST)):
+                return None
+            self._ahead += piece
+        request = bytes(self._ahead[: end.end()])
+        del self._ahead[: end.end()]
+        return request
+
+    def _send(self) -> None:
+        self.connection.settimeout(RESPONSE_SECONDS)
+        self._connections.note_response(self.connection)
+        try:
+            self.connection.sendall(self._out.getvalue())  # the timeout is that of the whole
+        except TimeoutError:
+            _reset(self.connection)
+            raise
+        self._connections.note_response(self.connection)
+
+    def do_GET(self) -> None:
+        path, _, asked = self.path.partition("?")
+        try:
+            query = parse_qs(asked, max_num_fields=MAX_IN_QUERY)
+        except ValueError:
+            self._respond(plain(HTTPStatus.BAD_REQUEST, f"at most {MAX_IN_QUERY} values can be asked for"))
+            return
+        if path == "/tap":
+            self._for_own_computer(lambda: self._tap(query.get("case", []), query.get("from", [])))
+        elif path == "/metrics":
+            self._respond(self._responder.metrics(self.headers.get("Accept", "")))
+        elif path == "/healthz":
+            self._slow = lambda: self._respond(self._responder.healthz())
+        else:
+            self._respond(self._responder.get(path, query))
+
+    do_HEAD = do_GET  # noqa: N815 - as http.server calls it
+
+    def do_POST(self) -> None:
+        self.close_connection = True  # a body is not read
+        self._for_own_computer(self._order)
+
+    def _for_own_computer(self, serve: Callable[[], None]) -> None:
+        why = refusal(self.client_address[0], self.connection.getsockname()[0], self.headers)
+        if why is None:
+            self._slow = serve
+        else:
+            self._respond(plain(HTTPStatus.FORBIDDEN, why))
+
+    def _order(self) -> None:
+        with self._ordering, self._connections.busy(self.connection):
+            self._respond(self._responder.post(self.path.partition("?")[0]))
+
+    def _respond(self, response: Response) -> None:
+        if gzip_accepted(self.headers.get("Accept-Encoding", "")):
+            response = response.zipped
+        self.send_response(response.status)
+        self.send_header("Content-Type", response.kind)
+        self.send_header("Content-Length", str(len(response.body)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        for name, value in response.headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(response.body)
+
+    def _tap(self, cases: list[str], sources: list[str]) -> None:
+        running = self._responder.running
+        try:
+            is_wanted = wanted(running.program, cases, sources)
+        except TapRequestError as error:
+            self._respond(plain(HTTPStatus.BAD_REQUEST, str(error)))
+            return
+        if not self._connections.admit_tap(self.connection):
+            self._respond(plain(HTTPStatus.SERVICE_UNAVAILABLE, f"there are {MAX_TAPS} taps already: end one"))
+            return
+        self.close_connection = True
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", CONTENT_TYPE)
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Connection", "close")
+        self.end_headers()
+        if self.command == "HEAD":
+            return
+        self._send()
+        self._out = BytesIO()
+        with closing(Tap(running.mirror, is_wanted)) as tap:
+            self._stream(tap.stream())
+
+    def _stream(self, pieces: Iterator[bytes]) -> None:
+        self.connection.settimeout(IDLE_SECONDS)
+        for piece in pieces:
+            left = memoryview(piece)
+            while left:
+                left = left[self.connection.send(left) :]
+            self._connections.note_response(self.connection)
+
+    def version_string(self) -> str:
+        return "router"
+
+    def log_message(self, *_: object) -> None:
+        """Requests are not logged: each open page sends one per second."""
+
+
+def refusal(peer: str, own: str, headers: Message) -> str | None:
+    """Return why a client at IP address `peer`, who reached us at `own`, may not order or tap; None where it may.
+
+    A browser would call for any page that is open in it, and a name may have been made to lead here only after that
+    page was loaded (DNS rebinding): so no browsers, and no names.
+    """
+    if not is_own_computer(peer, own):
+        return f"only from the router's own computer, not from {peer}"
+    if any(name in headers for name in _BY_BROWSERS):
+        return "not for browsers: use the command line"
+    hosts = headers.get_all("Host", [])
+    if len(hosts) != 1 or not _is_plain(hosts[0]):
+        return "only by an IP address or localhost, not by a name"
+    return None
+
+
+def is_own_computer(peer: str, own: str) -> bool:
+    """Return whether a client at IP address `peer`, who reached us at `own`, is on the router's computer."""
+    return ipaddress.ip_address(peer).is_loopback or peer == own
+
+
+def _is_plain(host: str) -> bool:
+    name = host.rpartition(":")[0] if ":" in host else host
+    try:
+        ipaddress.IPv4Address(name)
+    except ValueError:
+        return name == "localhost"
+    return True

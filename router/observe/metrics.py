@@ -1,7 +1,4 @@
-"""Prometheus: reads the counters' integers when it is asked.
-
-Counting happens elsewhere, in plain lists; nothing here is called per datagram.
-"""
+"""The collector for Prometheus, which reads the counters at each scrape. Nothing here is called per datagram."""
 
 from __future__ import annotations
 
@@ -16,26 +13,23 @@ from prometheus_client.samples import Sample
 
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, METRICS, Counters, Metric
 from router.compiler.metrics import metric as metric_named
-
-PREFIX = "router_"
+from router.observe.snapshot import BUCKETS, PREFIX
 
 SAMPLES_PER_REST = 16
 REST_SECONDS = 1e-4
 
 _EXPORTED_AS = {"time": "gauge", "number": "gauge"}
-_BUCKETS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
-
+_BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
 Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
-"""Gives the label values, in the metric's order, and the value of each series."""
+"""Returns the label values, in the metric's order, and the value of each series that there is now."""
 
 
 class CountersCollector(Collector):
     """All series of the counters, each from its first scrape on, at 0 while nothing has happened.
 
     `counts` has the list of each thread that counts: a counter is their sum, a number or a time the largest of them.
-    `asked` has what is asked for at each scrape instead, by metric: label values and the value of each series there is
-    then. `build` has the labels of `router_build_info`.
+    `asked` has functions that are called at each scrape instead, by metric. `build`: the labels of `router_build_info`.
     """
 
     def __init__(
@@ -48,11 +42,11 @@ class CountersCollector(Collector):
         self._counts = counts
         self._asked = asked
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
-        self._slots: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
+        self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
         for series, index in counters.series():
             if series.part == 0:
                 labels = dict(zip(metric_named(series.metric).labels, series.labels, strict=True))
-                self._slots[series.metric].append((labels, index))
+                self._indexes[series.metric].append((labels, index))
 
     def collect(self) -> Iterator[Family]:
         threads = [counts.copy() for counts in self._counts]  # at one instant each: copying holds the interpreter lock
@@ -69,7 +63,7 @@ class CountersCollector(Collector):
             for values, value in self._asked[metric.name]():
                 yield Sample(name + suffix, dict(zip(metric.labels, values, strict=True)), value)
             return
-        for labels, index in self._slots[metric.name]:
+        for labels, index in self._indexes[metric.name]:
             if metric.kind == "histogram":
                 yield from _histogram(name, labels, [thread[index : index + HISTOGRAM_CELLS] for thread in threads])
             elif metric.kind == "time":
@@ -81,9 +75,9 @@ class CountersCollector(Collector):
 
 
 def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:
-    """Lets datagrams through while a scrape writes its thousand lines, which would hold the interpreter lock for 5 ms.
+    """Pause every SAMPLES_PER_REST samples, so that a scrape does not hold the interpreter lock for its whole 5 ms.
 
-    A thread that needs the lock then waits 0.1 ms at most times; without rests it waits a whole switch
+    A thread that needs the lock then waits for 0.1 ms at most times; without rests it waits a whole switch
     interval, and the receive thread needs it again after each system call.
     """
     for number, sample in enumerate(samples, 1):
@@ -95,7 +89,7 @@ def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:
 def _histogram(name: str, labels: dict[str, str], threads: Iterable[list[int]]) -> Iterator[Sample]:
     *parts, sum_ns = map(sum, zip(*threads, strict=True))
     cumulative = list(accumulate(parts))
-    for bound, count in zip(_BUCKETS, cumulative, strict=True):
-        yield Sample(f"{name}_bucket", {**labels, "le": bound}, count)
+    for bound, count in zip(_BOUNDS, cumulative, strict=True):
+        yield Sample(f"{name}{BUCKETS}", {**labels, "le": bound}, count)
     yield Sample(f"{name}_count", labels, cumulative[-1])
     yield Sample(f"{name}_sum", labels, sum_ns / 1e9)

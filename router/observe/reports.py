@@ -1,4 +1,4 @@
-"""Says in the log what was lost and what deadmen do. Knows reports; what is counted is counted elsewhere."""
+"""Logs what was lost and what deadmen do."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from router.log import SUMMARY_INTERVAL_NS, FloodLog, logger
 
 
 class Reporter:
-    """Floods of reports become one line and then one per 10 s, which a thread of its own writes when it is due."""
+    """Logs the first report of a kind at once and then at most one line per 10 s, from a thread of its own."""
 
     def __init__(self) -> None:
         self._floods = FloodLog()
@@ -18,7 +18,7 @@ class Reporter:
         self._thread.start()
 
     def close(self) -> None:
-        """Says what has not been said yet."""
+        """Log what has not been logged yet."""
         self._stopped.set()
         self._thread.join()
         self._floods.flush(final=True)
@@ -34,7 +34,7 @@ class Reporter:
                 detail=report.detail,
             )
             return
-        # A traceback through generated code shows the line of the route table; others would show only the router.
+        # A traceback through generated code shows the line of the route table; others show only the router.
         traceback = report.error if report.reason in ("mapping_error", "non_finite") else None
         event = "message dropped" if report.kind == "drop" else "the deadman could not send"
         detail = {"detail": report.detail} if report.detail else {}

@@ -1,7 +1,4 @@
-"""What the status page asks for: the map of the running table, its numbers, and the last values, as JSON.
-
-Knows no HTTP.
-"""
+"""What the status page asks for, as JSON: the map of the running table, its numbers, and the last values."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from router.errors import shown_path
 from router.observe.last_values import LastValues
 from router.observe.route_map import NARROW, WIDE, Measures, RouteMap, route_map
 from router.observe.running import Running
-from router.observe.status_numbers import numbers
+from router.observe.snapshot import BUCKETS, SERIES, Snapshot, snapshot
 
 MEASURES: dict[str, Measures] = {
     "narrow": NARROW._replace(letters=17, letter=5.5),
@@ -20,24 +17,63 @@ MEASURES: dict[str, Measures] = {
 }
 """In wide boxes there is room for a number beside the name."""
 
+Json = dict[str, Any]
+
+PATHS = {
+    "messages_received": "routes {route} sources {source}",
+    "datagrams_sent": "routes {route} targets {destination} delivered",
+    "messages_published": "routes {route} targets {topic} delivered",
+    "messages_sent": "routes {route} targets {target} delivered",
+    "messages_dropped": "routes {route} targets {target} dropped {reason}",
+    "messages_filtered": "routes {route} targets {target} filtered",
+    "messages_collected": "routes {route} targets {target} collected",
+    "route_last_message_timestamp_seconds": "routes {route} last",
+    "deadman_active": "routes {route} deadman_active",
+    "deadman_trips": "routes {route} deadman_trips",
+    "gateway_clients": "routes {route} clients",
+    "gateway_topics": "routes {route} topics {state}",
+    "client_messages_dropped": "routes {route} clients_missed {reason}",
+    "qos_incompatible": "routes {route} qos {topic} {policy}",
+    "endpoint_last_seen_timestamp_seconds": "endpoints {endpoint} seen",
+    "datagrams_received": "listeners {listener} received",
+    "received_bytes": "listeners {listener} bytes",
+    "kernel_drops": "listeners {listener} kernel_drops",
+    "datagrams_rejected": "listeners {listener} rejected {reason}",
+    "unhandled": "unhandled {payload_case}",
+    "config_last_reload_successful": "reload ok",
+    "config_last_reload_timestamp_seconds": "reload at",
+}
+"""Where the values of each metric stand in the numbers: keys, and labels in braces."""
+
+IF_ANY = {
+    "messages_dropped",
+    "messages_filtered",
+    "messages_collected",
+    "client_messages_dropped",
+    "qos_incompatible",
+    "datagrams_rejected",
+    "unhandled",
+}
+"""Left out where they are 0."""
+
 
 class Status:
-    """Any thread may ask. Times are seconds of the router's wall clock."""
+    """Thread-safe. Times are seconds of the router's wall clock."""
 
     def __init__(self, running: Running) -> None:
         self._running = running
         self._started = wall_ns() / 1e9
         self._values = LastValues(running)
 
-    def numbers(self) -> dict[str, Any]:
-        """Everything that changes; `map` says to which map it belongs, which changes with the table.
+    def numbers(self) -> Json:
+        """Everything that changes. `map` says to which map it belongs, which changes with the table.
 
         `started` is different for each run of the router: counters begin again there.
         """
         running = self._running
         program = running.program
         table = program.table
-        found = numbers(running.samples())
+        found = numbers(snapshot(running.collect(), wall_ns() / 1e9))
         for name, endpoint in table.endpoints.items():
             patience = endpoint.stale_after
             found["endpoints"].setdefault(name, {})["stale_after"] = None if patience is None else patience / 1e9
@@ -51,16 +87,49 @@ class Status:
             "values": self._values.of(program),
         }
 
-    def map(self, width: str) -> dict[str, Any]:
+    def map(self, width: str) -> Json:
         """The drawing, of a width of MEASURES. Raises KeyError for another."""
         table = self._running.program.table
-        return {"map": table.sha256, **_as_json(route_map(table, MEASURES[width]))}
+        return {"map": table.sha256, **_map_json(route_map(table, MEASURES[width]))}
 
     def close(self) -> None:
         self._values.close()
 
 
-def _as_json(drawing: RouteMap) -> dict[str, Any]:
+def numbers(now: Snapshot) -> Json:
+    """All that is counted, by route, endpoint and listener. Times in seconds, counts since the start.
+
+    `routes` has gateways as well. A route's `buckets` are cumulative, in the order of bounds.
+    """
+    found: Json = {"routes": {}, "endpoints": {}, "listeners": {}, "unhandled": {}, "reload": {}}
+    for metric, path in _PATHS.items():
+        for labels, value in now.counts(metric).items():
+            if value or metric not in IF_ANY:
+                *way, last = (labels[key] if isinstance(key, int) else key for key in path)
+                place = found
+                for key in way:
+                    place = place.setdefault(key, {})
+                place[last] = place.get(last, 0) + value
+    for (route, bound), value in now.counts(f"route_duration_seconds{BUCKETS}").items():
+        found["routes"].setdefault(route, {}).setdefault("buckets", []).append([bound, value])
+    for each in found["routes"].values():
+        for key in ("sources", "targets"):
+            each.setdefault(key, {})
+        for target in each["targets"].values():
+            target.setdefault("delivered", 0)
+            target.setdefault("dropped", {})
+    return found
+
+
+def _steps(metric: str, path: str) -> tuple[str | int, ...]:
+    """The keys of a path; in place of labels their indexes."""
+    return tuple(SERIES[metric].index(key[1:-1]) if key.startswith("{") else key for key in path.split())
+
+
+_PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
+
+
+def _map_json(drawing: RouteMap) -> Json:
     nodes = [
         {
             "key": node.part.key,

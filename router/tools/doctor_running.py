@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from router.compiler.metrics import INTENDED_REASONS
 from router.compiler.program import Program
 from router.errors import TransportError
+from router.observe.snapshot import Snapshot, parse_metrics
 from router.table.model import RouteTable
 from router.table.quantities import duration
 from router.tools.doctor_report import Finding, fine, problem, warning
-from router.tools.live import Snapshot, parse_metrics
 from router.tools.running_router import metrics, url_of
 
 _SHOWN = 3

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from xml.sax.saxutils import escape
 
-from router.observe.route_map import COLUMNS
-from router.observe.route_map_parts import Part, PartKind, Tie, map_parts
+from router.observe.route_map import COLUMNS, Part, PartKind, Tie, map_parts
 from router.table.model import RouteTable
 
 _MERMAID_SHAPES = {PartKind.TOPIC: ("([", "])"), PartKind.CLIENTS: ("([", "])"), PartKind.ANYONE: ("((", "))")}

@@ -7,7 +7,7 @@ from pathlib import Path
 from time import monotonic_ns, time_ns
 
 from router.errors import UsageError
-from router.observe.tap_stream import Lost
+from router.observe.tap import Lost
 from router.recording.channels import Channels
 from router.recording.encoding import Encoder
 from router.recording.file import RecordingFile

@@ -1,7 +1,4 @@
-"""A running router as another process meets it: its HTTP address, its metrics, what it can be told to do, and its tap.
-
-Knows the address and the form of the answers; what is in a datagram is for whoever asks.
-"""
+"""The HTTP client of a running router: its metrics, orders to it, and its tap."""
 
 from __future__ import annotations
 
@@ -15,8 +12,8 @@ from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
-from router.observe.http_callers import COLLECTED_AT
-from router.observe.tap_stream import Lost, StreamReader
+from router.observe.snapshot import COLLECTED_AT
+from router.observe.tap import Lost, StreamReader
 from router.recording.mirror import MirroredDatagram
 from router.table.model import RouteTable
 from router.tools.places import reachable
@@ -28,33 +25,33 @@ PIECE = 1 << 18
 
 
 class Answer(NamedTuple):
-    """`said` is the JSON object of the answer; `ok` that what was asked for was done."""
+    """The JSON object of an answer; `ok`: the order was carried out."""
 
     ok: bool
-    said: dict[str, Any]
+    body: dict[str, Any]
 
 
 def url_of(table: RouteTable) -> str:
-    """Where the router that runs a table answers. Raises UsageError where it serves no HTTP."""
+    """Return where the router that runs a table answers. Raises UsageError where it serves no HTTP."""
     if table.metrics is None:
         raise UsageError(f"{table.path} has no 'metrics.address', without which a running router cannot be asked")
     return f"http://{reachable(table.metrics.value)}"
 
 
 def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
-    """Has a running router do something. Raises TransportError where nobody answers, or no router."""
+    """Order a running router to do something. Raises TransportError where no router answers."""
     with closing(_connection(url, patience)) as connection:
         response = _asked(connection, url, "POST", path)
         text = _read(response, url)
         try:
-            said = json.loads(text)
+            body = json.loads(text)
         except ValueError:
             raise TransportError(f"{url}{path}: {response.status} {_first_line(text)}") from None
-        return Answer(response.status == http.client.OK, said)
+        return Answer(response.status == http.client.OK, body)
 
 
 def metrics(url: str) -> tuple[str, float]:
-    """The text of /metrics, and when its numbers were read (s, wall clock).
+    """Return the text of /metrics, and when its numbers were read (s, wall clock).
 
     Raises TransportError where nobody answers, or something else than a router.
     """
@@ -70,7 +67,7 @@ def metrics(url: str) -> tuple[str, float]:
 def tap(
     url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()
 ) -> Iterator[Iterator[list[MirroredDatagram | Lost]]]:
-    """What a running router receives from now on: of these payload cases, from these endpoints; none means all.
+    """Yield what a running router receives from now on: of these payload cases, from these endpoints; none means all.
 
     It comes in batches, of which there is an empty one each second while nothing comes. What is of no known payload
     case comes in any case. Raises UsageError for what the router refuses, TransportError where none answers, and

@@ -1,22 +1,22 @@
-"""What `router top` shows of a running router: its rows with ages and latencies, in the order that is asked for.
-
-Two snapshots of the metrics in, rows out. Knows neither HTTP nor terminals (see `live`, `top_view`).
-"""
+"""What `router top` shows: rates, drops, ages and latencies between two snapshots of a router's metrics."""
 
 from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections import defaultdict, deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
-from router.tools.live import BUCKETS, Counts, RouteRow, Snapshot, View, view
+from router.compiler.metrics import INTENDED_REASONS
+from router.observe.snapshot import BUCKETS, DELIVERED, Counts, Snapshot
 
-_HISTOGRAM = f"route_duration_seconds{BUCKETS}"
+WINDOW = 3.0
+"""Seconds over which rates are shown: over less, one message in two seconds is no rate but a flicker."""
 
 
 class Order(enum.Enum):
-    """By what rows are sorted, and the key that chooses it. All but TABLE have the largest first."""
+    """By what routes are sorted, and the key that chooses it. All but TABLE have the largest first."""
 
     TABLE = "table"
     RATE = "rate"
@@ -30,92 +30,210 @@ class Order(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class TopRow:
-    """`age` is the time since the route's last message, `median` and `slowest` (of 100 messages) its latency; seconds.
-
-    None where there is none yet. `is_tripped` says that its deadman sends now.
+class TargetRow:
+    """A destination or topic of a route, or the clients of a gateway: delivered messages in all and per second, those
+    that were dropped, and withheld ones. Of the dropped, `lost` are those that the table does not want gone.
     """
 
-    row: RouteRow
-    age: float | None
-    median: float | None
-    slowest: float | None
-    is_tripped: bool
+    name: str
+    is_topic: bool
+    delivered: int
+    rate: float
+    dropped: Mapping[str, int]
+    filtered: int
+
+    @property
+    def lost(self) -> dict[str, int]:
+        return unwanted(self.dropped)
 
 
 @dataclass(frozen=True, slots=True)
-class Top:
-    """`silence` is the time since each endpoint sent, None for never; seconds."""
+class RouteRow:
+    """A route or a gateway: messages taken in all and per second, and its targets.
 
-    view: View
-    rows: tuple[TopRow, ...]
-    silence: Mapping[str, float | None]
+    `age` is the time since its last message, `median` and `slowest` (of 100 messages) its latency: seconds, None where
+    there is none yet. `is_tripped`: its deadman sends now.
+    """
+
+    route: str
+    received: int
+    rate: float
+    targets: tuple[TargetRow, ...]
+    age: float | None = None
+    median: float | None = None
+    slowest: float | None = None
+    is_tripped: bool = False
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Dropped messages of all targets by reason."""
+        total: dict[str, int] = defaultdict(int)
+        for target in self.targets:
+            for reason, count in target.dropped.items():
+                total[reason] += count
+        return dict(total)
+
+    @property
+    def lost(self) -> dict[str, int]:
+        return unwanted(self.dropped)
 
 
-def top(before: Snapshot, after: Snapshot, now: float, order: Order = Order.TABLE) -> Top:
-    """`now` in seconds since 1970, as the stamps in the metrics."""
-    seen = view(before, after)
-    rows = tuple(_row(row, before, after, now) for row in seen.routes)
-    stamps = after.counts("endpoint_last_seen_timestamp_seconds")
-    silence = {labels[0]: _since(stamp, now) for labels, stamp in stamps.items()}
-    return Top(seen, ordered(rows, order), silence)
+@dataclass(frozen=True, slots=True)
+class View:
+    """All routes, and what no route took, by reason. `silence`: seconds since each endpoint sent, None for never."""
+
+    routes: tuple[RouteRow, ...]
+    received: int
+    rate: float
+    rejected: Mapping[str, int]
+    kernel_drops: int
+    silence: Mapping[str, float | None] = field(default_factory=dict)
 
 
-def ordered(rows: Sequence[TopRow], order: Order) -> tuple[TopRow, ...]:
+class Window:
+    """The snapshots of the last seconds, of one run of the router."""
+
+    def __init__(self, seconds: float = WINDOW) -> None:
+        self._seconds = seconds
+        self._snapshots: deque[Snapshot] = deque()
+
+    def add(self, newest: Snapshot) -> None:
+        if self._snapshots and _is_of_another_run(self._snapshots[-1], newest):
+            self._snapshots.clear()
+        while len(self._snapshots) > 1 and newest.at - self._snapshots[1].at >= self._seconds:
+            self._snapshots.popleft()
+        self._snapshots.append(newest)
+
+    def clear(self) -> None:
+        self._snapshots.clear()
+
+    @property
+    def ends(self) -> tuple[Snapshot, Snapshot]:
+        """The first and the last of them, which may be the same one. Raises IndexError before the first `add`."""
+        return self._snapshots[0], self._snapshots[-1]
+
+
+def _is_of_another_run(before: Snapshot, after: Snapshot) -> bool:
+    """Counters only fall when the router starts anew."""
+    return any(
+        after.counts(metric).get(labels, 0.0) < count
+        for metric in ("datagrams_received", "messages_received")
+        for labels, count in before.counts(metric).items()
+    )
+
+
+def view(before: Snapshot, after: Snapshot, now: float | None = None) -> View:
+    """Totals as of `after`, rates per second and latencies since `before`, routes in the order of the metrics.
+
+    `now` for ages, seconds since 1970; without it that of `after`.
+    """
+    now = after.at if now is None else now
+    routes = dict.fromkeys(route for route, _ in after.counts("messages_received"))
+    seen = after.counts("endpoint_last_seen_timestamp_seconds")
+    rejected: dict[str, int] = defaultdict(int)
+    for (_, reason), count in after.counts("datagrams_rejected").items():
+        if count:
+            rejected[reason] += int(count)
+    return View(
+        routes=tuple(_route_row(route, before, after, now) for route in routes),
+        received=after.total("datagrams_received"),
+        rate=_rate(before, after, "datagrams_received"),
+        rejected=dict(rejected),
+        kernel_drops=after.total("kernel_drops"),
+        silence={endpoint: _age(stamp, now) for (endpoint,), stamp in seen.items()},
+    )
+
+
+def ordered(rows: Sequence[RouteRow], order: Order) -> tuple[RouteRow, ...]:
     """The largest first, what has no value last; those that are equal stay in the order of the table."""
     if order is Order.TABLE:
         return tuple(rows)
     return tuple(sorted(rows, key=lambda row: -_weight(row, order)))
 
 
-def _weight(row: TopRow, order: Order) -> float:
+def _weight(row: RouteRow, order: Order) -> float:
     if order is Order.RATE:
-        return row.row.rate
+        return row.rate
     if order is Order.DROPS:
-        return sum(row.row.lost.values())
+        return sum(row.lost.values())
     value = row.age if order is Order.AGE else row.slowest
     return value if value is not None else -1.0
 
 
-def _row(row: RouteRow, before: Snapshot, after: Snapshot, now: float) -> TopRow:
-    counts = _since_then(_buckets(row.route, before), _buckets(row.route, after))
-    return TopRow(
-        row=row,
-        age=_since(after.counts("route_last_message_timestamp_seconds").get((row.route,), 0.0), now),
-        median=quantile(counts, 0.5),
-        slowest=quantile(counts, 0.99),
-        is_tripped=bool(after.counts("deadman_active").get((row.route,))),
+def unwanted(reasons: Mapping[str, int]) -> dict[str, int]:
+    """Without what the table asks for, such as `max_rate`."""
+    return {reason: count for reason, count in reasons.items() if reason not in INTENDED_REASONS}
+
+
+def _route_row(route: str, before: Snapshot, after: Snapshot, now: float) -> RouteRow:
+    latencies = _new_latencies(_latencies(route, before), _latencies(route, after))
+    return RouteRow(
+        route=route,
+        received=after.total("messages_received", route),
+        rate=_rate(before, after, "messages_received", route),
+        targets=tuple(_target_row(metric, route, target, before, after) for metric, target in _targets(route, after)),
+        age=_age(after.of("route_last_message_timestamp_seconds", route).get((), 0.0), now),
+        median=quantile(latencies, 0.5),
+        slowest=quantile(latencies, 0.99),
+        is_tripped=after.total("deadman_active", route) > 0,
     )
 
 
-def _since(stamp: float, now: float) -> float | None:
+def _targets(route: str, after: Snapshot) -> Iterator[tuple[str, str]]:
+    """With the metric that counts what each got. Of a gateway these are messages, and not the packets they went in."""
+    is_gateway = bool(after.of("messages_sent", route))
+    for metric in DELIVERED:
+        if not (is_gateway and metric == "datagrams_sent"):
+            for (target,) in after.of(metric, route):
+                yield metric, target
+
+
+def _target_row(metric: str, route: str, target: str, before: Snapshot, after: Snapshot) -> TargetRow:
+    dropped = after.of("messages_dropped", route)
+    return TargetRow(
+        name=target,
+        is_topic=metric == "messages_published",
+        delivered=after.total(metric, route, target),
+        rate=_rate(before, after, metric, route, target),
+        dropped={reason: int(count) for (to, reason), count in dropped.items() if to == target and count},
+        filtered=after.total("messages_filtered", route, target),
+    )
+
+
+def _rate(before: Snapshot, after: Snapshot, metric: str, *labels: str) -> float:
+    """Per second; a router that was started anew counts from zero."""
+    then, now, seconds = before.total(metric, *labels), after.total(metric, *labels), after.at - before.at
+    return (now - then if now >= then else now) / seconds if seconds > 0 else 0.0
+
+
+def _age(stamp: float, now: float) -> float | None:
     return max(now - stamp, 0.0) if stamp else None
 
 
-def _buckets(route: str, snapshot: Snapshot) -> dict[float, float]:
-    counts: Counts = snapshot.counts(_HISTOGRAM)
-    return {float(bound): count for (name, bound), count in counts.items() if name == route}
+def _latencies(route: str, snapshot: Snapshot) -> dict[float, float]:
+    counts: Counts = snapshot.of(f"route_duration_seconds{BUCKETS}", route)
+    return {float(bound): count for (bound,), count in counts.items()}
 
 
-def _since_then(before: Mapping[float, float], after: Mapping[float, float]) -> Mapping[float, float]:
-    """What came in between; all that there was where nothing did, and where the router was started anew."""
+def _new_latencies(before: Mapping[float, float], after: Mapping[float, float]) -> Mapping[float, float]:
+    """Those in between; all where there are none in between, and where the router was started anew."""
     between = {bound: count - before.get(bound, 0.0) for bound, count in after.items()}
     return between if between.get(math.inf, 0.0) > 0 and min(between.values()) >= 0 else after
 
 
 def quantile(counts: Mapping[float, float], part: float) -> float | None:
-    """The value below which that part of all is, of how many are not above each bound; within a bucket by its length.
+    """The value below which that part of all is, interpolated in its bucket. `counts`: how many are not above a bound.
 
     `inf` where it is beyond the last bound, None where there is nothing.
     """
     bounds = sorted(counts)
     if not bounds or counts[bounds[-1]] <= 0:
         return None
-    wanted = part * counts[bounds[-1]]
+    rank = part * counts[bounds[-1]]
     lower, below = 0.0, 0.0
     for bound in bounds:
-        if counts[bound] >= wanted:
+        if counts[bound] >= rank:
             inside = counts[bound] - below
-            return lower + (bound - lower) * (wanted - below) / inside if math.isfinite(bound) and inside else bound
+            return lower + (bound - lower) * (rank - below) / inside if math.isfinite(bound) and inside else bound
         lower, below = bound, counts[bound]
     return math.inf

@@ -1,51 +1,161 @@
-"""How `router top` looks: a headline, who is silent, one line for each route that fits.
-
-Knows no HTTP and no keys; what is shown is made by `top`.
-"""
+"""How `router top` looks on a terminal and in a file, and the keys that it takes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import TracebackType
 
 from rich.console import Group, RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.table.quantities import duration
-from router.tools.live import RouteRow
-from router.tools.live_view import Column, route_table, summary_line
-from router.tools.top import Order, Top, TopRow
+from router.tools.top import Order, RouteRow, TargetRow, View, ordered, unwanted
+from router.values import rate_text
+
+Column = Callable[[RouteRow], Text]
+"""One more cell for a route."""
 
 _HEAD = 4
 """Lines above the routes and the one below them."""
 
 
-def screen(shown: Top, title: str, order: Order, height: int, note: str = "") -> RenderableType:
-    """At most `height` lines. `note` says what went wrong with the last look."""
+class Keys:
+    """Until the context ends, keys come without Enter and are not echoed. Without a terminal there are none."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
+        self._before = termios.tcgetattr(self._terminal) if self._terminal is not None else None
+
+    def __enter__(self) -> Keys:
+        if self._terminal is not None:
+            tty.setcbreak(self._terminal)
+        return self
+
+    def wait(self, seconds: float) -> str:
+        """Return the next key, or nothing when none came in that time."""
+        if self._terminal is None:
+            time.sleep(seconds)
+            return ""
+        ready, _, _ = select.select([self._terminal], [], [], seconds)
+        return os.read(self._terminal, 1).decode(errors="replace") if ready else ""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._terminal is not None and self._before is not None:
+            termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
+
+
+def screen(view: View, title: str, order: Order, height: int, note: str = "") -> RenderableType:
+    """At most `height` lines. `note` says what went wrong when the router was last asked."""
     keys = ", ".join(f"{each.key} {each.value}" for each in Order)
     foot = Text(f"sorted by {order.value}; keys: {keys}, q quit", style="dim", no_wrap=True, overflow="ellipsis")
     head = Text(title, style="bold", no_wrap=True, overflow="ellipsis")
     if note:
         head.append(f"  {note}", style="bold red")
-    return Group(head, *_told(shown), routes(shown, height - _HEAD), foot)
+    return Group(head, *_summary(view), _routes(view, order, height - _HEAD), foot)
 
 
-def page(shown: Top) -> RenderableType:
-    """All of it, for whom it is shown once."""
-    return Group(*_told(shown), routes(shown, len(shown.rows) + 1))
+def page(view: View, order: Order) -> RenderableType:
+    """All of it, to be printed once."""
+    return Group(*_summary(view), _routes(view, order, len(view.routes) + 1))
 
 
-def routes(shown: Top, height: int) -> RenderableType:
-    """The rows in their order. What does not fit is counted in the last line."""
+def _summary(view: View) -> list[Text]:
+    """The whole router in a line, and the endpoints, with the deadmen that send, in another."""
+    about = Text(no_wrap=True, overflow="ellipsis")
+    for row in view.routes:
+        if row.is_tripped:
+            about.append(f"deadman of {row.route} sends  ", style="bold red")
+    if view.silence:
+        about.append("last heard: ", style="dim")
+    about.append(", ".join(f"{name} {age_text(seconds)}" for name, seconds in view.silence.items()), style="cyan")
+    return [Text(summary_line(view), no_wrap=True, overflow="ellipsis"), about]
+
+
+def _routes(view: View, order: Order, height: int) -> RenderableType:
+    """The first rows in this order. What does not fit is counted in the last line."""
     room = height - 1
-    rows = shown.rows if len(shown.rows) <= room else shown.rows[: max(room - 1, 0)]
-    by_name = {row.row.route: row for row in rows}
-    table = route_table(replace(shown.view, routes=tuple(row.row for row in rows)), len(rows) + 1, _columns(by_name))
-    if len(rows) < len(shown.rows):
-        table.add_row(Text(f"and {len(shown.rows) - len(rows)} more", style="dim"))
+    rows = ordered(view.routes, order)
+    shown = rows if len(rows) <= room else rows[: max(room - 1, 0)]
+    table = route_table(replace(view, routes=shown), len(shown) + 1, _TIMES)
+    if len(shown) < len(rows):
+        table.add_row(Text(f"and {len(rows) - len(shown)} more", style="dim"))
     return table
+
+
+def route_table(view: View, height: int, columns: Mapping[str, Column] | None = None) -> Table:
+    """At most `height` lines, those with losses first where not all fit; the last line counts the others."""
+    columns = columns or {}
+    table = Table(box=None, pad_edge=False, expand=True, header_style="bold")
+    table.add_column("route", no_wrap=True)
+    table.add_column("in/s", justify="right", no_wrap=True)
+    table.add_column("delivered per second", no_wrap=True, ratio=1, overflow="ellipsis")
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("drops", no_wrap=True, overflow="ellipsis")
+    room = height - 1
+    shown = list(view.routes)
+    if len(shown) > room:
+        shown = sorted(shown, key=lambda row: (not row.lost, -row.rate))[: max(room - 1, 0)]
+    for row in shown:
+        rate = Text(rate_text(row.rate), style="" if row.rate else "dim")
+        drops = Text(reasons_text(row.dropped) or "-", style="red" if row.lost else "dim")
+        table.add_row(row.route, rate, _targets_cell(row), *(column(row) for column in columns.values()), drops)
+    if len(shown) < len(view.routes):
+        table.add_row(Text(f"and {len(view.routes) - len(shown)} more", style="dim"))
+    return table
+
+
+def _targets_cell(row: RouteRow) -> Text:
+    """Destinations in cyan, topics in green, dim while nothing flows."""
+    cell = Text()
+    for target in row.targets:
+        cell.append(f"{target.name} ", style=_style(target))
+        cell.append(f"{rate_text(target.rate)}  ", style="" if target.rate else "dim")
+    return cell
+
+
+def _style(target: TargetRow) -> str:
+    if target.lost:
+        return "red"
+    if not target.rate:
+        return "dim"
+    return "green" if target.is_topic else "cyan"
+
+
+def summary_line(view: View) -> str:
+    """The whole router in one line."""
+    delivered = sum(target.delivered for row in view.routes for target in row.targets)
+    rate = sum(target.rate for row in view.routes for target in row.targets)
+    gone = Counter(view.rejected)
+    for row in view.routes:
+        gone.update(row.dropped)
+    lost = unwanted(gone)
+    wanted = {reason: count for reason, count in gone.items() if reason not in lost}
+    if view.kernel_drops:
+        lost["kernel_drops"] = view.kernel_drops
+    return (
+        f"in {view.received} ({rate_text(view.rate)}/s), delivered {delivered} ({rate_text(rate)}/s), "
+        f"lost {reasons_text(lost) or 'none'}{'; as the table wants ' if wanted else ''}{reasons_text(wanted)}"
+    )
+
+
+def reasons_text(dropped: Mapping[str, int]) -> str:
+    """`12 stale, 3 queue_full`, the largest first."""
+    by_count = sorted(dropped.items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{count} {reason}" for reason, count in by_count)
 
 
 def age_text(seconds: float | None) -> str:
@@ -68,27 +178,8 @@ def latency_text(seconds: float | None) -> str:
     return f"{seconds * 1e6:.0f} us" if seconds < 1e-3 else f"{seconds * 1e3:.1f} ms"
 
 
-def _told(shown: Top) -> list[Text]:
-    """The whole router in a line, and the endpoints, with the deadmen that send, in another."""
-    about = Text(no_wrap=True, overflow="ellipsis")
-    for row in shown.rows:
-        if row.is_tripped:
-            about.append(f"deadman of {row.row.route} sends  ", style="bold red")
-    if shown.silence:
-        about.append("last heard: ", style="dim")
-    about.append(", ".join(f"{name} {age_text(seconds)}" for name, seconds in shown.silence.items()), style="cyan")
-    return [Text(summary_line(shown.view), no_wrap=True, overflow="ellipsis"), about]
-
-
-def _columns(rows: Mapping[str, TopRow]) -> Mapping[str, Column]:
-    def age(row: RouteRow) -> Text:
-        seconds = rows[row.route].age
-        return Text(age_text(seconds), style="dim" if seconds is None else "")
-
-    def median(row: RouteRow) -> Text:
-        return Text(latency_text(rows[row.route].median))
-
-    def slowest(row: RouteRow) -> Text:
-        return Text(latency_text(rows[row.route].slowest))
-
-    return {"age": age, "p50": median, "p99": slowest}
+_TIMES: Mapping[str, Column] = {
+    "age": lambda row: Text(age_text(row.age), style="dim" if row.age is None else ""),
+    "p50": lambda row: Text(latency_text(row.median)),
+    "p99": lambda row: Text(latency_text(row.slowest)),
+}

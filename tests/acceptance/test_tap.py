@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from router.cli import main
-from router.observe.tap_stream import Lost
+from router.observe.tap import Lost
 from router.tools.running_router import tap
 from tests.acceptance.conftest import Rover
 from tests.acceptance.payloads import generated

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import runpy
 
-from router.observe import http_answers
+from router.observe import responses
 
 if __name__ == "__main__":
-    http_answers.KEPT_SECONDS = 0
+    responses.KEPT_SECONDS = 0
     runpy.run_module("router", run_name="__main__", alter_sys=True)

@@ -28,6 +28,7 @@ from router.app.watching import watched_files
 from router.compiler import check_table
 from router.compiler.metrics import Counters
 from router.net.receiver import ReceiveThread
+from router.observe.snapshot import Snapshot, snapshot
 from tests.acceptance.site import wait_until
 from tests.ports import free_port
 from tests.tables import PROTOS
@@ -175,12 +176,12 @@ def site(tmp_path: Path) -> Iterator[Site]:
         yield Site(tmp_path, board, basestation, free_port())
 
 
-def settled(router: Router) -> dict[str, float]:
-    return {
-        f"{name}{sorted(labels.values())}": value
-        for name, labels, value in router.samples()
-        if name.startswith("router_config_")
-    }
+def numbers(router: Router) -> Snapshot:
+    return snapshot(router.collect(), 0)
+
+
+def reloads(router: Router, result: str) -> float:
+    return numbers(router).total("config_reloads", result)
 
 
 def test_nothing_is_lost_or_doubled_or_out_of_order_while_tables_change(site: Site) -> None:
@@ -211,14 +212,13 @@ def test_a_table_with_errors_changes_nothing_and_is_told(site: Site) -> None:
         assert (result.ok, result.text) == (False, "the table has 1 error")
         assert "nobody" in str(result.findings[-1])
         assert router.program is before
-        told = settled(router)
-        assert told["router_config_last_reload_successful[]"] == 0
-        assert told["router_config_reloads_total['invalid']"] == 1
+        assert numbers(router).total("config_last_reload_successful") == 0
+        assert reloads(router, "invalid") == 1
         site.send(numbered(3))
         assert site.basestation.recv(1000) == numbered(3)
         site.write(PH)
         assert router.reload().text == "nothing changed"
-        assert settled(router)["router_config_last_reload_successful[]"] == 1
+        assert numbers(router).total("config_last_reload_successful") == 1
 
 
 def test_an_address_outside_of_the_networks_changes_nothing(site: Site) -> None:
@@ -244,7 +244,7 @@ def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
         assert not result.ok
         assert "has the port" in result.text
         assert "no route for the payload cases" in str(result.findings[0])  # warnings are told all the same
-        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        assert reloads(router, "failed") == 1
         assert list(router.listeners) == ["rover"]
         site.write(PH, listen=f'  rover: {{address: "0.0.0.0:{site.listen}"}}')
         assert f"the router itself (pid {os.getpid()}) has the port; restart it" in router.reload().text
@@ -281,8 +281,9 @@ def test_what_has_arrived_on_a_listener_that_goes_is_routed_before_it_goes(
         site.write(PH)
         assert router.reload().ok
         assert [site.basestation.recv(1000) for _ in range(50)] == [numbered(number) for number in range(50)]
-        counted = {str(labels): value for name, labels, value in router.samples() if name.endswith("received_total")}
-        assert counted["{'listener': 'second'}"] == 50  # what happened does not vanish with who it happened to
+        assert (
+            numbers(router).total("datagrams_received", "second") == 50
+        )  # what happened does not vanish with who it happened to
 
 
 def test_a_deadman_stays_armed_when_its_table_is_reloaded(site: Site) -> None:
@@ -481,7 +482,7 @@ def test_a_gateway_that_made_room_in_vain_is_opened_again(site: Site) -> None:
 
 
 def client_count(router: Router) -> int:
-    return int(sum(value for name, _, value in router.samples() if name == "router_gateway_clients"))
+    return numbers(router).total("gateway_clients")
 
 
 def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -577,7 +578,7 @@ def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
             stuck.setattr(MessageThread, "_do_tasks", stand_still)
             result = router.reload()
         assert (result.ok, "is stuck" in result.text) == (False, True)
-        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        assert reloads(router, "failed") == 1
         assert [route.name for route in router.program.table.routes] == ["ph_info", "rock_measure_result"]
         site.send(numbered(1))
         assert site.basestation.recv(1000) == numbered(1)
@@ -612,7 +613,7 @@ def test_files_that_go_while_they_are_read_change_nothing(site: Site, monkeypatc
         monkeypatch.setattr("router.app.reloading.check_table", vanished)
         result = router.reload()
         assert (result.ok, "components" in result.text) == (False, True)
-        assert settled(router)["router_config_reloads_total['failed']"] == 1
+        assert reloads(router, "failed") == 1
         site.send(numbered(1))
         assert site.basestation.recv(1000) == numbered(1)
 
@@ -662,8 +663,7 @@ def test_a_gateway_in_a_zenoh_network_goes_on_unless_its_config_changes(site: Si
         site.write(PH + gateways % "mars")
         assert router.reload().text == "gateway earth removed, gateway mars added"
         wait_until(lambda: client_count(router) == 1, "its turn")
-        conflicts = [value for name, _, value in router.samples() if name == "router_gateway_key_conflicts_total"]
-        assert set(conflicts) == {0}
+        assert set(numbers(router).counts("gateway_key_conflicts").values()) == {0}
 
 
 def test_a_reload_agrees_with_validate_about_stray_protos_and_a_lock_elsewhere(site: Site) -> None:

@@ -55,9 +55,6 @@ class FakeRunning:
         }
         return CountersCollector(self.program.counters, [self.counts], asked, {"version": "1"}).collect()
 
-    def samples(self) -> Iterator[tuple[str, dict[str, str], float]]:
-        return ((sample.name, sample.labels, sample.value) for family in self.collect() for sample in family.samples)
-
     def progress(self) -> int:
         self._turns += not self.is_stuck
         return self._turns

@@ -16,8 +16,7 @@ from rclpy.serialization import deserialize_message
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.observe import diagnostics
-from router.observe.diagnostics import LOOKS, Diagnostics, Watch, diagnostic_array
-from router.observe.diagnostics_findings import Level, Status
+from router.observe.diagnostics import SNAPSHOTS, Diagnostics, Level, Status, Watch, diagnostic_array
 from router.observe.metrics import CountersCollector
 from router.observe.running import Running
 from router.ros.types import installed_class
@@ -79,7 +78,7 @@ class Counting:
 
     def after(self, seconds: float) -> dict[str, Status]:
         self.now += int(seconds * SECOND)
-        return {status.name: status for status in self.watch.look(self.now, self.wall)}
+        return {status.name: status for status in self.watch.statuses(self.now, self.wall)}
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +155,7 @@ def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Countin
 
 def test_drops_are_told_with_their_reasons_for_as_long_as_anybody_may_need_to_look(router: Counting) -> None:
     router.add(7, "messages_dropped", "imu_info", "imu/mag", "mapping_error")
-    for _ in range(LOOKS - 1):
+    for _ in range(SNAPSHOTS - 1):
         told = router.after(1)["route/imu_info"]
         assert (told.level, told.message) == (Level.WARN, "dropped 7 for imu/mag: mapping_error")
         router.hear("sensor_board")

@@ -19,21 +19,15 @@ from typing import Any
 
 import pytest
 
-import router.observe.http
-import router.observe.http_answers
-import router.observe.http_connection
-import router.observe.http_places
-import router.observe.status
 from router.errors import Code, Diagnostic, RouterError, SourceSpan
 from router.log import logger
-from router.observe.http import HttpServer
-from router.observe.http_answers import text
-from router.observe.http_callers import refusal
-from router.observe.http_connection import MOST_ANSWERING
-from router.observe.http_places import MOST_FROM_OTHERS, MOST_PER_HOST, MOST_TAPS
+from router.observe import http as server_module
+from router.observe import responses, status
+from router.observe.http import MAX_ANSWERING, MAX_FROM_OTHERS, MAX_PER_HOST, MAX_TAPS, HttpServer, refusal
+from router.observe.responses import plain
 from router.observe.route_map import Measures, RouteMap, route_map
 from router.observe.running import ReloadResult
-from router.observe.tap_stream import MAGIC
+from router.observe.tap import MAGIC
 from router.table.model import Address, RouteTable
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import FakeRunning, sim_program
@@ -85,7 +79,7 @@ def ask(server: HttpServer, path: str, method: str = "GET", headers: Mapping[str
 def test_health_is_that_the_receive_thread_gets_further(
     server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(router.observe.http_answers, "STUCK_SECONDS", 0.2)
+    monkeypatch.setattr(responses, "STUCK_SECONDS", 0.2)
     assert ask(server, "/healthz").status == 200
     running.is_stuck = True
     stuck = ask(server, "/healthz")
@@ -230,12 +224,12 @@ def is_ended(connection: socket.socket) -> bool:
 @pytest.fixture
 def others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who comes from 127.0.1.0/24 is on another computer."""
-    monkeypatch.setattr(router.observe.http, "is_own_computer", lambda peer, _: not peer.startswith("127.0.1."))
+    monkeypatch.setattr(server_module, "is_own_computer", lambda peer, _: not peer.startswith("127.0.1."))
 
 
 def test_who_has_all_places_of_a_host_makes_room_for_one_more(server: HttpServer) -> None:
     with ExitStack() as stack:
-        silent = opened(server, stack, MOST_PER_HOST)
+        silent = opened(server, stack, MAX_PER_HOST)
         for _ in range(3):
             assert answers(server)
         wait_until(lambda: is_ended(silent[0]), "the end of the one that waited longest")
@@ -244,7 +238,7 @@ def test_who_has_all_places_of_a_host_makes_room_for_one_more(server: HttpServer
 
 def test_who_has_an_answer_goes_before_who_has_not_asked_yet(server: HttpServer) -> None:
     with ExitStack() as stack:
-        silent = opened(server, stack, MOST_PER_HOST - 1)
+        silent = opened(server, stack, MAX_PER_HOST - 1)
         answered = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
         answered.request("GET", "/ready")
         assert answered.getresponse().read() == b"ready\n"
@@ -257,7 +251,7 @@ def test_who_has_an_answer_goes_before_who_has_not_asked_yet(server: HttpServer)
 
 def test_all_addresses_of_the_own_computer_are_one_host(server: HttpServer) -> None:
     with ExitStack() as stack:
-        silent = [opened(server, stack, 1, f"127.0.0.{number}")[0] for number in range(1, MOST_PER_HOST + 2)]
+        silent = [opened(server, stack, 1, f"127.0.0.{number}")[0] for number in range(1, MAX_PER_HOST + 2)]
         wait_until(lambda: is_ended(silent[0]), "the end of the one that waited longest")
         assert not any(map(is_ended, silent[1:]))
 
@@ -267,20 +261,20 @@ def test_other_computers_share_places_that_are_not_the_own_ones(server: HttpServ
     with ExitStack() as stack:
         tap = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
         tap.request("GET", "/tap")
-        own = opened(server, stack, MOST_PER_HOST - 1)
-        first = opened(server, stack, MOST_PER_HOST + 1, "127.0.1.1")
+        own = opened(server, stack, MAX_PER_HOST - 1)
+        first = opened(server, stack, MAX_PER_HOST + 1, "127.0.1.1")
         wait_until(lambda: is_ended(first[0]), "the end of the one that waited longest of its host")
         more = [each for number in range(2, 50) for each in opened(server, stack, 1, f"127.0.1.{number}")]
         taken = [*first, *more]
-        wait_until(lambda: sum(map(is_ended, taken)) == len(taken) - MOST_FROM_OTHERS, "the end of what is too much")
-        assert not any(map(is_ended, taken[-MOST_FROM_OTHERS:]))
+        wait_until(lambda: sum(map(is_ended, taken)) == len(taken) - MAX_FROM_OTHERS, "the end of what is too much")
+        assert not any(map(is_ended, taken[-MAX_FROM_OTHERS:]))
         assert not any(map(is_ended, own))
         assert tap.getresponse().status == 200
 
 
 def test_who_asks_byte_by_byte_makes_room_for_others(server: HttpServer) -> None:
     with ExitStack() as stack:
-        for each in opened(server, stack, MOST_PER_HOST):
+        for each in opened(server, stack, MAX_PER_HOST):
             each.sendall(b"GET /ready HTTP/1.1\r\nHost: 127")
         for _ in range(3):
             assert answers(server)
@@ -301,7 +295,7 @@ def test_an_order_that_takes_long_keeps_its_place(
         connection = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
         connection.request("POST", "/-/reload")
         assert begun.wait(10)
-        opened(server, stack, 2 * MOST_PER_HOST)
+        opened(server, stack, 2 * MAX_PER_HOST)
         assert answers(server)
         done.set()
         assert connection.getresponse().status == 200
@@ -313,7 +307,7 @@ def test_a_tap_whose_reader_takes_what_comes_keeps_its_place(server: HttpServer,
         connection.request("GET", "/tap")
         response = connection.getresponse()
         assert response.read(len(MAGIC)) == MAGIC
-        opened(server, stack, 2 * MOST_PER_HOST)
+        opened(server, stack, 2 * MAX_PER_HOST)
         assert answers(server)
         running.receive(b"junk", ("127.0.0.99", 1))
         while b"junk" not in (piece := response.read1()):
@@ -324,13 +318,13 @@ def test_of_taps_there_are_a_few_only_and_one_that_is_not_read_goes(
     server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ExitStack() as stack:
-        for _ in range(MOST_TAPS):
+        for _ in range(MAX_TAPS):
             tap = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
             tap.request("GET", "/tap")
             assert tap.getresponse().status == 200
         refused = ask(server, "/tap")
         assert (refused.status, refused.text) == (503, "there are 6 taps already: end one\n")
-        monkeypatch.setattr(router.observe.http_places, "STALLED_SECONDS", 0)
+        monkeypatch.setattr(server_module, "STALLED_SECONDS", 0)
         another = stack.enter_context(closing(http.client.HTTPConnection(*server.address, timeout=10)))
 
         def is_let_in() -> bool:
@@ -348,8 +342,8 @@ def test_an_answer_that_is_not_taken_as_a_whole_ends_its_connection(
     server: HttpServer, monkeypatch: pytest.MonkeyPatch, taken: int
 ) -> None:
     """Also where its reader takes a little now and then."""
-    monkeypatch.setattr(router.observe.http_connection, "ANSWER_SECONDS", 0.3)
-    monkeypatch.setattr(router.observe.http_connection, "MOST_IN_KERNEL", 4096)
+    monkeypatch.setattr(server_module, "RESPONSE_SECONDS", 0.3)
+    monkeypatch.setattr(server_module, "MAX_IN_KERNEL", 4096)
     with socket.socket() as caller:
         caller.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         caller.connect(server.address)
@@ -369,7 +363,7 @@ def test_a_request_that_does_not_come_to_its_end_ends_its_connection(
     server: HttpServer, monkeypatch: pytest.MonkeyPatch, idle: float, piece: bytes
 ) -> None:
     """It may take too long, or be too long."""
-    monkeypatch.setattr(router.observe.http_connection, "IDLE_SECONDS", idle)
+    monkeypatch.setattr(server_module, "IDLE_SECONDS", idle)
     with socket.create_connection(server.address, 10) as caller:
 
         def has_ended() -> bool:
@@ -383,20 +377,20 @@ def test_a_request_that_does_not_come_to_its_end_ends_its_connection(
 def test_a_few_threads_answer_at_a_time(server: HttpServer, monkeypatch: pytest.MonkeyPatch) -> None:
     now, one_more, let_go = list[object](), threading.Event(), threading.Event()
 
-    def get(self: object, *_: object) -> router.observe.http_answers.Answer:
+    def get(self: object, *_: object) -> responses.Response:
         now.append(self)
-        if len(now) > MOST_ANSWERING:
+        if len(now) > MAX_ANSWERING:
             one_more.set()
         let_go.wait(10)
         now.pop()
-        return text(HTTPStatus.OK, "got")
+        return plain(HTTPStatus.OK, "got")
 
-    monkeypatch.setattr(router.observe.http_answers.Answers, "get", get)
+    monkeypatch.setattr(responses.Responder, "get", get)
     with ExitStack() as stack:
-        callers = opened(server, stack, MOST_PER_HOST)
+        callers = opened(server, stack, MAX_PER_HOST)
         for caller in callers:
             caller.sendall(b"GET /ready HTTP/1.0\r\n\r\n")
-        wait_until(lambda: len(now) >= MOST_ANSWERING, "four that answer")
+        wait_until(lambda: len(now) >= MAX_ANSWERING, "four that answer")
         is_one_more = one_more.wait(0.3)
         let_go.set()
         for caller in callers:
@@ -412,7 +406,7 @@ OPEN_METRICS = [f"application/openmetrics-text; version={version}" for version i
 def test_metrics_are_collected_once_for_all_that_ask_within_half_a_second(
     server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(router.observe.http_answers, "KEPT_SECONDS", 3600)
+    monkeypatch.setattr(responses, "KEPT_SECONDS", 3600)
     for accepted, total in ((ACCEPTED, 1), (OPEN_METRICS, 2)):
         answers = [ask(server, "/metrics", headers={"Accept": each}) for each in accepted]
         assert {answer.status for answer in answers} == {200}
@@ -422,7 +416,7 @@ def test_metrics_are_collected_once_for_all_that_ask_within_half_a_second(
             assert gzip.decompress(zipped).decode() == answers[0].text
             ask(server, "/metrics", "HEAD", {"Accept": each})
         assert running.collected == total
-    monkeypatch.setattr(router.observe.http_answers, "KEPT_SECONDS", 0)
+    monkeypatch.setattr(responses, "KEPT_SECONDS", 0)
     ask(server, "/metrics")
     assert running.collected == 3
 
@@ -436,8 +430,8 @@ def test_what_the_page_asks_for_is_made_once_for_all_that_look(
         drawn.append(measures)
         return route_map(table, measures)
 
-    monkeypatch.setattr(router.observe.status, "route_map", drawing)
-    monkeypatch.setattr(router.observe.http_answers, "KEPT_SECONDS", 3600)
+    monkeypatch.setattr(status, "route_map", drawing)
+    monkeypatch.setattr(responses, "KEPT_SECONDS", 3600)
     assert len({ask(server, "/status.json").text for _ in range(5)}) == 1
     assert running.collected == 1
     for width in ("wide", "narrow"):

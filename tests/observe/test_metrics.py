@@ -65,7 +65,7 @@ class Scraped:
 
 @pytest.fixture
 def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
-    monkeypatch.setattr("router.observe.http_answers.KEPT_SECONDS", 0)
+    monkeypatch.setattr("router.observe.responses.KEPT_SECONDS", 0)
     counters = Counters()
     slots = {
         metric.name: counters.index(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS
@@ -78,7 +78,7 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
         yield result
 
 
-def test_every_metric_of_the_books_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
+def test_every_metric_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
     values = scraped.values()
     for metric in METRICS:
         labels = frozenset((label, LABELS[label]) for label in metric.labels)

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.observe.route_map import NARROW, WIDE, Measures, route_map, shortened, spread
-from router.observe.route_map_parts import PartKind, map_parts
+from router.observe.route_map import NARROW, WIDE, Measures, PartKind, map_parts, route_map, shortened, spread
 from router.table.model import ANY, RouteTable
 from tests.tables import PROTOS, ROUTES
 

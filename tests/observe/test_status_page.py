@@ -12,7 +12,7 @@ import pytest
 
 from router.compiler import check_table
 from router.errors import SourceSpan
-from router.observe import http_answers
+from router.observe import responses
 from router.observe.http import HttpServer
 from router.observe.last_values import LastValues
 from router.table.model import Address
@@ -40,12 +40,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture
 def running(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeRunning]:
     """All endpoints were heard just now, and the page asks ten times as often."""
-    monkeypatch.setattr(http_answers, "KEPT_SECONDS", 0)
-    page = http_answers.PAGE.read_text(encoding="utf-8")
+    monkeypatch.setattr(responses, "KEPT_SECONDS", 0)
+    page = responses.PAGE.read_text(encoding="utf-8")
     assert "const PERIOD = 1000;" in page
     hasty = tmp_path / "page.html"
     hasty.write_text(page.replace("const PERIOD = 1000;", "const PERIOD = 100;"), encoding="utf-8")
-    monkeypatch.setattr(http_answers, "PAGE", hasty)
+    monkeypatch.setattr(responses, "PAGE", hasty)
     opened = FakeRunning(sim_program())
     for endpoint in opened.program.table.endpoints:
         opened.count("endpoint_last_seen_timestamp_seconds", endpoint, to=2**62)

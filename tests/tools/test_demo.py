@@ -34,8 +34,8 @@ from demo.recorded import Recorded, first_of
 from demo.verdict import judge
 from router.table import read_table
 from router.table.model import Address, Located, RouteTable
-from router.tools.live import RouteRow, TargetRow, View
 from router.tools.places import open_udp
+from router.tools.top import RouteRow, TargetRow, View
 from tests.ports import free_port
 from tests.tables import ROUTES
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from router.observe.route_map_parts import map_parts
+from router.observe.route_map import map_parts
 from router.table.model import RouteTable
 from router.tools.graph_text import dot, mermaid
 from tests.tables import PROTOS, ROUTES

@@ -10,7 +10,7 @@ import pytest
 
 from router.cli import main
 from router.errors import UsageError
-from router.observe.tap_stream import Lost
+from router.observe.tap import Lost
 from router.tools import recording_tap as module
 from router.tools.recording_tap import TapRecording
 from tests.ports import free_port

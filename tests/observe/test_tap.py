@@ -1,16 +1,29 @@
-"""A tap on what a router receives: what it shows, and that its reader's slowness is the reader's alone."""
+"""A tap on what a router receives: what it shows, that a slow reader slows nobody, and the stream in any pieces."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import pairwise
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from router.observe import http_tap
-from router.observe.http_tap import Tap, TapRequestError, wanted
-from router.observe.tap_stream import MAGIC, Lost, StreamReader
+from router.errors import TransportError
+from router.observe import tap as tap_module
+from router.observe.tap import (
+    MAGIC,
+    Lost,
+    StreamReader,
+    Tap,
+    TapRequestError,
+    encode,
+    encode_alive,
+    encode_lost,
+    wanted,
+)
 from router.recording.mirror import MirroredDatagram
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import FakeRunning, sim_program
@@ -89,7 +102,7 @@ def test_a_name_that_there_is_not_is_refused() -> None:
 def test_a_reader_who_is_too_slow_is_told_how_many_he_missed(
     running: FakeRunning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(http_tap, "MOST_WAITING", 1000)
+    monkeypatch.setattr(tap_module, "MAX_WAITING", 1000)
     with closing(Tap(running.mirror, None)) as tap:
         stream = tap.stream()
         next(stream)
@@ -107,7 +120,7 @@ def test_a_reader_who_is_too_slow_is_told_how_many_he_missed(
 
 
 def test_a_quiet_tap_says_that_it_is_there(running: FakeRunning, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_tap, "ALIVE_SECONDS", 0.01)
+    monkeypatch.setattr(tap_module, "ALIVE_SECONDS", 0.01)
     with closing(Tap(running.mirror, None)) as tap:
         stream = tap.stream()
         pieces = [next(stream) for _ in range(3)]
@@ -122,3 +135,53 @@ def test_a_closed_tap_ends_its_stream(running: FakeRunning) -> None:
     tap.close()
     reading.join(10)
     assert not reading.is_alive()
+
+
+# ---- the stream -------------------------------------------------------------------------------------------------
+
+HOSTS = st.tuples(*[st.integers(0, 255)] * 4).map(lambda parts: ".".join(map(str, parts)))
+SEEN = st.builds(
+    MirroredDatagram,
+    st.integers(0, 2**64 - 1),
+    st.text(min_size=1, max_size=60).filter(lambda name: len(name.encode()) < 256),
+    st.tuples(HOSTS, st.integers(0, 65535)),
+    st.binary(max_size=300),
+)
+LOST = st.builds(Lost, st.integers(0, 2**64 - 1))
+
+
+@given(st.lists(st.one_of(SEEN, LOST, st.none()), max_size=8), st.data())
+def test_a_stream_reads_as_what_was_written_however_it_is_cut(
+    said: list[MirroredDatagram | Lost | None], data: st.DataObject
+) -> None:
+    stream = MAGIC
+    for each in said:
+        stream += (
+            encode_alive() if each is None else encode_lost(each.number) if isinstance(each, Lost) else encode([each])
+        )
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
+    reader = StreamReader()
+    read = [each for start, end in pairwise([0, *cuts, len(stream)]) for each in reader.take(stream[start:end])]
+    assert read == [each for each in said if each is not None]
+
+
+def test_a_batch_is_one_record_after_the_other() -> None:
+    batch = [MirroredDatagram(1, "rover", ("10.0.0.1", 8), b"a"), MirroredDatagram(2, "rover", ("10.0.0.2", 9), b"")]
+    assert list(StreamReader().take(MAGIC + encode(batch))) == batch
+
+
+def test_what_a_newer_router_says_is_passed_over() -> None:
+    unknown = (3).to_bytes(4, "little") + b"\xf0ab"
+    assert list(StreamReader().take(MAGIC + unknown + encode_lost(7))) == [Lost(7)]
+
+
+@pytest.mark.parametrize("stream", [b"<!doctype html>", b"router tap 2\n"])
+def test_another_stream_is_refused(stream: bytes) -> None:
+    with pytest.raises(TransportError, match="no stream of a tap"):
+        list(StreamReader().take(stream))
+
+
+@pytest.mark.parametrize("length", [0, 1 << 30])
+def test_a_length_that_cannot_be_is_refused(length: int) -> None:
+    with pytest.raises(TransportError, match="broken"):
+        list(StreamReader().take(MAGIC + length.to_bytes(4, "little") + b"x"))

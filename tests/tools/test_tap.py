@@ -6,7 +6,7 @@ import socket
 from router.engine.wire import Wire
 from router.table.model import Address
 from router.tools.places import open_udp
-from router.tools.tapping import heard, listen
+from router.tools.tap import heard, listen
 from router.values import payload
 
 

@@ -1,14 +1,11 @@
-"""What arrives on a UDP port or a ROS topic, one by one, taken apart for a person or a program.
-
-Knows no command line; `places` opens the socket, `edges.ros_listen` the subscription.
-"""
+"""What `router tap` shows: datagrams of a running router or of a UDP port, and messages of a ROS topic, decoded."""
 
 from __future__ import annotations
 
 import datetime as dt
 import json
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +13,10 @@ from google.protobuf.json_format import MessageToDict
 
 from router.engine.wire import Decoded, Wire
 from router.errors import DecodeError
+from router.observe.tap import Lost
+from router.recording.mirror import MirroredDatagram
 from router.table.units import LARGEST_DATAGRAM
+from router.tools.conditions import Condition
 from router.values import compact, one_line, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
@@ -92,12 +92,62 @@ def _clock(at: dt.datetime) -> str:
     return f"{at:%H:%M:%S.%f}"[:-3]
 
 
+def _local_time(at: int) -> dt.datetime:
+    """`at`: ns since 1970."""
+    return dt.datetime.fromtimestamp(at / 1e9).astimezone()
+
+
+class RunningTap:
+    """Decodes what a running router receives. `missed` counts what it could not send, because this is too slow.
+
+    Only what is of `cases` and fulfils `condition`; without both everything, also what is no payload.
+    """
+
+    def __init__(
+        self,
+        wire: Wire,
+        name_of: Callable[..., str],
+        cases: Collection[str] = (),
+        condition: Condition | None = None,
+    ) -> None:
+        self.missed = 0
+        self._wire = wire
+        self._name_of = name_of
+        self._cases = cases
+        self._condition = condition
+
+    def take(self, batches: Iterable[list[MirroredDatagram | Lost]]) -> Iterator[list[Heard]]:
+        """Yield for each batch what is to be shown of it, which may be nothing."""
+        for batch in batches:
+            shown = []
+            for each in batch:
+                if isinstance(each, Lost):
+                    self.missed += each.number
+                elif (heard := self._heard(each)) is not None:
+                    shown.append(heard)
+            yield shown
+
+    def _heard(self, seen: MirroredDatagram) -> Heard | None:
+        """None where it is not wanted."""
+        peer = self._name_of(seen.peer, seen.listener)
+        try:
+            decoded = self._wire.decode(seen.data)
+        except DecodeError as error:
+            is_wanted = not self._cases and self._condition is None
+            return Heard(_local_time(seen.at), peer, seen.data, None, str(error)) if is_wanted else None
+        case = decoded.case.name
+        if self._cases and case not in self._cases:
+            return None
+        if self._condition is not None and not self._condition.holds(case, decoded.message, peer, seen.at):
+            return None
+        return Heard(_local_time(seen.at), peer, seen.data, decoded)
+
+
 def listen_to_topic(listener: TopicListener) -> Iterator[HeardMessage]:
     """Wait for one message after the other, for ever."""
     while True:
         for cdr, arrived in listener.take(PATIENCE):
-            at = dt.datetime.fromtimestamp(arrived / 1e9).astimezone()
-            yield HeardMessage(at, listener.type_name, cdr, listener.message(cdr))
+            yield HeardMessage(_local_time(arrived), listener.type_name, cdr, listener.message(cdr))
 
 
 def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> Iterator[Heard]:

@@ -1,7 +1,4 @@
-"""What is answered over HTTP, but for taps: metrics, health, the page, and what a router is told to do.
-
-Knows no connection; who may ask is not its business.
-"""
+"""The responses to HTTP requests, but for taps: metrics, health, the status page, and orders to the router."""
 
 from __future__ import annotations
 
@@ -22,8 +19,8 @@ from prometheus_client.exposition import choose_encoder
 from router.assets import page_policy
 from router.clock import wall_ns
 from router.errors import RouterError
-from router.observe.http_callers import COLLECTED_AT
 from router.observe.running import Running
+from router.observe.snapshot import COLLECTED_AT
 from router.observe.status import MEASURES, Status
 
 PAGE = Path(__file__).with_name("status_page.html")
@@ -34,10 +31,10 @@ STUCK_SECONDS = 2.0
 LOOK_SECONDS = 0.05
 
 KEPT_SECONDS = 0.5
-"""For so long an answer that is costly to make is given to whoever asks for the same."""
+"""For so long a response that is costly to make is given to whoever asks for the same."""
 
 GZIP_FROM = 1000
-"""Bytes of an answer that are worth compressing."""
+"""Bytes of a response that are worth compressing."""
 
 OPEN_METRICS = "application/openmetrics-text"
 
@@ -48,14 +45,14 @@ Query = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True)
-class Answer:
+class Response:
     status: HTTPStatus
     kind: str
     body: bytes
     headers: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
-    def zipped(self) -> Answer:
+    def zipped(self) -> Response:
         """The same, compressed where that is worth it."""
         if len(self.body) < GZIP_FROM:
             return self
@@ -63,104 +60,104 @@ class Answer:
         return replace(self, body=gzip.compress(self.body, compresslevel=1), headers=headers)
 
 
-def text(status: HTTPStatus, line: str) -> Answer:
-    return Answer(status, TEXT, f"{line}\n".encode())
+def plain(status: HTTPStatus, line: str) -> Response:
+    return Response(status, TEXT, f"{line}\n".encode())
 
 
-class _Kept:
-    """What is costly to make, made at most every KEPT_SECONDS for each key, and one at a time."""
+def _json(status: HTTPStatus, value: Mapping[str, Any]) -> Response:
+    return Response(status, JSON, json.dumps(value).encode())
+
+
+class _Cache:
+    """Responses that are costly to make, each made at most every KEPT_SECONDS, and one at a time."""
 
     def __init__(self) -> None:
-        self._answers: dict[str, tuple[float, Answer]] = {}  # with when each was made (monotonic, s)
+        self._responses: dict[str, tuple[float, Response]] = {}  # with when each was made (monotonic, s)
         self._making = threading.Lock()
 
-    def get(self, key: str, make: Callable[[], Answer]) -> Answer:
+    def get(self, key: str, make: Callable[[], Response]) -> Response:
         with self._making:
             fresh = monotonic() - KEPT_SECONDS
-            self._answers = {name: kept for name, kept in self._answers.items() if kept[0] > fresh}
-            if key not in self._answers:
-                answer = make()
-                self._answers[key] = monotonic(), answer
-            return self._answers[key][1]
+            self._responses = {name: kept for name, kept in self._responses.items() if kept[0] > fresh}
+            if key not in self._responses:
+                response = make()
+                self._responses[key] = monotonic(), response
+            return self._responses[key][1]
 
 
-def _json(status: HTTPStatus, said: Mapping[str, Any]) -> Answer:
-    return Answer(status, JSON, json.dumps(said).encode())
-
-
-class Answers:
-    """What is answered to each request; knows no connection."""
+class Responder:
+    """Thread-safe. `save` as for HttpServer."""
 
     def __init__(self, running: Running, status: Status, save: Callable[[str], Path] | None) -> None:
         self.running = running
         self._status = status
-        self._kept = _Kept()
+        self._cache = _Cache()
         self._save = save
         self._registry = CollectorRegistry()
         self._registry.register(running)
         ProcessCollector(registry=self._registry)
         page = PAGE.read_bytes()
         policy = f"{page_policy(page)}; connect-src 'self'"
-        self._page = Answer(HTTPStatus.OK, HTML, page, {"Content-Security-Policy": policy})
-        self._get: Mapping[str, Callable[[Query], Answer]] = {
+        self._page = Response(HTTPStatus.OK, HTML, page, {"Content-Security-Policy": policy})
+        self._get: Mapping[str, Callable[[Query], Response]] = {
             "/": lambda _: self._page,
-            "/status.json": lambda _: self._kept.get("status", self._numbers),
+            "/status.json": lambda _: self._cache.get("status", self._numbers),
             "/map.json": self._map,
             "/ready": lambda _: self._ready(),
         }
         self._post = {"/-/reload": self._reload, "/record/save": self._save_recording}
 
-    def get(self, path: str, query: Query) -> Answer:
+    def get(self, path: str, query: Query) -> Response:
         if path in self._get:
             return self._get[path](query)
         if path in self._post:
-            return text(HTTPStatus.METHOD_NOT_ALLOWED, f"{path} is an order: POST")
-        return text(HTTPStatus.NOT_FOUND, "there are /, /metrics, /healthz, /ready and /tap")
+            return plain(HTTPStatus.METHOD_NOT_ALLOWED, f"{path} is an order: POST")
+        return plain(HTTPStatus.NOT_FOUND, "there are /, /metrics, /healthz, /ready and /tap")
 
-    def metrics(self, accepts: str) -> Answer:
-        """In one of two formats: versions and escapings, which callers may make up, would each be encoded anew."""
+    def metrics(self, accepts: str) -> Response:
+        """In one of two formats: each version and escaping, which clients may make up, would be encoded anew."""
         asked = OPEN_METRICS if OPEN_METRICS in accepts else ""
-        return self._kept.get(f"metrics {asked}", partial(self._collected, asked))
+        return self._cache.get(f"metrics {asked}", partial(self._collected, asked))
 
-    def _collected(self, asked: str) -> Answer:
+    def _collected(self, asked: str) -> Response:
         encode, kind = choose_encoder(asked)
         at = f"{wall_ns() / 1e9:.6f}"
-        return Answer(HTTPStatus.OK, kind, encode(self._registry), {COLLECTED_AT: at})
+        return Response(HTTPStatus.OK, kind, encode(self._registry), {COLLECTED_AT: at})
 
-    def _numbers(self) -> Answer:
+    def _numbers(self) -> Response:
         return _json(HTTPStatus.OK, self._status.numbers())
 
-    def post(self, path: str) -> Answer:
+    def post(self, path: str) -> Response:
         if path in self._post:
             return self._post[path]()
-        return text(HTTPStatus.NOT_FOUND, f"there are {' and '.join(self._post)}")
+        return plain(HTTPStatus.NOT_FOUND, f"there are {' and '.join(self._post)}")
 
-    def _map(self, query: Query) -> Answer:
+    def _map(self, query: Query) -> Response:
         width = query.get("width", ["wide"])[0]
         if width not in MEASURES:
-            return text(HTTPStatus.BAD_REQUEST, f"there is no width '{width}': narrow, wide")
+            return plain(HTTPStatus.BAD_REQUEST, f"there is no width '{width}': narrow, wide")
         key = f"map {width} {self.running.program.table.sha256}"
-        return self._kept.get(key, lambda: _json(HTTPStatus.OK, self._status.map(width)))
+        return self._cache.get(key, lambda: _json(HTTPStatus.OK, self._status.map(width)))
 
-    def healthz(self) -> Answer:
+    def healthz(self) -> Response:
         before, until = self.running.progress(), monotonic() + STUCK_SECONDS
         while monotonic() < until:
             if self.running.progress() != before:
-                return text(HTTPStatus.OK, "ok")
+                return plain(HTTPStatus.OK, "ok")
             sleep(LOOK_SECONDS)
-        return text(HTTPStatus.SERVICE_UNAVAILABLE, f"the receive thread is stuck, for {STUCK_SECONDS:g} s at least")
+        return plain(HTTPStatus.SERVICE_UNAVAILABLE, f"the receive thread is stuck, for {STUCK_SECONDS:g} s at least")
 
-    def _ready(self) -> Answer:
+    def _ready(self) -> Response:
         if self.running.is_ready:
-            return text(HTTPStatus.OK, "ready")
-        return text(HTTPStatus.SERVICE_UNAVAILABLE, "not ready: starting or stopping")
+            return plain(HTTPStatus.OK, "ready")
+        return plain(HTTPStatus.SERVICE_UNAVAILABLE, "not ready: starting or stopping")
 
-    def _reload(self) -> Answer:
+    def _reload(self) -> Response:
         result = self.running.reload()
-        said = {"ok": result.ok, "text": result.text, "findings": [str(finding) for finding in result.findings]}
-        return _json(HTTPStatus.OK if result.ok else HTTPStatus.UNPROCESSABLE_ENTITY, said)
+        body = {"ok": result.ok, "text": result.text, "findings": [str(finding) for finding in result.findings]}
+        return _json(HTTPStatus.OK if result.ok else HTTPStatus.UNPROCESSABLE_ENTITY, body)
 
-    def _save_recording(self) -> Answer:
+    def _save_recording(self) -> Response:
         if self._save is None:
             return _json(HTTPStatus.NOT_FOUND, {"ok": False, "text": _NO_RECORDING})
         try:

@@ -1,0 +1,204 @@
+"""A tap on a running router: what it receives, before routing, as a stream of bytes over HTTP.
+
+The stream is MAGIC and then records, each behind its length: `<uint32 length> <uint8 kind> ...`, all little-endian.
+
+    SEEN   <uint64 wall clock, ns> <4 bytes IPv4 address> <uint16 port> <uint8 length> <listener> <datagram>
+    LOST   <uint64 count>    so many were not sent, because whoever reads the stream is too slow
+    ALIVE                    nothing was seen: once a second where there is nothing to send
+
+A datagram longer than the router takes is cut to one byte more than that.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+from router.compiler.program import Program
+from router.errors import RouterError, TransportError, did_you_mean
+from router.recording.mirror import Classifier, Mirror, Mirrored, MirroredDatagram, first_field
+
+MAGIC = b"router tap 1\n"
+CONTENT_TYPE = "application/x-router-tap"
+
+SEEN, LOST, ALIVE = 1, 2, 3
+
+MAX_WAITING = 4 << 20
+"""Bytes that wait for a slow reader."""
+
+ALIVE_SECONDS = 1.0
+
+_LENGTH = struct.Struct("<I")
+_SEEN = struct.Struct("<IBQ")
+_LOST = struct.Struct("<IBQ")
+_SENDER = struct.Struct("<4sHB")
+_LONGEST = 1 << 20
+
+Wanted = Callable[[Mirrored], bool]
+
+
+class TapRequestError(RouterError):
+    """A payload case or an endpoint was asked for that there is not."""
+
+
+def wanted(program: Program, cases: Sequence[str], sources: Sequence[str]) -> Wanted | None:
+    """Return what tells whether a datagram is of these payload cases and from these endpoints; None: all are wanted.
+
+    What does not begin with the field of a payload case is wanted in any case: only a decoder can say what it is.
+    A source may be an IPv4 address as well. Raises TapRequestError.
+    """
+    of_case = _of_case(program, cases) if cases else None
+    from_source = _from_source(program, sources) if sources else None
+    if of_case is None or from_source is None:
+        return of_case or from_source
+    return lambda datagram: from_source(datagram) and of_case(datagram)
+
+
+def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
+    known = program.envelope.cases
+    if unknown := [name for name in cases if name not in known]:
+        raise TapRequestError(f"the router has no payload case '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
+    unwanted = frozenset(case.number for name, case in known.items() if name not in cases)
+
+    def is_wanted(datagram: Mirrored) -> bool:
+        _, _, _, data = datagram
+        return first_field(data) not in unwanted
+
+    return is_wanted
+
+
+def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
+    endpoints = program.table.endpoints
+    if unknown := [name for name in sources if name not in endpoints and not name[:1].isdigit()]:
+        raise TapRequestError(f"the router has no endpoint '{unknown[0]}'; {did_you_mean(unknown[0], endpoints)}")
+    sender, names = Classifier(program.envelope, program.table).sender, frozenset(sources)
+
+    def is_wanted(datagram: Mirrored) -> bool:
+        _, listener, peer, _ = datagram
+        return peer[0] in names or sender(listener, peer) in names
+
+    return is_wanted
+
+
+class Tap:
+    """What is received from now until `close`, as a stream. A reader that is too slow misses datagrams."""
+
+    def __init__(self, mirror: Mirror, is_wanted: Wanted | None) -> None:
+        self._mirror = mirror
+        self._is_wanted = is_wanted
+        self._pieces: deque[bytes] = deque()
+        self._waiting = 0
+        self._lost = 0
+        self._lost_before = mirror.lost
+        self._changed = threading.Condition()
+        self._is_closed = False
+        self._detach = mirror.attach(self._take)
+
+    def stream(self) -> Iterator[bytes]:
+        """Piece by piece, each as soon as there is one; at least one a second. Ends after `close`."""
+        yield MAGIC
+        while not self._is_closed:
+            with self._changed:
+                self._changed.wait_for(lambda: self._pieces or self._lost or self._is_closed, ALIVE_SECONDS)
+                piece, lost = b"".join(self._pieces), self._lost
+                self._pieces.clear()
+                self._waiting = self._lost = 0
+            yield piece + (encode_lost(lost) if lost else b"") or encode_alive()
+
+    def close(self) -> None:
+        self._detach()
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify()
+
+    def _take(self, batch: Sequence[Mirrored]) -> None:
+        """Called by the mirror's thread."""
+        chosen = batch if self._is_wanted is None else list(filter(self._is_wanted, batch))
+        piece = encode(chosen)
+        unseen, self._lost_before = self._mirror.lost - self._lost_before, self._mirror.lost
+        with self._changed:
+            if self._waiting + len(piece) > MAX_WAITING:
+                self._lost += len(chosen)
+            elif piece:
+                self._pieces.append(piece)
+                self._waiting += len(piece)
+            self._lost += unseen
+            if piece or self._lost:
+                self._changed.notify()
+
+
+def encode(batch: Iterable[Mirrored]) -> bytes:
+    """One record for each."""
+    pieces: list[bytes] = []
+    for at, listener, peer, data in batch:
+        sender = _sender(listener, peer)
+        pieces += (_SEEN.pack(9 + len(sender) + len(data), SEEN, at), sender, data)
+    return b"".join(pieces)
+
+
+def encode_lost(count: int) -> bytes:
+    return _LOST.pack(9, LOST, count)
+
+
+def encode_alive() -> bytes:
+    return _LENGTH.pack(1) + bytes([ALIVE])
+
+
+@lru_cache(1024)
+def _sender(listener: str, peer: tuple[str, int]) -> bytes:
+    name = listener.encode()
+    return _SENDER.pack(socket.inet_aton(peer[0]), peer[1], len(name)) + name
+
+
+class Lost(NamedTuple):
+    """So many were received and are not in the stream."""
+
+    number: int
+
+
+class StreamReader:
+    """Reads the stream, in whatever pieces it comes."""
+
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+        self._has_begun = False
+
+    def take(self, piece: bytes) -> Iterator[MirroredDatagram | Lost]:
+        """Yield what is complete with this piece. Raises TransportError for what is no stream of a tap."""
+        waiting = self._waiting
+        waiting += piece
+        if not self._has_begun:
+            if len(waiting) < len(MAGIC):
+                return
+            if not waiting.startswith(MAGIC):
+                raise TransportError(f"this is no stream of a tap, or of another version: {bytes(waiting[:20])!r}")
+            self._has_begun = True
+            del waiting[: len(MAGIC)]
+        start = 0
+        while len(waiting) - start >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(waiting, start)
+            end = start + _LENGTH.size + length
+            if not 0 < length <= _LONGEST:
+                raise TransportError(f"the stream of a tap is broken: a record of {length} bytes")
+            if len(waiting) < end:
+                break
+            yield from _record(bytes(waiting[start + _LENGTH.size : end]))
+            start = end
+        del waiting[:start]
+
+
+def _record(record: bytes) -> Iterator[MirroredDatagram | Lost]:
+    """Kinds that are not known are left out: a newer router may have more."""
+    if record[0] == LOST:
+        yield Lost(int.from_bytes(record[1:9], "little"))
+    elif record[0] == SEEN:
+        host, port, length = _SENDER.unpack_from(record, 9)
+        data = 9 + _SENDER.size + length
+        listener = record[9 + _SENDER.size : data].decode()
+        at = int.from_bytes(record[1:9], "little")
+        yield MirroredDatagram(at, listener, (socket.inet_ntoa(host), port), record[data:])
