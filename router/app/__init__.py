@@ -34,7 +34,7 @@ from router.table.model import Address
 from router.threads import background_threads
 
 if TYPE_CHECKING:
-    from router.gateway.subscribers import Subscriber
+    from router.gateway.clients import ClientQueue
 
 __all__ = ["Router", "tune_interpreter"]
 
@@ -190,7 +190,7 @@ class Router:
     def _asked(self) -> dict[str, Asked]:
         """Series that nobody counts in a index."""
 
-        def of_clients(value: Callable[[Subscriber], float]) -> Asked:
+        def of_clients(value: Callable[[ClientQueue], float]) -> Asked:
             return lambda: gateways.clients(value) if (gateways := self._edges.gateways) else ()
 
         return {

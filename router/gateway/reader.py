@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Union
 
+from router.gateway.context import Tasks
 from router.gateway.documents import SchemaRequest
 from router.gateway.encoding import Encoding
 from router.gateway.inlet import Checked, Inlet, RefusedError
@@ -18,7 +19,6 @@ from router.gateway.json_pieces import let_go
 from router.gateway.json_reading import InvalidMessageError
 from router.gateway.letters import Letter
 from router.gateway.packets import PacketError, TooLargeError
-from router.gateway.tasks import Tasks
 from router.gateway.transport.base import Client
 
 MOST_READING = 16 << 20

@@ -1,4 +1,4 @@
-"""One gateway: its topics, its clients, and what they send, brought together. Runs in the thread of an event loop."""
+"""One gateway: connects its topics, its clients and their requests. Runs in the thread of the event loop."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 
 from router.compiler.program import GatewayPlan
+from router.gateway.clients import Clients
+from router.gateway.context import GatewayContext, Tasks
+from router.gateway.counters import GatewayCounters
 from router.gateway.documents import (
     InboundRow,
     SchemaRequest,
@@ -16,21 +19,17 @@ from router.gateway.documents import (
 from router.gateway.encoding import ENCODINGS
 from router.gateway.inlet import Checked, Inlet, RefusedError
 from router.gateway.json_reading import example
-from router.gateway.ledger import Ledger
-from router.gateway.outlet import Outlet
 from router.gateway.reader import Reader, Understood
 from router.gateway.schema_text import schema_text
+from router.gateway.sending import TopicSender
 from router.gateway.style import Style
-from router.gateway.subscribers import Subscribers
-from router.gateway.surroundings import Surroundings
-from router.gateway.tasks import Tasks
 from router.gateway.topics import Topics
 from router.gateway.transport.base import Client, Frame, Transport
 from router.table.model import Transport as Way
 
-_TELL_S = _LOG_S = 1.0
+_TOPICS_S = _LOG_S = 1.0
 _ANSWER_NS = 100_000_000
-"""How often schemas are sent because a client asks for them: a small question has a large answer."""
+"""Between two answers to requests for schemas: a small request has a large answer."""
 
 
 class GatewayService:
@@ -39,8 +38,8 @@ class GatewayService:
     def __init__(
         self,
         plan: GatewayPlan,
-        around: Surroundings,
-        ledger: Ledger,
+        context: GatewayContext,
+        counters: GatewayCounters,
         inlet: Inlet,
         transport: Callable[[GatewayService], Transport],
     ) -> None:
@@ -48,82 +47,82 @@ class GatewayService:
         self.plan = plan
         self.is_closed = False
         self.name = settings.name
-        self._around = around
-        self._ledger = ledger
+        self._context = context
+        self._counters = counters
         self._inlet = inlet
         self._encoding = ENCODINGS[settings.format](settings)
-        self._tasks = Tasks(around.failed)
-        self.subscribers = Subscribers(self.name, self._encoding, ledger, around.clock_ns, around.wall_s)
-        outlet = Outlet(
-            settings, around, self._encoding, ledger, self._tasks, lambda: bool(self.subscribers), self._deliver
+        self._tasks = Tasks(context.failed)
+        self.clients = Clients(self.name, self._encoding, counters, context.clock_ns, context.wall_s)
+        sender = TopicSender(
+            settings, context, self._encoding, counters, self._tasks, lambda: bool(self.clients), self._deliver
         )
-        self._topics = Topics(plan, around, outlet, ledger, self._tasks, self._deliver)
+        self._topics = Topics(plan, context, sender, counters, self._tasks, self._deliver)
         self._new_transport = transport
         self._transport = transport(self)
         self._answered = -_ANSWER_NS
-        self._reader = Reader(self._encoding, inlet, self._tasks, around.reading, self._settle)
+        self._reader = Reader(self._encoding, inlet, self._tasks, context.reading, self._settle)
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
 
     def anew(self) -> GatewayService:
-        """One like this, which was closed: with the same limits and counters, without its clients."""
-        return GatewayService(self.plan, self._around, self._ledger, self._inlet, self._new_transport)
+        """Return a new service like this one, which was closed: the same limits and counters, no clients."""
+        return GatewayService(self.plan, self._context, self._counters, self._inlet, self._new_transport)
 
     async def open(self) -> None:
         """Raises StartError."""
         await self._transport.open()
 
     def start(self) -> None:
-        """Looks for topics and serves them from now on."""
+        """Look for topics and serve them from now on."""
         self._topics.start()
-        self._tasks.each(_LOG_S, self.subscribers.flush_log)
+        self._tasks.each(_LOG_S, self.clients.flush_log)
         if self._has_page:
-            self._tasks.each(_TELL_S, self._tell_topics)
+            self._tasks.each(_TOPICS_S, self._send_topics)
 
     async def close(self) -> None:
-        """Nothing is sent or received any more; closing again changes nothing."""
+        """Stop sending and receiving. Idempotent."""
         if self.is_closed:
             return
         self.is_closed = True
-        async with AsyncExitStack() as closing:  # in the opposite order: who comes or sends something begins tasks
-            closing.callback(self.subscribers.close)
+        async with AsyncExitStack() as closing:  # in reverse order: clients that come or send something start tasks
+            closing.callback(self.clients.close)
             closing.push_async_callback(self._tasks.close)
             closing.callback(self._topics.close)
             closing.push_async_callback(self._transport.close)
 
     def _deliver(self, frames: Sequence[Frame]) -> None:
-        self.subscribers.send(frames, self._transport)
+        self.clients.send(frames, self._transport)
 
     # -- Events --------------------------------------------------------------------------------------------------
 
     def joined(self, client: Client) -> None:
-        subscriber = self.subscribers.joined(client)
-        is_alone = len(self.subscribers.by_client) == 1
-        self.subscribers.send_to(subscriber, self._hello() + self._topics.snapshot(is_for_all=is_alone))
+        queue = self.clients.joined(client)
+        is_alone = len(self.clients.queues) == 1
+        self.clients.send_to(queue, self._hello() + self._topics.snapshot(is_for_all=is_alone))
         if is_alone:
-            self._topics.look_again()
+            self._topics.discover_now()
 
     def left(self, client: Client) -> None:
-        self.subscribers.left(client)
+        self.clients.left(client)
 
     def drained(self, client: Client) -> None:
-        self.subscribers.drained(client)
+        self.clients.drained(client)
 
     def failed(self, client: Client | None, error: Exception, lost: int) -> None:
-        self._ledger.send_error(error, lost)
+        self._counters.send_error(error, lost)
 
     def contended(self) -> None:
-        self._ledger.contended()
+        self._counters.contended()
 
     def snapshot(self) -> list[Frame]:
         return self._topics.snapshot()
 
     def refused(self, reason: str) -> None:
-        self._ledger.arrived(0)
+        self._counters.arrived(0)
         self._inlet.reject(reason)
 
     def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
-        self._ledger.arrived(len(data))
+        self._counters.arrived(len(data))
         self._reader.received(client, data, arrived_ns)
 
     def _settle(self, client: Client, understood: Understood, arrived_ns: int) -> None:
@@ -145,22 +144,22 @@ class GatewayService:
         self._tell(client, refused)
 
     def _tell(self, client: Client, refused: RefusedError) -> None:
-        subscriber = self.subscribers.by_client.get(client)
-        if self._explains and subscriber is not None:
+        queue = self.clients.queues.get(client)
+        if self._explains and queue is not None:
             document = rejected_document(refused.reason, str(refused), refused.topic)
-            self.subscribers.send_to(subscriber, [self._document("rejected", document)])
+            self.clients.send_to(queue, [self._document("rejected", document)])
 
     def _show_schemas(self, client: Client, type_name: str | None) -> None:
-        now = self._around.clock_ns()
-        subscriber = self.subscribers.by_client.get(client)
-        if subscriber is None or now - self._answered < _ANSWER_NS:
+        now = self._context.clock_ns()
+        queue = self.clients.queues.get(client)
+        if queue is None or now - self._answered < _ANSWER_NS:
             self._refuse(client, RefusedError("rate_limited", "schemas are sent 10 times per second at most"))
             return
         self._answered = now
-        self.subscribers.send_to(subscriber, self._topics.snapshot(type_name))
+        self.clients.send_to(queue, self._topics.snapshot(type_name))
 
     def _hello(self) -> list[Frame]:
-        """What a client may send, for one that can show that to a person."""
+        """Return what a client may send, for one that can show that to a person."""
         if not self._has_page:
             return []
         rows = [
@@ -169,10 +168,10 @@ class GatewayService:
         ]
         return [self._document("inbound", inbound_document(rows))]
 
-    async def _tell_topics(self) -> None:
-        rows = list(self._topics.rates(_TELL_S))
-        self._deliver([self._document("topics", topics_document(self._around.wall_s(), rows))])
+    async def _send_topics(self) -> None:
+        rows = list(self._topics.rates(_TOPICS_S))
+        self._deliver([self._document("topics", topics_document(self._context.wall_s(), rows))])
 
     def _document(self, kind: str, data: bytes) -> Frame:
-        """One that belongs to no topic; with a slow client, a newer one of its kind takes its place."""
+        """Make a frame of a document of no topic; for a slow client, a newer one of its `kind` replaces it."""
         return Frame(data, kind, "", is_schema=False)

@@ -1,4 +1,4 @@
-"""The thread in which all gateways of a router live, with its event loop."""
+"""The thread of all gateways of a router, with its event loop."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from router.clock import monotonic_ns, wall_ns
@@ -15,17 +16,20 @@ from router.compiler.program import GatewayPlan, Program
 from router.engine import Report
 from router.engine.deadman import FeedMaker
 from router.errors import StartError
+from router.gateway.clients import ClientQueue
+from router.gateway.context import GatewayContext
+from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import ENCODINGS
-from router.gateway.hub import Hub
 from router.gateway.inlet import Inlet, InletOutlets
-from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
-from router.gateway.subscribers import Subscriber
-from router.gateway.surroundings import Surroundings
+from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Events, Transport
+from router.gateway.transport.stream import Limits
+from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.udp import UdpTransport
-from router.gateway.transports import new_transport
-from router.table.model import Gateway
+from router.gateway.transport.websocket import WebsocketTransport
+from router.table.model import Gateway, GatewayFormat
+from router.table.model import Transport as TransportKind
 from router.table.sameness import are_same
 from router.threads import DaemonThread
 from router.types.ros import ros_interfaces
@@ -35,10 +39,15 @@ if TYPE_CHECKING:  # which imports rclpy
 
 T = TypeVar("T")
 
+MOST_REQUEST = 4096
+"""Bytes of a message from a client that may publish nothing: it can only request schemas."""
+
+PAGE = Path(__file__).with_name("page.html")
+
 
 @dataclass(frozen=True, slots=True)
 class GatewayChange:
-    """`services` are those of the program that comes, by gateway; `opened` are new, nobody wants those of `left`."""
+    """Services of the next program by gateway; those of them that are new, and those that it does not have."""
 
     services: dict[str, GatewayService]
     opened: list[GatewayService]
@@ -46,11 +55,11 @@ class GatewayChange:
 
 
 class GatewayThread:
-    """Serves the gateways of one program, or then of another.
+    """Serves the gateways of a program, and changes to those of another one.
 
-    `prepare` opens what is new, `retire` closes what is not wanted any more, `finish` has the new ones serve. Or
-    `abandon` undoes it. `counts` belong to its thread, in which all that it is given is called.
-    `kernel_drops` has what tells that number, for any thread, by gateway that receives datagrams.
+    `prepare` opens what is new, `retire` closes what is not wanted any more, `finish` starts the new services; or
+    `abandon` undoes the change. `counts` belong to this thread, in which all callbacks are called. `kernel_drops` has,
+    by gateway that receives datagrams, a thread-safe function that returns how many the kernel dropped.
     """
 
     def __init__(
@@ -71,15 +80,17 @@ class GatewayThread:
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
         self._services: dict[str, GatewayService] = {}
-        self._hub = Hub(ros.topics, ros_interfaces(), self._loop)
-        self._around = Surroundings(self._hub, self._converting, self._reading, failed, monotonic_ns, wall_ns)
+        self._subscriptions = Subscriptions(ros.topics, ros_interfaces(), self._loop)
+        self._context = GatewayContext(
+            self._subscriptions, self._converting, self._reading, failed, monotonic_ns, wall_ns
+        )
         self._thread.start()
 
     def prepare(self, program: Program, feed: FeedMaker) -> GatewayChange:
-        """Opens what `program` wants and what is not open. Raises StartError, and then all is as it was.
+        """Open the gateways of `program` that are not open. Raises StartError, and then all is as it was.
 
-        `feed` makes what tells deadmen. A gateway that is the same as before keeps its clients. One that has changed
-        loses them here: its socket has to be closed before the new one can be opened.
+        `feed` makes the functions that feed deadmen. A gateway that is the same as before keeps its clients. One that
+        has changed loses them here: its socket has to be closed before the new one can be opened.
         """
         return self._call(self._prepare(program, _outlets(program, self._ros, feed, self._report)))
 
@@ -95,7 +106,9 @@ class GatewayThread:
         try:
             for plan in program.gateways:
                 if plan.settings.name not in kept:
-                    for rival in [each for each in change.left if _meet(each.plan.settings, plan.settings)]:
+                    for rival in [
+                        each for each in change.left if _exclude_each_other(each.plan.settings, plan.settings)
+                    ]:
                         await rival.close()
                     service = await self._open(plan, program.counters, outlets)
                     change.opened.append(service)
@@ -106,7 +119,7 @@ class GatewayThread:
         return change
 
     def abandon(self, change: GatewayChange) -> None:
-        """Closes what `prepare` opened, and opens what had to make room for it."""
+        """Close what `prepare` opened, and open again what it had to close."""
         self._call(self._abandon(change))
 
     async def _abandon(self, change: GatewayChange) -> None:
@@ -124,7 +137,7 @@ class GatewayThread:
         self._services[again.name] = again
 
     def retire(self, change: GatewayChange) -> None:
-        """Closes what nobody wants any more; `abandon` would still open it again."""
+        """Close the services of `left`; `abandon` would still open them again."""
         self._call(self._retire(change))
 
     async def _retire(self, change: GatewayChange) -> None:
@@ -133,7 +146,7 @@ class GatewayThread:
                 closing.push_async_callback(service.close)
 
     def finish(self, change: GatewayChange) -> None:
-        """From now on these serve, and no others."""
+        """Start the new services, and forget those of `left`."""
         self._services = change.services
         for service in change.left:
             if service.name not in change.services:
@@ -146,9 +159,11 @@ class GatewayThread:
 
     async def _open(self, plan: GatewayPlan, counters: Counters, outlets: InletOutlets) -> GatewayService:
         settings = plan.settings
-        ledger = Ledger(settings, counters, self._counts, outlets.report, wall_ns)
+        gateway_counters = GatewayCounters(settings, counters, self._counts, outlets.report, wall_ns)
         inlet = Inlet(plan, ENCODINGS[settings.format].style, counters, self._counts, outlets)
-        service = GatewayService(plan, self._around, ledger, inlet, lambda events: self._transport(settings, events))
+        service = GatewayService(
+            plan, self._context, gateway_counters, inlet, lambda events: self._transport(settings, events)
+        )
         try:
             await service.open()
         except StartError as error:
@@ -163,17 +178,17 @@ class GatewayThread:
             self.kernel_drops[settings.name] = transport.kernel_drops
         return transport
 
-    def clients(self, value: Callable[[Subscriber], float]) -> Iterator[tuple[tuple[str, str], float]]:
-        """Gateway and number of each client, and what `value` makes of it. For any thread."""
+    def clients(self, value: Callable[[ClientQueue], float]) -> Iterator[tuple[tuple[str, str], float]]:
+        """Yield gateway and number of each client, and its `value`. Thread-safe."""
         for service in list(self._services.values()):
-            for each in list(service.subscribers.by_client.values()):
+            for each in list(service.clients.queues.values()):
                 yield (service.name, str(each.number)), value(each)
 
     def stop(self) -> None:
-        """Nothing is received any more when this returns, nor sent."""
+        """Close all gateways and end the thread."""
         try:
             self._call(self._close())
-        finally:  # a thread that goes on would keep the process
+        finally:  # a running thread would keep the process
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
             self._converting.shutdown()
@@ -182,7 +197,7 @@ class GatewayThread:
 
     async def _close(self) -> None:
         async with AsyncExitStack() as closing:  # all of them, whatever one raises
-            closing.callback(self._hub.close)
+            closing.callback(self._subscriptions.close)
             for service in self._services.values():
                 closing.push_async_callback(service.close)
 
@@ -190,13 +205,31 @@ class GatewayThread:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
     def _on_fault(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """What a callback of the loop raised: a fault of ours."""
+        """Report what a callback of the loop raised: a fault of the router."""
         error = context.get("exception")
         self._failed(error if isinstance(error, Exception) else RuntimeError(context["message"]))
 
 
-def _meet(one: Gateway, other: Gateway) -> bool:
-    """Whether both can be open at a time is not known here, so only those are kept apart that could not."""
+def new_transport(settings: Gateway, events: Events) -> Transport:
+    """Return the transport that a gateway's settings ask for, not open yet."""
+    most = settings.max_message if settings.inbound else MOST_REQUEST
+    if settings.zenoh is not None:
+        from router.gateway.transport.zenoh import ZenohTransport  # takes 50 ms to import
+
+        return ZenohTransport(settings.zenoh, events, most)
+    assert settings.address is not None  # noqa: S101 - the schema wants one for all others
+    address = settings.address.value
+    if settings.transport.value is TransportKind.UDP:
+        return UdpTransport(address, settings.receive.value if settings.receive else None, events)
+    limits = Limits(settings.max_clients, settings.max_clients_per_host, most)
+    if settings.transport.value is TransportKind.TCP:
+        return TcpTransport(address, events, limits, prefixed=settings.format is GatewayFormat.GATEWAY_V1)
+    text = settings.format is GatewayFormat.JSON
+    return WebsocketTransport(address, events, limits, text=text, page=PAGE.read_bytes())
+
+
+def _exclude_each_other(one: Gateway, other: Gateway) -> bool:
+    """Return whether both need the same name, address or key, and so cannot be open at a time."""
     if one.zenoh and other.zenoh and one.zenoh.key.value == other.zenoh.key.value:
         return True
     wanted = {where.value for where in (other.address, other.receive) if where}

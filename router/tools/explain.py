@@ -17,7 +17,7 @@ from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import qos_of, resolved
 from router.errors import StartError, shown_path
-from router.gateway.following import by_frequency
+from router.gateway.publishers import by_frequency
 from router.ros.environment import check_environment, ros_remedy
 from router.table.model import (
     ANY,

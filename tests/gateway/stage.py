@@ -17,12 +17,12 @@ from router.compiler import check_table
 from router.compiler.program import GatewayPlan, Program
 from router.engine import Report
 from router.errors import StartError
-from router.gateway.hub import Hub
+from router.gateway.context import GatewayContext
+from router.gateway.counters import GatewayCounters
 from router.gateway.inlet import Inlet, InletOutlets
-from router.gateway.ledger import Ledger
 from router.gateway.service import GatewayService
 from router.gateway.style import Style
-from router.gateway.surroundings import Surroundings
+from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Client, Events, Frame
 from router.ros.topics import RosTopics, SeenPublisher
 from router.table.model import Address
@@ -169,9 +169,9 @@ class Stage:
         worker = self._closing.enter_context(ThreadPoolExecutor(1))
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(lambda _, context: self.faults.append(context["exception"]))
-        hub = Hub(cast("RosTopics", self._graph), INTERFACES, loop)
-        self._closing.callback(hub.close)
-        self.around = Surroundings(hub, worker, worker, self.faults.append, monotonic_ns, wall_ns)
+        subscriptions = Subscriptions(cast("RosTopics", self._graph), INTERFACES, loop)
+        self._closing.callback(subscriptions.close)
+        self.context = GatewayContext(subscriptions, worker, worker, self.faults.append, monotonic_ns, wall_ns)
         self.played = {plan.settings.name: Played(self, plan) for plan in self._plans}
         return self
 
@@ -185,8 +185,8 @@ class Stage:
     def count(self, metric: str, *labels: str) -> int:
         return self.counts[self._counters.index(metric, *labels)]
 
-    def ledger(self, plan: GatewayPlan) -> Ledger:
-        return Ledger(plan.settings, self._counters, self.counts, self.reports.append, wall_ns)
+    def gateway_counters(self, plan: GatewayPlan) -> GatewayCounters:
+        return GatewayCounters(plan.settings, self._counters, self.counts, self.reports.append, wall_ns)
 
     def inlet(self, plan: GatewayPlan) -> Inlet:
         def publisher(topic: str) -> Any:
@@ -207,7 +207,9 @@ class Played:
     """One gateway and its client."""
 
     def __init__(self, stage: Stage, plan: GatewayPlan) -> None:
-        self.service = GatewayService(plan, stage.around, stage.ledger(plan), stage.inlet(plan), self._transport)
+        self.service = GatewayService(
+            plan, stage.context, stage.gateway_counters(plan), stage.inlet(plan), self._transport
+        )
         self._is_open = False
 
     def _transport(self, events: Events) -> PlayedTransport:

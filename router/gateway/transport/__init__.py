@@ -1,1 +1,1 @@
-"""One module per transport: how frames reach clients, and what clients send is read."""
+"""The ways to a gateway's clients: UDP, TCP, websocket and Zenoh."""

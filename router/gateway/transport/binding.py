@@ -1,4 +1,4 @@
-"""Opens what needs a local address: now, or as soon as this machine has that address. Knows no protocol."""
+"""Opening sockets at a local address: now, or as soon as this machine has that address."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from router.net.kernel import port_taken
 from router.table.model import Address
 
 RETRY_SECONDS = 1.0
-"""Between attempts at an address that is not there."""
+"""Between two attempts at an address that this machine does not have."""
 
 MOST_UNACCEPTED = 1024
-"""Connections that the kernel keeps for a listener that is busy: as many clients may come at once."""
+"""Connections that the kernel keeps until they are accepted: as many clients may come at once."""
 
 RECEIVE_BUFFER = 64 * 1024
-"""Bytes that the kernel keeps of what a client sends. Little is sent, and a thousand clients are to cost little."""
+"""Bytes that the kernel buffers of what a client sends: clients send little, and there may be a thousand."""
 
 
 class Binding:
-    """Calls `attempt` until it works. `protocol` is udp or tcp. `is_ready` once it has."""
+    """Calls `attempt` until it succeeds, after which `is_ready`. `protocol` is udp or tcp."""
 
     def __init__(self, protocol: str, address: Address, attempt: Callable[[], Awaitable[None]]) -> None:
         self.is_ready = False
@@ -34,7 +34,7 @@ class Binding:
         self._retrying: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Raises StartError, unless it is only that no network interface has the address yet."""
+        """Raises StartError for all errors but that no network interface has the address yet."""
         try:
             await self._attempt()
         except OSError as error:
@@ -53,16 +53,16 @@ class Binding:
                 await self._retrying
 
     async def _retry(self) -> None:
-        told = errno.EADDRNOTAVAIL
+        reported = errno.EADDRNOTAVAIL
         while not self.is_ready:
             await asyncio.sleep(RETRY_SECONDS)
             try:
                 await self._attempt()
             except OSError as error:
-                if error.errno not in (None, errno.EADDRNOTAVAIL, told):
-                    told = error.errno
+                if error.errno not in (None, errno.EADDRNOTAVAIL, reported):
+                    reported = error.errno
                     logger.error("this address cannot be used: trying on", why=self._why_not(error))
-            except Exception as error:  # noqa: BLE001 - a fault of the router, told loudly, is no reason to give up
+            except Exception as error:  # noqa: BLE001 - a fault of the router is reported, and no reason to give up
                 what = {"message": f"a fault in the router itself kept {self._address} closed", "exception": error}
                 asyncio.get_running_loop().call_exception_handler(what)
             else:
@@ -79,7 +79,7 @@ class Binding:
 
 
 def listen_at(address: Address) -> socket.socket:
-    """A non-blocking TCP socket that listens at `address`. Raises OSError."""
+    """Return a non-blocking TCP socket that listens at `address`. Raises OSError."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         # A restarted router need not wait for old connections to end; a port that another listens at stays refused.

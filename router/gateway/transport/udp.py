@@ -1,6 +1,6 @@
-"""A gateway's UDP socket: sends to one client, and hears that client's host. Knows no packet.
+"""A gateway's UDP socket: sends to one client, and receives from that client's host.
 
-Unconnected, so that a client may send from any port; news about unreachable hosts does not reach such a socket.
+It is not connected, so that a client may send from any port; ICMP errors do not reach such a socket.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ RECEIVE_BUFFER = 1 << 20
 BURST = 64
 BURST_BYTES = 128 * 1024
 PAUSE_SECONDS = 0.001
-"""So much is sent at once, and so long is waited before more: what a receiver with a default buffer can stand."""
+"""Datagrams and bytes sent at once, and the pause before more: a receiver with a default buffer keeps up with that."""
 
-RECEIVED_PER_TURN = 32
-"""Datagrams that are taken before other work of the loop has its turn."""
+READ_PER_TURN = 32
+"""Datagrams that are read before other work of the loop has its turn."""
 
 
 class UdpTransport:
-    """Its one client is there from the start. Without `local`, any port is sent from and nothing is received.
+    """Has one client, from the start. Without `local`, it sends from any port and receives nothing.
 
-    `most` bounds what is received, in bytes.
+    `most` bounds a datagram that is received, in bytes.
     """
 
     def __init__(self, remote: Address, local: Address | None, events: Events, most: int = LARGEST_DATAGRAM) -> None:
@@ -67,7 +67,7 @@ class UdpTransport:
         self._socket = None
 
     def kernel_drops(self) -> int:
-        """Datagrams of whomever that the kernel threw away before they were received. For any thread."""
+        """Return how many datagrams, from any sender, the kernel dropped before they were received. Thread-safe."""
         opened = self._socket
         return self._drops_at_close if opened is None else drops(opened)
 
@@ -96,7 +96,7 @@ class UdpTransport:
         self._events.joined(self._client)
 
     def _receive(self, opened: socket.socket, client: UdpClient) -> None:
-        for _ in range(RECEIVED_PER_TURN):
+        for _ in range(READ_PER_TURN):
             try:
                 data, sender = opened.recvfrom(self._most + 1)
             except BlockingIOError:
@@ -113,7 +113,7 @@ class UdpTransport:
 
 
 class UdpClient:
-    """Whoever hears at the remote address. Each frame is one datagram; bursts are paced."""
+    """The receiver at the remote address. Each frame is one datagram; bursts are paced."""
 
     def __init__(self, opened: socket.socket, remote: Address, events: Events) -> None:
         self.label = str(remote)
@@ -153,7 +153,7 @@ class UdpClient:
         self._events.left(self)
 
     def _send_burst(self) -> None:
-        """Sends what may be sent now, and the rest later. Of errors, the last one stands for all of the burst."""
+        """Send what may be sent now, and the rest later. Of several errors in a burst, the last one is reported."""
         self._resume = None
         now = self._loop.time()
         if now >= self._burst_ends:

@@ -20,11 +20,10 @@ from rclpy.serialization import serialize_message
 from router.compiler.program import TopicPlan
 from router.errors import StartError
 from router.gateway.compression import decompress
-from router.gateway.feeds import TURN, Feed
-from router.gateway.following import Choice
-from router.gateway.hub import Hub
+from router.gateway.publishers import Selection
 from router.gateway.samples import ReadyType, Sample
 from router.gateway.style import Style, UnreadableError
+from router.gateway.subscriptions import READ_PER_TURN, Subscriptions, TopicSubscription
 from router.types.ros import RosInterfaces, ros_interfaces
 from router.types.ros_sources import MsgFiles, RosbagsDefinitions
 from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, padded, string_topic
@@ -33,7 +32,7 @@ from tests.ros.ros_publisher import Publisher
 INT32 = "std_msgs/msg/Int32"
 FIVE = bytes.fromhex("0001000005000000")
 INTERFACES = ros_interfaces()
-PLAIN = Choice(STRING, is_reliable=True, keeps=False, others=())
+PLAIN = Selection(STRING, is_reliable=True, keeps=False, others=())
 OURS = PLAIN._replace(is_ours=True)
 PATIENCE_S = 20.0
 
@@ -52,13 +51,13 @@ def run(story: Coroutine[Any, Any, None]) -> None:
 
 
 @asynccontextmanager
-async def opened(*publishers: TopicPlan) -> AsyncIterator[Hub]:
-    """A hub on a node that publishes on these."""
+async def opened(*publishers: TopicPlan) -> AsyncIterator[Subscriptions]:
+    """A subscriptions on a node that publishes on these."""
     with (
         closing(open_ros(*publishers)) as ros,
-        closing(Hub(ros.topics, INTERFACES, asyncio.get_running_loop())) as hub,
+        closing(Subscriptions(ros.topics, INTERFACES, asyncio.get_running_loop())) as subscriptions,
     ):
-        yield hub
+        yield subscriptions
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -68,11 +67,11 @@ async def until(condition: Callable[[], bool]) -> None:
         await asyncio.sleep(0.01)
 
 
-async def seen(hub: Hub, condition: Callable[[Choice], bool] = lambda _: True) -> Choice:
+async def seen(subscriptions: Subscriptions, condition: Callable[[Selection], bool] = lambda _: True) -> Selection:
     """What is seen of /greeting as soon as it is published so."""
     deadline = asyncio.get_running_loop().time() + PATIENCE_S
     while True:
-        choice = (await hub.look((), lambda topic: topic == "/greeting")).get("/greeting")
+        choice = (await subscriptions.discover((), lambda topic: topic == "/greeting")).get("/greeting")
         if choice and condition(choice):
             return choice
         assert asyncio.get_running_loop().time() < deadline, f"it was never published like that: {choice}"
@@ -83,17 +82,17 @@ async def matched(peer: Publisher) -> None:
     assert await asyncio.to_thread(peer.line) == "matched"
 
 
-def latest(feed: Feed) -> bytes | None:
-    sample = feed.latest()
+def latest(subscription: TopicSubscription) -> bytes | None:
+    sample = subscription.latest()
     return sample.cdr if sample else None
 
 
-async def heard(peer: Publisher, cdr: bytes, feed: Feed) -> None:
+async def heard(peer: Publisher, cdr: bytes, subscription: TopicSubscription) -> None:
     """It publishes until it is heard: whoever was subscribed to anew is not told in any other way."""
 
     def came() -> bool:
         peer.publish([cdr])
-        return latest(feed) == cdr
+        return latest(subscription) == cdr
 
     await until(came)
 
@@ -102,22 +101,22 @@ def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: Publish
     publisher(STRING, "--transient-local")
 
     async def story() -> None:
-        async with opened(string_topic(topic="own")) as hub:
-            await seen(hub)
-            assert await hub.look((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
-                "/greeting": Choice(STRING, is_reliable=True, keeps=True, others=()),
+        async with opened(string_topic(topic="own")) as subscriptions:
+            await seen(subscriptions)
+            assert await subscriptions.discover((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
+                "/greeting": Selection(STRING, is_reliable=True, keeps=True, others=()),
                 "/own": OURS,
             }
-            assert await hub.look((), lambda _: False) == {}
+            assert await subscriptions.discover((), lambda _: False) == {}
 
     run(story())
 
 
 def test_what_only_we_publish_on_a_topic_that_is_let_in_is_not_seen() -> None:
     async def story() -> None:
-        async with opened(string_topic()) as hub:
-            assert await seen(hub) == OURS
-            assert await hub.look(["/greeting"], lambda topic: topic == "/greeting") == {}
+        async with opened(string_topic()) as subscriptions:
+            assert await seen(subscriptions) == OURS
+            assert await subscriptions.discover(["/greeting"], lambda topic: topic == "/greeting") == {}
 
     run(story())
 
@@ -132,10 +131,10 @@ def test_looking_lets_others_have_their_turn_between_topics() -> None:
                 turns += 1
                 await asyncio.sleep(0)
 
-        async with opened(*(string_topic(topic=f"number_{number}") for number in range(20))) as hub:
-            await hub.look((), lambda _: True)  # the type is ready from here on
+        async with opened(*(string_topic(topic=f"number_{number}") for number in range(20))) as subscriptions:
+            await subscriptions.discover((), lambda _: True)  # the type is ready from here on
             task = asyncio.get_running_loop().create_task(other())
-            assert len(await hub.look((), lambda topic: topic.startswith("/number_"))) == 20
+            assert len(await subscriptions.discover((), lambda topic: topic.startswith("/number_"))) == 20
             assert turns >= 20
             task.cancel()
 
@@ -144,22 +143,26 @@ def test_looking_lets_others_have_their_turn_between_topics() -> None:
 
 def test_the_latest_value_is_the_newest_and_stays_until_another_one_comes(publisher: Publish) -> None:
     async def story() -> None:
-        async with opened() as hub:
-            feed = hub.join("/greeting", PLAIN, None)
-            assert (feed.topic, feed.type_name, feed.message) == ("/greeting", STRING, INTERFACES.get(STRING))
-            assert json.loads(feed.schema)["name"] == "String"
-            assert feed.latest() is None
+        async with opened() as subscriptions:
+            subscription = subscriptions.join("/greeting", PLAIN, None)
+            assert (subscription.topic, subscription.type_name, subscription.message) == (
+                "/greeting",
+                STRING,
+                INTERFACES.get(STRING),
+            )
+            assert json.loads(subscription.schema)["name"] == "String"
+            assert subscription.latest() is None
             peer = publisher(STRING)
             await matched(peer)
             peer.publish(cdr(str(number)) for number in range(50))
-            await until(lambda: feed.arrived == 50)
-            sample = feed.latest()
+            await until(lambda: subscription.arrived == 50)
+            sample = subscription.latest()
             assert sample
             assert (sample.topic, sample.type_name, sample.cdr) == ("/greeting", STRING, cdr("49"))
-            assert feed.latest() is sample
+            assert subscription.latest() is sample
             peer.publish([HELLO])
-            await until(lambda: latest(feed) == HELLO)
-            assert feed.arrived == 51
+            await until(lambda: latest(subscription) == HELLO)
+            assert subscription.arrived == 51
 
     run(story())
 
@@ -175,45 +178,45 @@ def test_every_message_is_handed_on_in_order_and_a_turn_is_short(publisher: Publ
             asyncio.get_running_loop().call_soon(turn)
 
     async def story() -> None:
-        async with opened() as hub:
-            feed = hub.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+        async with opened() as subscriptions:
+            subscription = subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
             peer = publisher(STRING)
             await matched(peer)
             peer.publish(texts)
             peer.await_receipt()  # while the loop stands still, so that they all wait
             turn()
             await until(lambda: samples == texts)
-            assert max(after - before for before, after in pairwise(turns)) <= TURN
-            assert feed.arrived == len(texts)
-            assert latest(feed) == texts[-1]
+            assert max(after - before for before, after in pairwise(turns)) <= READ_PER_TURN
+            assert subscription.arrived == len(texts)
+            assert latest(subscription) == texts[-1]
 
     run(story())
 
 
 def test_all_who_want_each_message_share_a_feed_and_all_who_want_the_latest_another(publisher: Publish) -> None:
-    first: list[tuple[Feed, Sample]] = []
-    second: list[tuple[Feed, Sample]] = []
+    first: list[tuple[TopicSubscription, Sample]] = []
+    second: list[tuple[TopicSubscription, Sample]] = []
 
-    def each(feed: Feed, sample: Sample) -> None:
-        first.append((feed, sample))
+    def each(subscription: TopicSubscription, sample: Sample) -> None:
+        first.append((subscription, sample))
 
     async def story() -> None:
-        async with opened() as hub:
-            calm = hub.join("/greeting", PLAIN, None)
-            feed = hub.join("/greeting", PLAIN, each)
-            assert hub.join("/greeting", PLAIN, lambda *handed: second.append(handed)) is feed
-            assert hub.join("/greeting", PLAIN, None) is calm is not feed
+        async with opened() as subscriptions:
+            calm = subscriptions.join("/greeting", PLAIN, None)
+            subscription = subscriptions.join("/greeting", PLAIN, each)
+            assert subscriptions.join("/greeting", PLAIN, lambda *handed: second.append(handed)) is subscription
+            assert subscriptions.join("/greeting", PLAIN, None) is calm is not subscription
             peer = publisher(STRING)
-            await heard(peer, cdr("one"), feed)
+            await heard(peer, cdr("one"), subscription)
             peer.publish([cdr("two"), cdr("three")])
-            await until(lambda: latest(feed) == latest(calm) == cdr("three"))
+            await until(lambda: latest(subscription) == latest(calm) == cdr("three"))
             assert first == second
-            assert all(handed is feed for handed, _ in first)
+            assert all(handed is subscription for handed, _ in first)
             assert [sample.cdr for _, sample in first][-2:] == [cdr("two"), cdr("three")]
-            assert feed.latest() is first[-1][1]
-            hub.leave(feed, each)
+            assert subscription.latest() is first[-1][1]
+            subscriptions.leave(subscription, each)
             peer.publish([cdr("four")])
-            await until(lambda: latest(feed) == cdr("four"))
+            await until(lambda: latest(subscription) == cdr("four"))
             assert len(first) == len(second) - 1
 
     run(story())
@@ -222,22 +225,22 @@ def test_all_who_want_each_message_share_a_feed_and_all_who_want_the_latest_anot
 def test_what_is_kept_comes_once_though_publishers_of_less_quality_come_and_go(publisher: Publish) -> None:
     samples: list[bytes] = []
 
-    def each(_: Feed, sample: Sample) -> None:
+    def each(_: TopicSubscription, sample: Sample) -> None:
         samples.append(sample.cdr)
 
     async def story() -> None:
-        async with opened() as hub:
+        async with opened() as subscriptions:
             publisher(STRING, "--transient-local").publish([HELLO])
-            kept = await seen(hub)
-            feed = hub.join("/greeting", kept, each)
+            kept = await seen(subscriptions)
+            subscription = subscriptions.join("/greeting", kept, each)
             await until(lambda: samples == [HELLO])
             for wanted in (kept._replace(keeps=False), kept):
-                assert hub.join("/greeting", wanted, each) is feed
-                hub.leave(feed, each)
-            await until(lambda: feed.arrived == 2)  # delivered again
+                assert subscriptions.join("/greeting", wanted, each) is subscription
+                subscriptions.leave(subscription, each)
+            await until(lambda: subscription.arrived == 2)  # delivered again
             await asyncio.sleep(0.1)
             assert samples == [HELLO]
-            assert feed.missed == 0
+            assert subscription.missed == 0
 
     run(story())
 
@@ -246,14 +249,14 @@ def test_a_fault_of_one_follower_loses_nothing_else(publisher: Publish) -> None:
     samples: list[bytes] = []
     faults: list[object] = []
 
-    def fails(_: Feed, sample: Sample) -> None:
+    def fails(_: TopicSubscription, sample: Sample) -> None:
         raise RuntimeError("no")
 
     async def story() -> None:
         asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
-        async with opened() as hub:
-            hub.join("/greeting", PLAIN, fails)
-            hub.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+        async with opened() as subscriptions:
+            subscriptions.join("/greeting", PLAIN, fails)
+            subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
             peer = publisher(STRING)
             await matched(peer)
             peer.publish([HELLO, cdr("newer")])
@@ -265,32 +268,35 @@ def test_a_fault_of_one_follower_loses_nothing_else(publisher: Publish) -> None:
 
 def test_a_feed_is_closed_when_the_last_follower_leaves() -> None:
     async def story() -> None:
-        with closing(open_ros()) as ros, closing(Hub(ros.topics, INTERFACES, asyncio.get_running_loop())) as hub:
-            feed = hub.join("/nobody", PLAIN, None)
-            assert hub.join("/nobody", PLAIN, None) is feed
-            hub.leave(feed, None)
+        with (
+            closing(open_ros()) as ros,
+            closing(Subscriptions(ros.topics, INTERFACES, asyncio.get_running_loop())) as subscriptions,
+        ):
+            subscription = subscriptions.join("/nobody", PLAIN, None)
+            assert subscriptions.join("/nobody", PLAIN, None) is subscription
+            subscriptions.leave(subscription, None)
             assert "/nobody" in ros.topics.names()
-            hub.leave(feed, None)
+            subscriptions.leave(subscription, None)
             await until(lambda: "/nobody" not in ros.topics.names())
-            assert feed.latest() is None
-            assert hub.join("/nobody", PLAIN, None) is not feed
+            assert subscription.latest() is None
+            assert subscriptions.join("/nobody", PLAIN, None) is not subscription
 
     run(story())
 
 
 def test_it_adapts_when_a_publisher_of_less_quality_joins(publisher: Publish) -> None:
     async def story() -> None:
-        async with opened() as hub:
+        async with opened() as subscriptions:
             reliable = publisher(STRING)
-            feed = hub.join("/greeting", before := await seen(hub), None)
+            subscription = subscriptions.join("/greeting", before := await seen(subscriptions), None)
             await matched(reliable)
             lossy = publisher(STRING, "--best-effort")
-            after = await seen(hub, lambda choice: not choice.is_reliable)
-            assert hub.join("/greeting", after, None) is feed
-            hub.leave(feed, None)
+            after = await seen(subscriptions, lambda choice: not choice.is_reliable)
+            assert subscriptions.join("/greeting", after, None) is subscription
+            subscriptions.leave(subscription, None)
             assert before.is_reliable
-            await heard(lossy, HELLO, feed)
-            await heard(reliable, cdr("as well"), feed)
+            await heard(lossy, HELLO, subscription)
+            await heard(reliable, cdr("as well"), subscription)
 
     run(story())
 
@@ -298,19 +304,19 @@ def test_it_adapts_when_a_publisher_of_less_quality_joins(publisher: Publish) ->
 def test_whoever_follows_again_for_another_quality_gets_no_message_twice(publisher: Publish) -> None:
     samples: list[bytes] = []
 
-    def each(_: Feed, sample: Sample) -> None:
+    def each(_: TopicSubscription, sample: Sample) -> None:
         samples.append(sample.cdr)
 
     async def story() -> None:
-        async with opened() as hub:
-            feed = hub.join("/greeting", PLAIN, each)
+        async with opened() as subscriptions:
+            subscription = subscriptions.join("/greeting", PLAIN, each)
             peer = publisher(STRING)
             await matched(peer)
             peer.publish([HELLO])
             peer.await_receipt()  # holds up the loop: what came is not taken yet
             assert samples == []
-            assert hub.join("/greeting", PLAIN._replace(is_reliable=False), each) is feed
-            hub.leave(feed, each)
+            assert subscriptions.join("/greeting", PLAIN._replace(is_reliable=False), each) is subscription
+            subscriptions.leave(subscription, each)
             assert samples == [HELLO]
 
     run(story())
@@ -320,21 +326,21 @@ def test_what_gave_way_in_the_queue_is_counted_once_and_nothing_else(publisher: 
     samples: list[bytes] = []
 
     async def story() -> None:
-        async with opened() as hub:
-            feed = hub.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+        async with opened() as subscriptions:
+            subscription = subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
             peer = publisher(STRING)
             await matched(peer)
             peer.publish([HELLO])
             await until(lambda: samples == [HELLO])
             peer.publish([HELLO] * 250)
             peer.await_receipt()
-            await until(lambda: feed.arrived == 251)
+            await until(lambda: subscription.arrived == 251)
             peer.publish([cdr("last")])
             await until(lambda: samples[-1] == cdr("last"))
-            assert (len(samples), feed.missed) == (102, 150)
+            assert (len(samples), subscription.missed) == (102, 150)
             peer.close()
             await asyncio.sleep(0.5)  # a publisher that goes is no message
-            assert (feed.arrived, feed.missed) == (252, 150)
+            assert (subscription.arrived, subscription.missed) == (252, 150)
 
     run(story())
 
@@ -344,36 +350,38 @@ def test_what_was_kept_comes_to_a_late_feed(publisher: Publish, is_each: bool) -
     publisher(STRING, "--transient-local").publish([HELLO])
 
     async def story() -> None:
-        async with opened() as hub:
-            feed = hub.join("/greeting", await seen(hub), (lambda *_: None) if is_each else None)
-            await until(lambda: latest(feed) == HELLO)
+        async with opened() as subscriptions:
+            subscription = subscriptions.join(
+                "/greeting", await seen(subscriptions), (lambda *_: None) if is_each else None
+            )
+            await until(lambda: latest(subscription) == HELLO)
 
     run(story())
 
 
 def test_another_type_is_another_feed_and_the_old_one_ends(publisher: Publish) -> None:
     async def story() -> None:
-        async with opened() as hub:
+        async with opened() as subscriptions:
             text = publisher(STRING)
-            old = hub.join("/greeting", await seen(hub), None)
-            assert hub.join("/greeting", PLAIN, None) is old  # somebody else, who does not know yet
+            old = subscriptions.join("/greeting", await seen(subscriptions), None)
+            assert subscriptions.join("/greeting", PLAIN, None) is old  # somebody else, who does not know yet
             await matched(text)
             text.publish([HELLO])
             await until(lambda: latest(old) == HELLO)
             publisher(INT32)
             number = publisher(INT32)
-            several = await seen(hub, lambda choice: choice.type_name == INT32)
+            several = await seen(subscriptions, lambda choice: choice.type_name == INT32)
             assert several.others == (STRING,)
-            new = hub.join("/greeting", several, None)
+            new = subscriptions.join("/greeting", several, None)
             assert (new is old, new.type_name) == (False, INT32)
             assert (new.is_open, old.is_open) == (True, False)
-            hub.leave(old, None)
+            subscriptions.leave(old, None)
             await matched(number)
             number.publish([FIVE])
             await until(lambda: latest(new) == FIVE)
             assert latest(old) == HELLO
-            assert hub.join("/greeting", several, None) is new
-            hub.leave(old, None)
+            assert subscriptions.join("/greeting", several, None) is new
+            subscriptions.leave(old, None)
             assert latest(new) == FIVE
 
     run(story())
@@ -381,17 +389,17 @@ def test_another_type_is_another_feed_and_the_old_one_ends(publisher: Publish) -
 
 def test_a_publisher_that_was_killed_is_followed_by_its_successor() -> None:
     async def story() -> None:
-        async with opened() as hub:
-            feed = hub.join("/greeting", PLAIN, None)
+        async with opened() as subscriptions:
+            subscription = subscriptions.join("/greeting", PLAIN, None)
             killed = Publisher("greeting", STRING)
             await matched(killed)
             killed.publish([HELLO])
-            await until(lambda: latest(feed) == HELLO)
+            await until(lambda: latest(subscription) == HELLO)
             killed.kill()
             with closing(Publisher("greeting", STRING)) as successor:
                 await matched(successor)
                 successor.publish([cdr("again")])
-                await until(lambda: latest(feed) == cdr("again"))
+                await until(lambda: latest(subscription) == cdr("again"))
 
     run(story())
 
@@ -403,16 +411,18 @@ def test_a_part_of_a_service_is_followed_though_no_msg_file_declares_it(publishe
     happened = GetParameters.Event(request=[GetParameters.Request(names=["speed"])])
 
     async def story() -> None:
-        async with opened() as hub:
+        async with opened() as subscriptions:
             peer = publisher(EVENT)
-            feed = hub.join("/greeting", await seen(hub, lambda choice: choice.type_name == EVENT), None)
-            await heard(peer, padded(serialize_message(happened)), feed)
-            sample = feed.latest()
+            subscription = subscriptions.join(
+                "/greeting", await seen(subscriptions, lambda choice: choice.type_name == EVENT), None
+            )
+            await heard(peer, padded(serialize_message(happened)), subscription)
+            sample = subscription.latest()
             assert sample
             assert sample.type_name == EVENT
             value = json.loads(sample.text(Style.PLAIN))
             assert (value["request"], value["response"]) == ([{"names": ["speed"]}], [])
-            schema = json.loads(feed.schema)
+            schema = json.loads(subscription.schema)
             assert (schema["name"], schema["namespace"]) == ("GetParameters_Event", "rcl_interfaces::srv")
             request = schema["fields"][1]["subtype"]
             assert (request["name"], request["namespace"]) == ("GetParameters_Request", "rcl_interfaces::srv")
@@ -432,10 +442,10 @@ def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
 
     async def story() -> None:
         loop = asyncio.get_running_loop()
-        with closing(open_ros()) as ros, closing(Hub(ros.topics, interfaces, loop)) as hub:
-            feed = hub.join("/greeting", PLAIN, None)
-            await heard(publisher(STRING), HELLO, feed)
-            sample = feed.latest()
+        with closing(open_ros()) as ros, closing(Subscriptions(ros.topics, interfaces, loop)) as subscriptions:
+            subscription = subscriptions.join("/greeting", PLAIN, None)
+            await heard(publisher(STRING), HELLO, subscription)
+            sample = subscription.latest()
             assert sample
             assert sample.text(Style.PLAIN) == '{"data":"hello, rover"}'
 
@@ -445,20 +455,20 @@ def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
 @pytest.mark.parametrize("type_name", ["std_msgs/msg/NoSuch", "no_such/msg/Thing", "some::Idl_", "a/action/B_Feedback"])
 def test_a_type_that_is_not_installed_is_refused_each_time(type_name: str) -> None:
     async def story() -> None:
-        async with opened() as hub:
+        async with opened() as subscriptions:
             for _ in range(2):
                 with pytest.raises(StartError, match=f"{type_name} is not installed"):
-                    hub.join("/greeting", PLAIN._replace(type_name=type_name), None)
+                    subscriptions.join("/greeting", PLAIN._replace(type_name=type_name), None)
 
     run(story())
 
 
 def test_a_topic_that_a_route_has_with_another_type_is_refused_and_can_be_followed_with_its_own() -> None:
     async def story() -> None:
-        async with opened(string_topic()) as hub:
+        async with opened(string_topic()) as subscriptions:
             with pytest.raises(StartError, match="'/greeting' is std_msgs/msg/String in this router"):
-                hub.join("/greeting", PLAIN._replace(type_name=INT32), None)
-            assert hub.join("/greeting", PLAIN, None).type_name == STRING
+                subscriptions.join("/greeting", PLAIN._replace(type_name=INT32), None)
+            assert subscriptions.join("/greeting", PLAIN, None).type_name == STRING
 
     run(story())
 

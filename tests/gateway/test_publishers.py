@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.gateway.following import Choice, choice
+from router.gateway.publishers import Selection, select
 from router.ros.topics import SeenPublisher
 
 RELIABLE = SeenPublisher("a/msg/A", is_reliable=True, keeps=False, is_ours=False)
@@ -38,7 +38,7 @@ seen = st.builds(SeenPublisher, st.sampled_from("abc"), st.booleans(), st.boolea
 def test_quality_is_what_every_publisher_of_the_type_offers(
     publishers: list[SeenPublisher], is_reliable: bool, keeps: bool
 ) -> None:
-    chosen = choice(publishers, is_let_in=False)
+    chosen = select(publishers, is_inbound=False)
     assert chosen
     assert (chosen.is_reliable, chosen.keeps) == (is_reliable, keeps)
 
@@ -55,24 +55,24 @@ def test_quality_is_what_every_publisher_of_the_type_offers(
 def test_the_type_of_most_publishers_is_served(
     publishers: list[SeenPublisher], type_name: str, others: tuple[str, ...]
 ) -> None:
-    assert choice(publishers, is_let_in=False) == Choice(type_name, is_reliable=True, keeps=False, others=others)
+    assert select(publishers, is_inbound=False) == Selection(type_name, is_reliable=True, keeps=False, others=others)
 
 
 def test_a_topic_without_publishers_is_not_served() -> None:
-    assert choice([], is_let_in=False) is None
+    assert select([], is_inbound=False) is None
 
 
 def test_our_own_publishers_count_unless_the_topic_is_let_in() -> None:
     ours = OTHER._replace(is_ours=True)
-    routed, let_in = choice([ours], is_let_in=False), choice([ours, ours, RELIABLE], is_let_in=True)
+    routed, let_in = select([ours], is_inbound=False), select([ours, ours, RELIABLE], is_inbound=True)
     assert routed
     assert routed.type_name == "b/msg/B"
-    assert let_in == Choice("a/msg/A", is_reliable=True, keeps=False, others=())
-    assert choice([ours], is_let_in=True) is None
+    assert let_in == Selection("a/msg/A", is_reliable=True, keeps=False, others=())
+    assert select([ours], is_inbound=True) is None
 
 
 @given(st.lists(seen), st.booleans())
 def test_the_order_in_which_publishers_were_found_does_not_matter(
     publishers: list[SeenPublisher], is_let_in: bool
 ) -> None:
-    assert choice(publishers, is_let_in=is_let_in) == choice(sorted(publishers), is_let_in=is_let_in)
+    assert select(publishers, is_inbound=is_let_in) == select(sorted(publishers), is_inbound=is_let_in)

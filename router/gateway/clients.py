@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import count
 
+from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Encoding
-from router.gateway.ledger import Ledger
 from router.gateway.transport.base import HIGH_WATER, Client, Frame, Transport
 from router.log import FloodLog, logger
 
 
-class Subscriber:
-    """One client. `number` is its label in metrics: the lowest that no other client of the gateway has.
+class ClientQueue:
+    """What one client gets. `number` is its label in metrics: the lowest that no other client of the gateway has.
 
     While its backlog is at HIGH_WATER, frames wait in a queue that holds one per topic (and schema): a newer frame
     takes the place of the one that waits, so that each topic keeps its turn. `sent` and `dropped` count frames since
@@ -47,7 +47,7 @@ class Subscriber:
         self.client.write(self._on_wire(frames))
         self.sent += len(frames)
 
-    def queue(self, schemas: Mapping[Hashable, Frame], values: Mapping[Hashable, Frame], frames: int, now: int) -> int:
+    def put(self, schemas: Mapping[Hashable, Frame], values: Mapping[Hashable, Frame], frames: int, now: int) -> int:
         """Queue the newest of so many `frames`. Return how many frames gave way to newer ones."""
         if self._behind_since is None:
             self._behind_since = now
@@ -79,36 +79,36 @@ class Subscriber:
         return taken
 
 
-class Subscribers:
+class Clients:
     """All clients of a gateway. `clock_ns` is monotonic, `wall_s` gives the wall clock in seconds."""
 
     def __init__(
         self,
         gateway: str,
         encoding: Encoding,
-        ledger: Ledger,
+        counters: GatewayCounters,
         clock_ns: Callable[[], int],
         wall_s: Callable[[], float],
     ) -> None:
-        self.by_client: dict[Client, Subscriber] = {}
+        self.queues: dict[Client, ClientQueue] = {}
         self._gateway = gateway
         self._encoding = encoding
-        self._ledger = ledger
+        self._counters = counters
         self._clock_ns = clock_ns
         self._wall_s = wall_s
         self._log = FloodLog()
 
     def __bool__(self) -> bool:
         """Whether there are any."""
-        return bool(self.by_client)
+        return bool(self.queues)
 
     def send(self, frames: Sequence[Frame], transport: Transport) -> None:
         """Write frames to every client that keeps up, and queue them for the others."""
-        if not frames or not self.by_client:
+        if not frames or not self.queues:
             return
-        ready: list[Subscriber] = []
-        behind: list[Subscriber] = []
-        for each in self.by_client.values():
+        ready: list[ClientQueue] = []
+        behind: list[ClientQueue] = []
+        for each in self.queues.values():
             (ready if each.keeps_up else behind).append(each)
         if behind:
             self._queue(behind, frames)
@@ -119,52 +119,52 @@ class Subscribers:
         elif ready:
             ready[0].write(frames)
 
-    def send_to(self, subscriber: Subscriber, frames: Sequence[Frame]) -> None:
+    def send_to(self, queue: ClientQueue, frames: Sequence[Frame]) -> None:
         """Answer one client."""
         if not frames:
             return
-        if subscriber.keeps_up:
-            subscriber.write(frames)
+        if queue.keeps_up:
+            queue.write(frames)
         else:
-            self._queue([subscriber], frames)
+            self._queue([queue], frames)
 
     async def flush_log(self) -> None:
         self._log.flush()
 
-    def joined(self, client: Client) -> Subscriber:
-        taken = {each.number for each in self.by_client.values()}
+    def joined(self, client: Client) -> ClientQueue:
+        taken = {each.number for each in self.queues.values()}
         number = next(number for number in count() if number not in taken)
-        subscriber = self.by_client[client] = Subscriber(client, number, self._on_wire)
-        self._ledger.clients(len(self.by_client))
-        self._log_change("client joined", subscriber)
-        return subscriber
+        queue = self.queues[client] = ClientQueue(client, number, self._on_wire)
+        self._counters.clients(len(self.queues))
+        self._log_change("client joined", queue)
+        return queue
 
     def left(self, client: Client) -> None:
-        if (subscriber := self.by_client.pop(client, None)) is not None:
-            self._ledger.left(subscriber.waiting)
-            self._ledger.clients(len(self.by_client))
-            self._log_change("client left", subscriber)
+        if (queue := self.queues.pop(client, None)) is not None:
+            self._counters.left(queue.waiting)
+            self._counters.clients(len(self.queues))
+            self._log_change("client left", queue)
 
     def drained(self, client: Client) -> None:
-        if (subscriber := self.by_client.get(client)) is not None:
-            subscriber.drained()
+        if (queue := self.queues.get(client)) is not None:
+            queue.drained()
 
     def close(self) -> None:
         self._log.flush(final=True)
 
-    def _queue(self, subscribers: Sequence[Subscriber], frames: Sequence[Frame]) -> None:
+    def _queue(self, queues: Sequence[ClientQueue], frames: Sequence[Frame]) -> None:
         schemas: dict[Hashable, Frame] = {(each.topic, each.type_name): each for each in frames if each.is_schema}
         values: dict[Hashable, Frame] = {each.topic: each for each in frames if not each.is_schema}
         now = self._clock_ns()
-        self._ledger.superseded(sum(each.queue(schemas, values, len(frames), now) for each in subscribers))
+        self._counters.superseded(sum(each.put(schemas, values, len(frames), now) for each in queues))
 
-    def _log_change(self, event: str, subscriber: Subscriber) -> None:
+    def _log_change(self, event: str, queue: ClientQueue) -> None:
         """Log who came or went; repetitions from one host are summed up."""
-        address = subscriber.client.label
+        address = queue.client.label
         key = event, address.rpartition(":")[0]
-        self._log.note(key, logger.info, event, gateway=self._gateway, client=subscriber.number, address=address)
+        self._log.note(key, logger.info, event, gateway=self._gateway, client=queue.number, address=address)
 
     def _on_wire(self, frames: Sequence[Frame], clients: int = 1) -> Sequence[Frame]:
         wire = self._encoding.on_wire(frames, self._wall_s())
-        self._ledger.written(len(wire) * clients, sum(len(frame.data) for frame in wire) * clients)
+        self._counters.written(len(wire) * clients, sum(len(frame.data) for frame in wire) * clients)
         return wire

@@ -7,7 +7,7 @@ from collections.abc import Coroutine
 from contextlib import suppress
 from typing import Any
 
-from router.gateway.tasks import Tasks
+from router.gateway.context import Tasks
 
 PATIENCE_S = 20.0
 

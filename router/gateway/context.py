@@ -1,16 +1,38 @@
-"""What a gateway does again and again, or beside other things, in its event loop. Knows nothing of what that is."""
+"""What the parts of a gateway share: the context of all gateways of a router, and the tasks of one."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from typing import Any
 
-_PATIENCE_S = 0.1
+from router.gateway.subscriptions import Subscriptions
+
+_CANCEL_AGAIN_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class GatewayContext:
+    """`converting` runs what would block the loop for messages from ROS, `reading` for those from clients.
+
+    `failed` reports faults of the router itself. Clocks in ns.
+    """
+
+    subscriptions: Subscriptions
+    converting: Executor
+    reading: Executor
+    failed: Callable[[Exception], None]
+    clock_ns: Callable[[], int]
+    wall_ns: Callable[[], int]
+
+    def wall_s(self) -> float:
+        return self.wall_ns() * 1e-9
 
 
 class Tasks:
-    """`failed` hears what they raise: a fault of ours, told loudly, which ends no other task."""
+    """Asyncio tasks, periodic or not. `failed` reports what they raise; an exception ends no other task."""
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
@@ -22,24 +44,22 @@ class Tasks:
         task.add_done_callback(self._done)
 
     def each(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
-        """Calls `work` now and then on a grid of `period_s`; what it missed is left out."""
+        """Call `work` now and then on a grid of `period_s`; points that were missed are skipped."""
         self.run(self._each(period_s, work))
 
     async def attempt(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Calls `work` once, and waits for its end, whatever that is."""
+        """Call `work` once, and report what it raises."""
         try:
             await work()
         except Exception as error:  # noqa: BLE001 what comes next matters as much
             self._failed(error)
 
     async def close(self) -> None:
-        """Ends them all, wherever they are. One that has just got what it waited for may miss the first call to end:
-        asyncio.wait_for does until Python 3.12.
-        """
+        """Cancel all tasks, repeatedly: until Python 3.12, asyncio.wait_for may swallow a cancellation."""
         while running := list(self._running):
             for task in running:
                 task.cancel()
-            await asyncio.wait(running, timeout=_PATIENCE_S)
+            await asyncio.wait(running, timeout=_CANCEL_AGAIN_S)
 
     async def _each(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
         clock = asyncio.get_running_loop().time

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.gateway.subscribers import Subscriber
+from router.gateway.clients import ClientQueue
 from router.gateway.transport.base import HIGH_WATER, Frame
 
 MS = 1_000_000
@@ -44,12 +44,12 @@ class Client:
         raise AssertionError("nobody closes it here")
 
 
-def subscriber(client: Client) -> Subscriber:
-    return Subscriber(client, 0, lambda frames: frames)
+def new_queue(client: Client) -> ClientQueue:
+    return ClientQueue(client, 0, lambda frames: frames)
 
 
-def queue(subscriber: Subscriber, *frames: Frame, now: int = 0) -> int:
-    return subscriber.queue(
+def put(one: ClientQueue, *frames: Frame, now: int = 0) -> int:
+    return one.put(
         {(each.topic, each.type_name): each for each in frames if each.is_schema},
         {each.topic: each for each in frames if not each.is_schema},
         len(frames),
@@ -59,7 +59,7 @@ def queue(subscriber: Subscriber, *frames: Frame, now: int = 0) -> int:
 
 def test_who_keeps_up_gets_frames_at_once() -> None:
     client = Client(HIGH_WATER - 1)
-    one = subscriber(client)
+    one = new_queue(client)
     assert one.keeps_up
     one.write([data("/a", b"1"), data("/a", b"2")])
     assert [frame.data for frame in client.got] == [b"1", b"2"]
@@ -70,10 +70,10 @@ def test_who_keeps_up_gets_frames_at_once() -> None:
 
 def test_who_was_behind_gets_schemas_and_the_newest_of_each_topic() -> None:
     client = Client(HIGH_WATER)
-    one = subscriber(client)
-    assert queue(one, schema("T"), data("/a", b"0"), data("/b", b"0"), now=2 * MS) == 0
-    assert queue(one, *(data(topic, str(number).encode()) for number in range(9) for topic in ("/a", "/b"))) == 18
-    assert queue(one, schema("U")) == 0
+    one = new_queue(client)
+    assert put(one, schema("T"), data("/a", b"0"), data("/b", b"0"), now=2 * MS) == 0
+    assert put(one, *(data(topic, str(number).encode()) for number in range(9) for topic in ("/a", "/b"))) == 18
+    assert put(one, schema("U")) == 0
     assert (one.waiting, one.lag(7 * MS)) == (4, 5 * MS)
     client.level = 0
     assert not one.keeps_up  # what waits goes first
@@ -85,9 +85,9 @@ def test_who_was_behind_gets_schemas_and_the_newest_of_each_topic() -> None:
 
 def test_topics_have_their_turn_however_often_others_come() -> None:
     client = Client(HIGH_WATER)
-    one = subscriber(client)
+    one = new_queue(client)
     for number in range(4):
-        queue(one, *(data(topic, bytes([number]) * (HIGH_WATER - 1)) for topic in ("/a", "/b", "/c")))
+        put(one, *(data(topic, bytes([number]) * (HIGH_WATER - 1)) for topic in ("/a", "/b", "/c")))
         client.takes, client.level = 1, 0
         one.drained()
     assert [frame.topic for frame in client.got] == ["/a", "/b", "/c", "/a"]
@@ -96,9 +96,9 @@ def test_topics_have_their_turn_however_often_others_come() -> None:
 
 def test_a_schema_comes_before_data_of_its_type_also_where_it_was_repeated_after_it() -> None:
     client = Client(HIGH_WATER)
-    one = subscriber(client)
+    one = new_queue(client)
     for frame in (schema("T"), data("/a", b"1"), schema("T")):
-        queue(one, frame)
+        put(one, frame)
     client.level = 0
     one.drained()
     assert client.got == [schema("T"), data("/a", b"1")]
@@ -106,8 +106,8 @@ def test_a_schema_comes_before_data_of_its_type_also_where_it_was_repeated_after
 
 def test_a_frame_that_is_larger_than_the_buffer_is_written_alone() -> None:
     client = Client(HIGH_WATER)
-    one = subscriber(client)
-    queue(one, data("/a", bytes(HIGH_WATER * 2)), data("/b", b"1"))
+    one = new_queue(client)
+    put(one, data("/a", bytes(HIGH_WATER * 2)), data("/b", b"1"))
     client.takes, client.level = 1, 0
     one.drained()
     assert [frame.topic for frame in client.got] == ["/a"]
@@ -116,12 +116,12 @@ def test_a_frame_that_is_larger_than_the_buffer_is_written_alone() -> None:
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 3)), max_size=40))
 def test_in_the_end_everybody_has_the_latest_and_every_frame_is_accounted_for(steps: list[tuple[str, int]]) -> None:
     client = Client(HIGH_WATER)
-    one = subscriber(client)
+    one = new_queue(client)
     superseded, latest = 0, dict[str, bytes]()
     for number, (topic, takes) in enumerate(steps):
         frame = data(f"/{topic}", str(number).encode())
         latest[frame.topic] = frame.data
-        superseded += queue(one, frame)
+        superseded += put(one, frame)
         if takes:
             client.takes, client.level = takes, 0
             one.drained()

@@ -9,10 +9,10 @@ from router.engine import Report
 from router.table.model import ROS, Gateway
 
 
-class Ledger:
-    """For the thread that owns `counts`. Every ROS message that came is sent, filtered or dropped, once.
+class GatewayCounters:
+    """Each ROS message that came is counted as sent, filtered or dropped, once.
 
-    `wall_ns` is the wall clock.
+    For the thread that owns `counts`. `wall_ns` is the wall clock.
     """
 
     def __init__(
@@ -23,7 +23,7 @@ class Ledger:
         report: Callable[[Report], None],
         wall_ns: Callable[[], int],
     ) -> None:
-        name, way = settings.name, settings.transport.value.value
+        name, transport = settings.name, settings.transport.value.value
         self._name = name
         self._counts = counts
         self._report = report
@@ -35,8 +35,8 @@ class Ledger:
         self._dropped = {
             reason: counters.index("messages_dropped", name, CLIENTS, reason) for reason in GATEWAY_DROP_REASONS
         }
-        self._written = counters.index("datagrams_sent", name, way)
-        self._written_bytes = counters.index("sent_bytes", name, way)
+        self._written = counters.index("datagrams_sent", name, transport)
+        self._written_bytes = counters.index("sent_bytes", name, transport)
         self._arrived = counters.index("datagrams_received", name)
         self._arrived_bytes = counters.index("received_bytes", name)
         self._clients = counters.index("gateway_clients", name)
@@ -44,26 +44,26 @@ class Ledger:
         self._contended = counters.index("gateway_key_conflicts", name) if settings.zenoh else None
         self._lost = {reason: counters.index("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
 
-    def received(self, times: int) -> None:
+    def received(self, messages: int) -> None:
         """Messages came from ROS."""
-        if times:
-            self._counts[self._received] += times
+        if messages:
+            self._counts[self._received] += messages
             self._counts[self._last] = self._wall_ns()
 
     def sent(self) -> None:
         """One of them was handed to all clients."""
         self._counts[self._sent] += 1
 
-    def filtered(self, times: int) -> None:
-        """Some were not wanted: a newer one took their place, or there was no client."""
-        self._counts[self._filtered] += times
+    def filtered(self, messages: int) -> None:
+        """Messages were replaced by newer ones before their period was up, or there was no client."""
+        self._counts[self._filtered] += messages
 
     def dropped(
-        self, reason: str, topic: str, error: Exception | None = None, detail: str = "", times: int = 1
+        self, reason: str, topic: str, error: Exception | None = None, detail: str = "", messages: int = 1
     ) -> None:
-        """No client got it, for one of GATEWAY_DROP_REASONS."""
-        if times:
-            self._counts[self._dropped[reason]] += times
+        """No client got them, for one of GATEWAY_DROP_REASONS."""
+        if messages:
+            self._counts[self._dropped[reason]] += messages
             self._report(Report("drop", self._name, topic, reason, error, detail))
 
     def written(self, frames: int, size: int) -> None:
@@ -76,18 +76,20 @@ class Ledger:
         self._counts[self._arrived] += 1
         self._counts[self._arrived_bytes] += size
 
-    def superseded(self, times: int) -> None:
-        self._counts[self._lost["superseded"]] += times
+    def superseded(self, frames: int) -> None:
+        """Newer frames replaced those that waited for a slow client."""
+        self._counts[self._lost["superseded"]] += frames
 
-    def left(self, times: int) -> None:
-        self._counts[self._lost["left"]] += times
+    def left(self, frames: int) -> None:
+        """A client left while these waited for it."""
+        self._counts[self._lost["left"]] += frames
 
-    def send_error(self, error: Exception, times: int) -> None:
-        self._counts[self._lost["send_error"]] += times
+    def send_error(self, error: Exception, frames: int) -> None:
+        self._counts[self._lost["send_error"]] += frames
         self._report(Report("drop", self._name, CLIENTS, "send_error", error))
 
     def contended(self) -> None:
-        """Another gateway has the same key. Only Zenoh has keys."""
+        """Another gateway has the same Zenoh key."""
         if self._contended is not None:
             self._counts[self._contended] += 1
 

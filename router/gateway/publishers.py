@@ -1,0 +1,46 @@
+"""Selection of a topic's publishers: which type a gateway serves, and with which QoS it subscribes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:  # which imports rclpy
+    from router.ros.topics import SeenPublisher
+
+
+class Selection(NamedTuple):
+    """How a topic is subscribed to. `keeps` requests what publishers keep for late joiners.
+
+    `others` are the types that are not served, most publishers first. `is_ours`: only this router publishes on it.
+    """
+
+    type_name: str
+    is_reliable: bool
+    keeps: bool
+    others: tuple[str, ...]
+    is_ours: bool = False
+
+
+def select(publishers: Sequence[SeenPublisher], *, is_inbound: bool) -> Selection | None:
+    """Return the type that most publishers have (of several the first by name), and a QoS compatible with all of them.
+
+    On an inbound topic this router's publishers do not count: clients would get back what they sent. None where no
+    publisher is left.
+    """
+    counted = [publisher for publisher in publishers if not (is_inbound and publisher.is_ours)]
+    if not counted:
+        return None
+    type_name, *others = by_frequency(publisher.type_name for publisher in counted)
+    selected = [publisher for publisher in counted if publisher.type_name == type_name]
+    is_reliable = all(publisher.is_reliable for publisher in selected)
+    keeps = is_reliable and all(publisher.keeps for publisher in selected)
+    is_ours = all(publisher.is_ours for publisher in counted)
+    return Selection(type_name, is_reliable, keeps, tuple(others), is_ours)
+
+
+def by_frequency(type_names: Iterable[str]) -> dict[str, int]:
+    """Count equal names, the most frequent first."""
+    times = Counter(type_names)
+    return {name: times[name] for name in sorted(times, key=lambda name: (-times[name], name))}

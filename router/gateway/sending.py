@@ -1,0 +1,234 @@
+"""What becomes of the messages of a gateway's topics: frames, the schema first, and each message counted once."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from router.gateway.context import GatewayContext, Tasks
+from router.gateway.counters import GatewayCounters
+from router.gateway.encoding import LARGE, Encoding
+from router.gateway.publishers import Selection
+from router.gateway.samples import Sample
+from router.gateway.style import UnreadableError
+from router.gateway.subscriptions import TopicSubscription
+from router.gateway.transport.base import Frame
+from router.table.model import EACH, Gateway, Transport
+
+MOST_UNCONVERTED = 4
+"""Large messages of one topic that wait to be converted, where every message is sent."""
+
+
+@dataclass(slots=True)
+class ServedTopic:
+    """State of a topic that a gateway serves. `period` in ns, EACH for every message; `number` selects its turn in it.
+
+    `counted` is the part of `subscription.arrived` that is in the counters (of `subscription.missed` where every
+    message is sent), `reported` the part that clients were told as a rate. `sample` is the latest one that was looked
+    at, `readable` the latest that could be converted. `is_busy` while a large one is converted; `unconverted` wait.
+    """
+
+    subscription: TopicSubscription
+    selection: Selection
+    period: int
+    number: int
+    counted: int = 0
+    reported: int = 0
+    sample: Sample | None = None
+    readable: Sample | None = None
+    is_busy: bool = False
+    has_ended: bool = False
+    unconverted: deque[Sample] = field(default_factory=deque)
+
+    @classmethod
+    def begin(cls, subscription: TopicSubscription, selection: Selection, period: int, number: int) -> ServedTopic:
+        """Serve a topic from now on.
+
+        A latest value that is there already, because another gateway subscribes to the topic, counts as one that
+        arrives: publishers that keep it for late joiners do not send it again.
+        """
+        known = subscription.latest() is not None
+        arrived = subscription.arrived
+        counted = subscription.missed if period == EACH else arrived - known
+        return cls(subscription, selection, period, number, counted=counted, reported=arrived)
+
+    def uncounted(self) -> int:
+        """Return, and mark as counted, the messages since the last call; with EACH, those that were missed."""
+        total = self.subscription.missed if self.period == EACH else self.subscription.arrived
+        new, self.counted = total - self.counted, total
+        return new
+
+
+class TopicSender:
+    """Makes frames of messages. `has_clients` tells whether anybody gets what goes to `deliver`."""
+
+    def __init__(
+        self,
+        settings: Gateway,
+        context: GatewayContext,
+        encoding: Encoding,
+        counters: GatewayCounters,
+        tasks: Tasks,
+        has_clients: Callable[[], bool],
+        deliver: Callable[[Sequence[Frame]], None],
+    ) -> None:
+        self._context = context
+        self._encoding = encoding
+        self._counters = counters
+        self._tasks = tasks
+        self.has_clients = has_clients
+        self._deliver = deliver
+        self._introduced: set[Hashable] = set()
+        self._pending: list[Frame] = []
+        # Datagrams get lost, and the existing gateway's clients expect values to be repeated.
+        self._repeats = settings.transport.value is Transport.UDP
+        self._most = min(settings.max_message, encoding.most)
+        self._remedy = "see `max_message`" if self._most < encoding.most else "use compression or gateway_v2"
+
+    def poll(self, served: ServedTopic, frames: list[Frame]) -> None:
+        """Append the topic's latest value to `frames`, if it is to be sent now."""
+        if served.is_busy or served.has_ended:
+            return
+        new = served.uncounted()
+        self._counters.received(new)
+        if not self.has_clients():  # the middleware keeps the newest message for the next client
+            self._counters.filtered(new)
+            return
+        sample = served.subscription.latest() if new or served.sample is None else served.sample
+        is_new = new > 0 and sample is not None and sample is not served.sample
+        self._counters.filtered(new - is_new)
+        served.sample = sample
+        if sample is not None and is_new:
+            self._offer(served, sample, frames, is_new=True)
+        elif served.readable is not None and self._repeats:
+            self._offer(served, served.readable, frames, is_new=False)
+
+    def send(self, served: ServedTopic, sample: Sample) -> None:
+        """Send a message of a topic of which every one is sent."""
+        served.sample = sample
+        self._counters.received(1)
+        if not self.has_clients():
+            self._counters.filtered(1)
+        elif not served.is_busy:
+            self._offer(served, sample, self._queue(), is_new=True)
+        elif len(served.unconverted) < MOST_UNCONVERTED:
+            served.unconverted.append(sample)
+        else:
+            self._counters.dropped("overloaded", sample.topic)
+
+    def count_missed(self, served: ServedTopic) -> None:
+        """Count what arrived and gave way to newer messages before it was looked at."""
+        new = served.uncounted()
+        self._counters.received(new)
+        if served.period == EACH:
+            self._counters.dropped("overloaded", served.subscription.topic, messages=new)
+        else:
+            self._counters.filtered(new)
+
+    def end(self, served: ServedTopic) -> None:
+        """Send nothing more of the topic; should it come back, its schema comes first."""
+        self.count_missed(served)
+        served.has_ended = True
+        self._introduced.discard(self._encoding.introduces(served.subscription.topic, served.subscription.type_name))
+
+    def _queue(self) -> list[Frame]:
+        """Return the frames that go out together at the end of this turn of the loop."""
+        if not self._pending:
+            asyncio.get_running_loop().call_soon(self._flush)
+        return self._pending
+
+    def _flush(self) -> None:
+        frames, self._pending = self._pending, []
+        self._deliver(frames)
+
+    def _offer(self, served: ServedTopic, sample: Sample, frames: list[Frame], *, is_new: bool) -> None:
+        if self._is_quick(sample):
+            self._encode(served, sample, frames, is_new=is_new)
+        else:
+            served.is_busy = True
+            self._tasks.run(self._convert(served, sample, is_new=is_new))
+
+    def _is_quick(self, sample: Sample) -> bool:
+        return len(sample.cdr) <= LARGE or sample.has_payload(self._encoding.style, self._encoding.level)
+
+    async def _convert(self, served: ServedTopic, sample: Sample, *, is_new: bool) -> None:
+        """Convert a large message in another thread: the topic's next value waits for it, other topics do not."""
+        try:
+            await asyncio.get_running_loop().run_in_executor(
+                self._context.converting, sample.payload, self._encoding.style, self._encoding.level
+            )
+        except UnreadableError:
+            pass  # raised, and counted, again by `_encode`
+        finally:
+            served.is_busy = False
+        if served.has_ended:
+            self._counters.filtered(is_new + len(served.unconverted))
+            return
+        self._encode(served, sample, self._queue(), is_new=is_new)
+        while served.unconverted and not served.is_busy:
+            self._offer(served, served.unconverted.popleft(), self._queue(), is_new=True)
+
+    def _encode(self, served: ServedTopic, sample: Sample, frames: list[Frame], *, is_new: bool) -> None:
+        """Append the value, and before the first of its kind the schema."""
+        try:
+            data = self._frame(sample)
+        except UnreadableError as error:
+            if is_new:
+                self._counters.dropped("mapping_error", sample.topic, error)
+            return
+        served.readable = sample
+        if len(data.data) > self._most:
+            if is_new:
+                detail = f"{len(data.data)} bytes, and at most {self._most} can be sent; {self._remedy}"
+                self._counters.dropped("too_large", sample.topic, detail=detail)
+            return
+        if is_new:
+            self._counters.sent()
+        key = self._encoding.introduces(sample.topic, sample.type_name)
+        if key not in self._introduced:
+            self._introduced.add(key)
+            frames.append(self.schema(served))
+        frames.append(data)
+
+    def _frame(self, sample: Sample) -> Frame:
+        """Raises UnreadableError."""
+        data = self._encoding.data(sample, self._context.wall_s())
+        return Frame(data, sample.topic, sample.type_name, is_schema=False)
+
+    # -- answers to one client -----------------------------------------------------------------------------------
+
+    def schema(self, served: ServedTopic) -> Frame:
+        subscription = served.subscription
+        data = self._encoding.schema(
+            subscription.topic, subscription.type_name, subscription.schema, self._context.wall_s()
+        )
+        return Frame(data, subscription.topic, subscription.type_name, is_schema=True)
+
+    def show(self, served: ServedTopic, frames: list[Frame]) -> None:
+        """Append schema and latest value. `served` stays as it is: other clients are still to get the value.
+
+        A large value that is not converted yet goes to everybody a little later.
+        """
+        sample = served.subscription.latest()
+        if sample is None:
+            return
+        if not self._is_quick(sample):
+            frames.append(self.schema(served))
+            if not served.is_busy:
+                self._offer(served, sample, frames, is_new=False)
+            return
+        try:
+            data = self._frame(sample)
+        except UnreadableError:  # counted where it is new
+            if served.readable is None:
+                return
+            data = self._frame(served.readable)
+        frames.append(self.schema(served))
+        if len(data.data) <= self._most:
+            frames.append(data)
+
+    def introduced(self, frames: Iterable[Frame]) -> None:
+        """Record that all clients got the schemas among `frames`."""
+        self._introduced |= {self._encoding.introduces(frame.topic, frame.type_name) for frame in frames}

@@ -1,0 +1,280 @@
+"""Subscriptions to ROS topics, shared by all gateways of a router.
+
+A topic has at most two: one for gateways that send every message, one for those that send the latest value. All of it
+runs in the thread of the event loop, unless stated otherwise.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+from router.compiler.lookup import layout
+from router.errors import StartError, TableError
+from router.gateway.publishers import Selection, select
+from router.gateway.samples import ReadyType, Sample
+from router.types.model import MessageType
+from router.types.ros import RosInterfaces
+
+if TYPE_CHECKING:  # which imports rclpy
+    from router.ros.topics import RosTopics, TopicTap
+
+DEPTH = 100
+"""Messages that wait on a topic of which every one is wanted; the oldest are dropped first."""
+
+READ_PER_TURN = 32
+"""Messages of one topic that are handled before other work of the loop has its turn."""
+
+
+class TopicSubscription:
+    """What arrives on one topic as one type: every message, or the latest value, for all gateways that want it so.
+
+    The two ways do not share a subscription: to subscribe anew with another depth would have publishers deliver again
+    what they keep for late joiners. Where the latest value is enough, the middleware keeps one message, and a message
+    that nobody asks for costs no Python.
+    """
+
+    def __init__(
+        self, topic: str, ready: ReadyType, topics: RosTopics, loop: asyncio.AbstractEventLoop, *, is_each: bool
+    ) -> None:
+        self.topic = topic
+        self.type_name = ready.message.name
+        self.message = ready.message
+        self.schema = ready.schema
+        self._type = ready
+        self._topics = topics
+        self._loop = loop
+        self._users = 0
+        self._callbacks: tuple[OnSample, ...] = ()
+        self._tap: TopicTap | None = None
+        self._is_reliable = self._keeps = False
+        self._depth = DEPTH if is_each else 1
+        self._arrived = self._taken = self._missed = 0
+        self._is_synchronised = False  # `_taken` counts from when it was equal to `_arrived`
+        self._waits = False  # something arrived that was not taken
+        self._turn: asyncio.Handle | None = None
+        self._last: Sample | None = None
+
+    @property
+    def arrived(self) -> int:
+        """Messages that arrived since this was made, taken or not."""
+        if not self._callbacks:
+            self._count()
+        return self._arrived
+
+    @property
+    def missed(self) -> int:
+        """Messages for callbacks that newer ones replaced in the middleware's queue."""
+        return self._missed
+
+    @property
+    def is_open(self) -> bool:
+        """False once the topic is subscribed to as another type, or nobody uses this: then join again, or leave."""
+        return self._tap is not None
+
+    @property
+    def is_used(self) -> bool:
+        return self._users > 0
+
+    def latest(self) -> Sample | None:
+        """Return the newest message that was taken. Takes what waits, unless callbacks get it anyway."""
+        if not self._callbacks:
+            self._count()
+            if self._waits:
+                self._waits = False
+                self._take(self._depth)
+        return self._last
+
+    def add(self, wanted: Selection, callback: OnSample | None) -> None:
+        """Add a user, with a `callback` where every message is wanted. Subscribe, anew if that was with another QoS.
+
+        What had arrived by then goes to the earlier users. Raises StartError.
+        """
+        if (wanted.is_reliable, wanted.keeps) != (self._is_reliable, self._keeps):
+            self._take(self._depth)
+            self.close()
+        if self._tap is None:
+            self._tap = self._topics.tap(
+                self.topic,
+                self._type.message_class,
+                is_reliable=wanted.is_reliable,
+                keeps=wanted.keeps,
+                depth=self._depth,
+            )
+            self._is_reliable, self._keeps = wanted.is_reliable, wanted.keeps
+        self._users += 1
+        if callback:
+            self._callbacks += (callback,)
+        self._watch(self._tap)
+
+    def remove(self, callback: OnSample | None) -> None:
+        self._users -= 1
+        if callback:
+            position = self._callbacks.index(callback)
+            self._callbacks = self._callbacks[:position] + self._callbacks[position + 1 :]
+        if self._tap:
+            self._watch(self._tap)
+
+    def close(self) -> None:
+        """Unsubscribe; `latest` and `arrived` keep their values."""
+        if self._tap is None:
+            return
+        self._count()
+        if self._turn:
+            self._turn.cancel()
+            self._turn = None
+        self._loop.remove_reader(self._tap.fd)
+        self._tap.close()
+        self._tap = None
+
+    def _watch(self, tap: TopicTap) -> None:
+        """Have the loop handle messages when they arrive, if there are callbacks."""
+        if not self._callbacks:
+            self._loop.remove_reader(tap.fd)
+            return
+        self._loop.add_reader(tap.fd, self._on_arrival)
+        if self._turn is None:
+            self._turn = self._loop.call_soon(self._on_turn)  # for what was counted while there was no callback
+
+    def _on_arrival(self) -> None:
+        self._count()
+        if self._turn is None:
+            self._serve()
+
+    def _on_turn(self) -> None:
+        self._turn = None
+        self._count()
+        self._serve()
+
+    def _serve(self) -> None:
+        """Take messages; of those counted by now, what is not there to take was lost."""
+        if self._take(READ_PER_TURN) == READ_PER_TURN:
+            self._turn = self._loop.call_soon(self._on_turn)
+        elif self._is_synchronised:
+            self._missed = max(self._missed, self._arrived - self._taken)
+        else:
+            self._is_synchronised, self._taken = True, self._arrived - self._missed
+
+    def _count(self) -> None:
+        if self._tap and (arrived := self._tap.arrived()):
+            self._arrived += arrived
+            self._waits = True
+
+    def _take(self, most: int) -> int:
+        """Take messages, call back for each, and remember the last one. Return how many were taken.
+
+        One that equals the last is skipped: its publisher keeps it, and delivered it again to a new subscription.
+        """
+        taken = 0
+        while taken < most and self._tap and (message := self._tap.take()):
+            taken += 1
+            self._taken += 1
+            cdr, sent_ns = message
+            if self._last and (sent_ns, cdr) == (self._last.sent_ns, self._last.cdr):
+                continue
+            self._last = Sample(self.topic, self._type, cdr, sent_ns)
+            for callback in self._callbacks:
+                self._call(callback, self._last)
+        return taken
+
+    def _call(self, callback: OnSample, sample: Sample) -> None:
+        try:
+            callback(self, sample)
+        except Exception as error:  # noqa: BLE001 reported; the next message and the next gateway matter as much
+            self._loop.call_exception_handler({"message": f"a message of {self.topic} was lost", "exception": error})
+
+
+OnSample = Callable[[TopicSubscription, Sample], None]
+
+
+class Subscriptions:
+    """The topics that can be subscribed to, and the subscriptions in use."""
+
+    def __init__(self, ros: RosTopics, interfaces: RosInterfaces, loop: asyncio.AbstractEventLoop) -> None:
+        self._topics = ros
+        self._interfaces = interfaces
+        self._loop = loop
+        self._open: dict[tuple[str, bool], TopicSubscription] = {}  # by topic, and whether every message is wanted
+        self._types: dict[str, ReadyType | str] = {}  # or why a type cannot be received
+        self._loader = ThreadPoolExecutor(1, thread_name_prefix="gateway types")
+
+    def resolved(self, names: Iterable[str]) -> frozenset[str]:
+        """Return the absolute names that ROS makes of these."""
+        return frozenset(map(self._topics.resolved, names))
+
+    async def discover(self, inbound: Collection[str], is_wanted: Callable[[str], bool]) -> dict[str, Selection]:
+        """Return the wanted topics that somebody publishes on; on `inbound` ones this router does not count.
+
+        Types are loaded here, so that `join` does not take long. Other work has its turn between topics.
+        """
+        found: dict[str, Selection] = {}
+        for topic in self._topics.names():
+            await asyncio.sleep(0)
+            if not is_wanted(topic):
+                continue
+            if selection := select(self._topics.publishers(topic), is_inbound=topic in inbound):
+                found[topic] = selection
+                if selection.type_name not in self._types:
+                    ready = await self._loop.run_in_executor(self._loader, self._load, selection.type_name)
+                    self._types[selection.type_name] = ready
+        return found
+
+    def join(self, topic: str, wanted: Selection, callback: OnSample | None) -> TopicSubscription:
+        """Use a subscription: `callback` is called for every message; without it, ask for `latest`.
+
+        To change the selection, join again and leave the old subscription, which may be the same, afterwards. A
+        subscription of another type is closed, whoever uses it. Raises StartError, and then nobody uses it.
+        """
+        ready = self._ready(wanted.type_name)
+        for key in ((topic, False), (topic, True)):
+            if (other := self._open.get(key)) and other.type_name != wanted.type_name:
+                other.close()  # first: DDS has one type for a topic in a process
+                del self._open[key]
+        key = topic, callback is not None
+        if (subscription := self._open.get(key)) is None:
+            subscription = TopicSubscription(topic, ready, self._topics, self._loop, is_each=callback is not None)
+            self._open[key] = subscription
+        try:
+            subscription.add(wanted, callback)
+        except StartError:
+            del self._open[key]
+            raise
+        return subscription
+
+    def leave(self, subscription: TopicSubscription, callback: OnSample | None) -> None:
+        """Undo `join`, with the same `callback`."""
+        subscription.remove(callback)
+        if not subscription.is_used:
+            subscription.close()
+            if self._open.get(key := (subscription.topic, callback is not None)) is subscription:
+                del self._open[key]
+
+    def close(self) -> None:
+        for subscription in self._open.values():
+            subscription.close()
+        self._open.clear()
+        self._loader.shutdown()
+
+    def _ready(self, type_name: str) -> ReadyType:
+        if (ready := self._types.get(type_name)) is None:
+            ready = self._types[type_name] = self._load(type_name)
+        if isinstance(ready, str):
+            raise StartError(ready)
+        return ready
+
+    def _load(self, type_name: str) -> ReadyType | str:
+        """Load a type, or return why it cannot be received. Runs in a thread of its own, mostly."""
+        try:
+            message = self._declared(type_name) or self._topics.installed_type(type_name)
+            return ReadyType(message, self._topics.load(type_name, layout(message)))
+        except StartError as error:
+            return str(error)
+
+    def _declared(self, type_name: str) -> MessageType | None:
+        """Return the type as a `.msg` file declares it; None where that cannot be read: the class may describe it."""
+        try:
+            return self._interfaces.get(type_name)
+        except TableError:
+            return None
