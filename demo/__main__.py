@@ -23,7 +23,8 @@ from demo.processes import TABLE, Demo, DemoError
 from demo.verdict import Finding
 from router.errors import RouterError
 from router.table import read_table
-from router.table.model import Address, RouteTable
+from router.table.addresses import Address
+from router.table.model import RouteTable
 
 ROOT = Path(__file__).parent.parent
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

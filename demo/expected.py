@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from router.compiler.topics import resolved
-from router.table.model import Address, EndpointKind, GatewayFormat, Route, RouteTable, Transport
+from router.table.addresses import Address
+from router.table.model import EndpointKind, GatewayFormat, Route, RouteTable, Transport
 
 LOST, FOUND = 5.0, 8.0
 """Seconds after the simulator's start at which the link to all basestations is lost and found again."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from router.table.model import Address
+from router.table.addresses import Address
 
 PATIENCE = 5.0
 """Seconds in which the latest values must be there; they are sent at once."""

@@ -6,7 +6,8 @@ import random
 import socket
 
 from router.errors import UsageError
-from router.table.model import Address, RouteTable, Transport
+from router.table.addresses import Address
+from router.table.model import RouteTable, Transport
 from router.tools.places import open_udp
 
 DOMAINS = range(1, 102)

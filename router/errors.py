@@ -1,7 +1,4 @@
-"""What can be wrong, and where: source spans, diagnostics with a closed list of codes, the exceptions.
-
-This module is the bottom of the house: it imports nothing of ours and knows no table, type or socket.
-"""
+"""What can be wrong, and where: source spans, diagnostics with a closed list of codes, the exceptions."""
 
 from __future__ import annotations
 
@@ -10,6 +7,9 @@ import enum
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -31,6 +31,14 @@ class SourceSpan:
     def part(self, start: int, end: int) -> SourceSpan:
         """The characters `start` to `end` (from 0, `end` exclusive) of this span."""
         return SourceSpan(self.file, self.line, self.column + start, self.column + max(end, start + 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Located(Generic[T]):
+    """A value and the place that it was read from."""
+
+    value: T
+    span: SourceSpan
 
 
 class Severity(enum.Enum):
@@ -163,7 +171,7 @@ class UsageError(RouterError):
 
 
 class StartError(RouterError):
-    """An edge could not be opened; the message says which and what to do."""
+    """A socket or the ROS node could not be opened; the message says which and what to do."""
 
 
 class DecodeError(RouterError):

@@ -25,7 +25,7 @@ from router.gateway.json_reading import cdr_builder
 from router.gateway.packets import Packet, pack, unpack
 from router.gateway.schema_text import schema_text
 from router.gateway.style import Style
-from router.table.shape import table_schema
+from router.table.schema import table_schema
 from router.types.ros import ros_interfaces
 from tests.gateway.fake_gateway import FakeGateway
 from tests.ports import free_port

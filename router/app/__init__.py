@@ -30,7 +30,7 @@ from router.observe.metrics import Asked, CountersCollector
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult
 from router.recording.mirror import Mirror
-from router.table.model import Address
+from router.table.addresses import Address
 from router.threads import background_threads
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 
 from router.compiler.program import Program
 from router.errors import Code, Diagnostic, SourceSpan
+from router.table.keys import are_same
 from router.table.model import NodeSettings, RouteTable
-from router.table.sameness import are_same
 
 _MOST_NAMED = 12
 

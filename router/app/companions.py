@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from router.log import logger
 from router.observe.metrics import Asked
 from router.observe.running import Running
-from router.table.model import Address
+from router.table.addresses import Address
 from router.threads import DaemonThread
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from router.app.accounts import KernelDrops
 from router.compiler.program import Program
 from router.net.kernel import interface_is_up
 from router.net.udp import Listener, Sender
-from router.table.model import Address
+from router.table.addresses import Address
 
 
 @dataclass(slots=True)

@@ -17,9 +17,9 @@ from router.assets import asset, is_installed
 from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import plural, print_findings
 from router.cli.tool_options import explained
-from router.errors import SourceSpan, TableError, UsageError, did_you_mean, shown_path
+from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, shown_path
 from router.table import load_table
-from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, Located
+from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings
 from router.types.lock_file import short_name
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from router.cli import VERBS
 from router.cli.tool_options import add_wire_options, explained, load_wire, positive, whole
 
 if TYPE_CHECKING:
-    from router.table.model import Address, RouteTable
+    from router.table.addresses import Address
+    from router.table.model import RouteTable
     from router.tools.sending import Sent
 
 EPILOG = """\

@@ -16,7 +16,7 @@ from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
 from router.errors import Code, Diagnostic, MappingError, SourceSpan
-from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, Keep, Route, Topic
+from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, Keep, Route
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -70,7 +70,7 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
             lookup.report(deadman.span, Code.UNKNOWN_KEY, message, "a deadman belongs to a route with destinations")
         return
     rates = [destination.max_rate for destination in feeding(route, deadman)]
-    limited = [rate.value for rate in rates if rate is not None]
+    limited = [rate for rate in rates if rate is not None]
     lookup.findings += timing_findings(deadman, max(limited) if len(limited) == len(rates) else None, "datagrams")
     _want_no_late_commands(lookup, route, deadman)
 
@@ -91,8 +91,8 @@ def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> No
         return
     for destination in route.destinations:
         endpoint = lookup.table.endpoints.get(destination.endpoint.value)
-        waits_for = "`keep: latest`" if keep(destination) is Keep.LATEST else "the endpoint's budget"
-        if keep(destination) is Keep.LATEST or (endpoint is not None and endpoint.budget is not None):
+        waits_for = "`keep: latest`" if destination.keep is Keep.LATEST else "the endpoint's budget"
+        if destination.keep is Keep.LATEST or (endpoint is not None and endpoint.budget is not None):
             message = f"a command that waited for {waits_for} could undo the deadman when it is older than its timeout"
             span = route.ttl.span if route.ttl else destination.endpoint.span
             lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
@@ -160,7 +160,3 @@ def takes_over(route: Route, endpoint: str, other: Route) -> bool:
         and route.case.value in [case.value for case in deadman.hands_over_to]
         and endpoint in [to.value for to in deadman.to]
     )
-
-
-def keep(limited: Destination | Topic) -> Keep:
-    return limited.keep.value if limited.keep else Keep.FIRST

@@ -76,8 +76,7 @@ def _checked(lookup: Lookup, inbound: Inbound, name: str) -> CheckedInbound | No
     ros_type = lookup.ros_type(inbound.topic)
     deadman = inbound.deadman
     if deadman is not None:
-        max_rate = inbound.max_rate.value if inbound.max_rate else None
-        lookup.findings += timing_findings(deadman, max_rate, "messages")
+        lookup.findings += timing_findings(deadman, inbound.topic.max_rate, "messages")
     if ros_type is None:
         return None
     return CheckedInbound(inbound, name, ros_type, _stop(lookup, deadman, ros_type) if deadman else None)

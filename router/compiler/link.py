@@ -85,12 +85,12 @@ def link(
                 one.framing,
                 one.receive_buffer,
                 one.coalesce,
-                one.interface.value if one.interface else None,
+                one.interface,
             )
             for one in table.listeners.values()
         ),
         senders=tuple(
-            SenderPlan(one.name, one.address.value, one.budget.value if one.budget else None)
+            SenderPlan(one.name, one.address.value, one.budget)
             for one in table.endpoints.values()
             if one.name in destinations
         ),
@@ -247,7 +247,7 @@ def _inbound(entry: CheckedInbound, gateway: str, counters: Counters) -> Inbound
         topic=inbound.topic.topic.value,
         type=entry.type,
         ttl=inbound.ttl.value if inbound.ttl else None,
-        max_rate=inbound.max_rate.value if inbound.max_rate else None,
+        max_rate=inbound.topic.max_rate,
         deadman=deadman,
     )
 

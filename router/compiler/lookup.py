@@ -11,8 +11,8 @@ from pathlib import Path
 from router.compiler.expressions import ExpressionError, Reads, Scope, Typed, check
 from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.network import loop_finding
-from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean, nearest
-from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, Expression, Located, RouteTable, Topic
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest
+from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, Expression, RouteTable, Topic
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
 from router.types.proto_folder import read_folder

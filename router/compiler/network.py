@@ -7,8 +7,9 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from itertools import combinations
 
-from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
-from router.table.model import ANY, Address, Endpoint, Gateway, Located, RouteTable, Transport
+from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
+from router.table.addresses import Address
+from router.table.model import ANY, Endpoint, Gateway, RouteTable, Transport
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
@@ -44,7 +45,7 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 def _held(table: RouteTable) -> Iterator[_Held]:
     for listener in table.listeners.values():
-        interface = listener.interface.value if listener.interface else None
+        interface = listener.interface
         yield _Held(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
     if table.metrics is not None:
         yield _Held("the metrics", table.metrics)

@@ -12,7 +12,8 @@ from itertools import chain
 from types import CodeType
 
 from router.compiler.metrics import Counters
-from router.table.model import Address, Framing, Gateway, Keep, Priority, RouteTable, bound_to
+from router.table.addresses import Address
+from router.table.model import Framing, Gateway, Keep, Priority, RouteTable, bound_to
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 

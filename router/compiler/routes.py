@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from router.compiler.cdr.reading import CdrReads
 from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedRoute, CheckedTarget, Target
-from router.compiler.deadmen import check_deadman, feeding, keep, takes_over
+from router.compiler.deadmen import check_deadman, feeding, takes_over
 from router.compiler.expressions import ParsedReads, Reads, Scope, Typed
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.lookup import Lookup
@@ -15,7 +15,7 @@ from router.compiler.mapping import build
 from router.compiler.plan import Record
 from router.compiler.source import load
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
-from router.errors import Code, Diagnostic, SourceSpan, nearest
+from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.model import (
     ANY,
     ROS,
@@ -24,7 +24,6 @@ from router.table.model import (
     Endpoint,
     EndpointKind,
     Expression,
-    Located,
     Priority,
     Route,
     RouteTable,
@@ -124,9 +123,9 @@ def target_to(
         is_topic=False,
         reads=reads,
         when=when,
-        max_rate=max_rate(destination),
-        keep=keep(destination),
-        priority=route.priority.value if route.priority else Priority.COMMAND if to_board else Priority.TELEMETRY,
+        max_rate=destination.max_rate,
+        keep=destination.keep,
+        priority=route.priority or (Priority.COMMAND if to_board else Priority.TELEMETRY),
         has_budget=endpoint is not None and endpoint.budget is not None,
         trim=endpoint is not None and endpoint.trim_trailing_zeros,
         plan=plan,
@@ -134,17 +133,10 @@ def target_to(
     )
 
 
-def max_rate(limited: Destination | Topic) -> float | None:
-    return limited.max_rate.value if limited.max_rate else None
-
-
 # from UDP
 
 
 def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
-    if route.fields is not None:
-        message = "'fields' of a route belongs to `source: ros`"
-        lookup.report(route.fields.span, Code.UNKNOWN_KEY, message, "a topic has its own 'fields'")
     targets = [_forward(lookup, route, case, to, endpoint) for to, endpoint in destinations(lookup, route, case)]
     names = _frame_names(case, route.collect.span) if route.collect else {}
     for topic in route.topics:
@@ -158,9 +150,6 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
 def _forward(
     lookup: Lookup, route: Route, case: PayloadCase, destination: Destination, endpoint: Endpoint | None
 ) -> CheckedTarget:
-    if destination.fields is not None:
-        hint = "'fields' of a destination belongs to `source: ros`"
-        lookup.report(destination.fields.span, Code.UNKNOWN_KEY, "a datagram is forwarded unchanged", hint)
     reads = ParsedReads()
     when = lookup.when(destination.when, lookup.scope(case.type, reads))
     return CheckedTarget(target_to(lookup, route, destination, endpoint, when, reads))
@@ -174,8 +163,8 @@ def _publish(
     when = lookup.when(topic.when, scope)
     mapping = build(topic.fields, ros_type, scope, topic.topic.span)
     lookup.findings += mapping.findings
-    name, rate = topic.topic.value, max_rate(topic)
-    target = Target(name, topic.span, True, reads, when, rate, keep(topic), plan=mapping.plan)
+    name = topic.topic.value
+    target = Target(name, topic.span, True, reads, when, topic.max_rate, topic.keep, plan=mapping.plan)
     return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
 
 
@@ -226,13 +215,7 @@ def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRo
 
 
 def _subscribed(lookup: Lookup, route: Route, topic: Topic) -> None:
-    """What a topic may say where it is published only, or once."""
-    if topic.fields is not None:
-        message = "with `source: ros` the fields to fill are the payload's"
-        lookup.report(topic.fields.span, Code.UNKNOWN_KEY, message, "move 'fields' up to the route")
-    if topic.max_rate is not None:
-        message = "with `source: ros` it is destinations that take a 'max_rate'"
-        lookup.report(topic.max_rate.span, Code.UNKNOWN_KEY, message, "move it to {endpoint: NAME, max_rate: ...}")
+    """What a topic may say once."""
     name = topic.topic.value
     if next(other for other in route.topics if other.topic.value == name) is not topic:
         lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{name}' is a topic twice", "name it once")

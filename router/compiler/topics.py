@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from router.compiler.program import QosPlan
-from router.errors import Code, Diagnostic, SourceSpan
-from router.table.model import InboundDeadman, Located, NodeSettings, Route, RouteTable, Topic
+from router.errors import Code, Diagnostic, Located, SourceSpan
+from router.table.model import InboundDeadman, NodeSettings, Route, RouteTable, Topic
 
 DEFAULT_DEPTH = 10
 LONGEST_NAME = 247

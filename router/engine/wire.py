@@ -10,8 +10,8 @@ from google.protobuf.message import Message
 
 from router.engine import MAX_DATAGRAM
 from router.engine.slow_path import restored, why_no_payload
-from router.errors import DecodeError, SourceSpan, UsageError, did_you_mean, shown_path
-from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, Located, RouteTable
+from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_mean, shown_path
+from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, RouteTable
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
 
 

@@ -28,9 +28,9 @@ from router.gateway.transport.stream import Limits
 from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.udp import UdpTransport
 from router.gateway.transport.websocket import WebsocketTransport
+from router.table.keys import are_same
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as TransportKind
-from router.table.sameness import are_same
 from router.threads import DaemonThread
 from router.types.ros import ros_interfaces
 

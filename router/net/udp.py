@@ -21,7 +21,8 @@ from router.net.kernel import (
     port_taken,
     receive_buffer,
 )
-from router.table.model import Address, bound_to
+from router.table.addresses import Address
+from router.table.model import bound_to
 
 _NETWORK_CHANGED = (errno.EDESTADDRREQ, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.EINVAL)
 """Errors of sending if there was no network when the socket was connected, there is none now, or this computer has

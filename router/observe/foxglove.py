@@ -17,13 +17,13 @@ from foxglove.websocket import ChannelView, Client, ServerListener, WebSocketSer
 from google.protobuf.descriptor import Descriptor
 
 from router.compiler.program import Program
-from router.errors import StartError
+from router.errors import Located, StartError
 from router.log import logger
 from router.net.kernel import port_holder
 from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored, first_field
 from router.recording.schemas import descriptor_set
-from router.table.model import Address, Located
+from router.table.addresses import Address
 from router.threads import background_threads
 from router.types.protobuf import PayloadCase
 

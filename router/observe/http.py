@@ -43,7 +43,7 @@ from router.observe.responses import Responder, Response, plain
 from router.observe.running import Running
 from router.observe.status import Status
 from router.observe.tap import CONTENT_TYPE, Tap, TapRequestError, wanted
-from router.table.model import Address
+from router.table.addresses import Address
 
 MAX_PER_HOST = 16
 """Connections. The router's own computer counts as one host, whatever its addresses."""

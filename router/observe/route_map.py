@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 from router.compiler.metrics import CLIENTS
 from router.compiler.topics import resolved
+from router.table.keys import phrases
 from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, RouteTable, Topic
-from router.table.quantities import duration
+from router.table.units import duration
 
 COLUMNS = ("from", "payload case", "to")
 _MARGIN = 1
@@ -257,7 +258,7 @@ def map_parts(table: RouteTable) -> tuple[list[Part], list[Tie]]:
 def _case(route: Route) -> Part:
     case = route.case.value
     if route.ignore is not None:
-        return Part(f"case:{case}", 1, PartKind.IGNORED, case, f"ignored: {route.ignore.value}")
+        return Part(f"case:{case}", 1, PartKind.IGNORED, case, f"ignored: {route.ignore}")
     words = []
     if route.ttl is not None:
         words.append(f"dropped when older than {duration(route.ttl.value)}")
@@ -313,9 +314,7 @@ def _ties(route: Route) -> Iterator[Tie]:
 
 
 def _condition(target: Destination | Topic) -> str:
-    words = [f"when {' '.join(target.when.text.split())}"] if target.when is not None else []
-    words += [f"at most {target.max_rate.value:g} Hz"] if target.max_rate is not None else []
-    return ", ".join(words)
+    return ", ".join(" ".join(words.split()) for key, words in phrases(target).items() if key != "keep")
 
 
 def _gateway_parts(gateway: Gateway, table: RouteTable) -> Iterator[Part]:

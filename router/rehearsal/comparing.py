@@ -7,13 +7,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from router.engine.wire import Wire
-from router.errors import DecodeError, SourceSpan
+from router.errors import DecodeError, Located, SourceSpan
 from router.rehearsal.events import Dropped, Event, Filtered, Published, Received, Rejected, Sent
 from router.rehearsal.matching import Difference
 from router.rehearsal.model import Counted, Expected, Item, Message, Payload, Step, Unchanged
 from router.rehearsal.places import Place, Places
 from router.rehearsal.words import Happened, Words
-from router.table.model import Located, RouteTable
+from router.table.model import RouteTable
 from tests.oracles import reference_cdr
 
 _SHOWN = 3

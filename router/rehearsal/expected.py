@@ -6,12 +6,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
-from router.errors import Code, SourceSpan, did_you_mean
+from router.errors import Code, Located, SourceSpan, did_you_mean
 from router.rehearsal.matching import MessageMatch
 from router.rehearsal.model import Content, Counted, Expected, Item, Message, Payload, Unchanged, Whatever
 from router.rehearsal.names import Names, unsound
 from router.rehearsal.values import ANY, FieldReader
-from router.table.model import Located
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.types.model import MessageType
 
@@ -26,7 +25,7 @@ class ExpectedReader:
         self._given = FieldReader(names.enums, given=True)
 
     def expected(self, span: SourceSpan, node: Node, given: Node | None) -> Expected:
-        """`given` is what the step is given, which 'unchanged' refers to. Raises UnsoundError."""
+        """`given` is what the step is given, which 'unchanged' refers to. Raises InvalidValueError."""
         if isinstance(node, ScalarNode):
             return Expected(span, anything=node.text == ANY)
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from router.engine.wire import Wire, framed
-from router.errors import Code, SourceSpan, UsageError
+from router.errors import Code, Located, SourceSpan, UsageError
 from router.rehearsal.matching import MessageMatch, Moments
 from router.rehearsal.messages import fill, values
 from router.rehearsal.model import Given, GivenDatagram, GivenMessage, Repetition
 from router.rehearsal.names import Names, unsound
 from router.rehearsal.values import FieldReader
-from router.table.model import Located
 from router.table.nodes import MappingNode, Node
-from router.table.reading import UnsoundError, boolean, integer, optional_text
+from router.table.reading import boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
 from router.types.protobuf import PayloadCase
 from tests.oracles import reference_cdr
@@ -26,7 +25,7 @@ class GivenReader:
         self._fields = FieldReader(names.enums, given=True)
 
     def given(self, node: Node) -> Given:
-        """Raises UnsoundError."""
+        """Raises InvalidValueError."""
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
         span = next(iter(node.entries.values())).key.span if node.entries else node.span
         is_message = "topic" in node.entries
@@ -83,7 +82,7 @@ class GivenReader:
 
 
 def datagram(given: GivenDatagram, wire: Wire, moments: Moments) -> bytes:
-    """What arrives. Raises UnsoundError where a padded datagram is longer than that."""
+    """What arrives. Raises InvalidValueError where a padded datagram is longer than that."""
     if isinstance(given.content, bytes):
         data = given.content
     else:
@@ -119,8 +118,8 @@ def _repetition(node: MappingNode) -> Repetition:
         raise unsound(every.span, Code.MISSING_KEY, "'every' without 'times'", "say how often it is given")
     return Repetition(
         times=times.value if times else 1,
-        every=UnsoundError.guard(parse_duration, every) if every else 0,
-        age=UnsoundError.guard(parse_duration, age) if age else 0,
+        every=parsed(parse_duration, every) if every else 0,
+        age=parsed(parse_duration, age) if age else 0,
     )
 
 

@@ -9,9 +9,8 @@ from typing import Union
 
 from router.compiler import Checked
 from router.engine.dispatch import Peer
-from router.errors import SourceSpan
+from router.errors import Located, SourceSpan
 from router.rehearsal.matching import MessageMatch
-from router.table.model import Located
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 

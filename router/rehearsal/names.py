@@ -9,9 +9,9 @@ from router.compiler import Checked
 from router.compiler.program import Program
 from router.engine.dispatch import Peer
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
-from router.table.address import BadAddressError, parse_address
+from router.table.addresses import BadAddressError, parse_address
 from router.table.model import Endpoint
-from router.table.reading import UnsoundError
+from router.table.reading import InvalidValueError
 from router.types.model import Enum, MessageType
 from router.types.protobuf import PayloadCase
 
@@ -20,7 +20,7 @@ _PORT = 40_000
 
 
 class Names:
-    """Each method takes a name and the place where it is written, and raises UnsoundError if there is none such."""
+    """Each method takes a name and the place where it is written, and raises InvalidValueError if there is none."""
 
     def __init__(self, checked: Checked) -> None:
         assert checked.program is not None  # noqa: S101 - whoever tests a table has seen to that
@@ -105,5 +105,5 @@ class Names:
             raise unsound(span, code, f"{self._table.path.name} has no {what} '{name}'", did_you_mean(name, names))
 
 
-def unsound(span: SourceSpan, code: Code, message: str, hint: str = "") -> UnsoundError:
-    return UnsoundError(Diagnostic(span, code, message, hint))
+def unsound(span: SourceSpan, code: Code, message: str, hint: str = "") -> InvalidValueError:
+    return InvalidValueError(Diagnostic(span, code, message, hint))

@@ -12,16 +12,15 @@ from typing import TypeVar
 
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, shown_path
 from router.rehearsal.expected import ExpectedReader
 from router.rehearsal.given import GivenReader
 from router.rehearsal.model import Expected, Step, TableTest, TableTestFile
 from router.rehearsal.names import Names
 from router.rehearsal.shape import read_shape
 from router.rehearsal.shown import offset
-from router.table.model import Located
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
-from router.table.reading import UnsoundError
+from router.table.reading import InvalidValueError, parsed
 from router.table.units import parse_duration
 
 R = TypeVar("R")
@@ -138,7 +137,7 @@ class _Reader:
             return None
         try:
             return read(node)
-        except UnsoundError as error:
+        except InvalidValueError as error:
             self._findings.append(error.diagnostic)
             return None
 
@@ -146,7 +145,7 @@ class _Reader:
 def _duration(node: Node) -> int:
     assert isinstance(node, ScalarNode)  # noqa: S101 - the schema saw to it
     written = Located(node.text, node.span)
-    return 0 if _is_zero(written.value) else UnsoundError.guard(parse_duration, written)
+    return 0 if _is_zero(written.value) else parsed(parse_duration, written)
 
 
 def _is_zero(text: str) -> bool:

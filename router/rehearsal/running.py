@@ -16,7 +16,7 @@ from router.rehearsal.model import GivenDatagram, Step, TableTest, TableTestFile
 from router.rehearsal.places import Places
 from router.rehearsal.rehearsal import START, Rehearsal
 from router.rehearsal.words import Happened
-from router.table.reading import UnsoundError
+from router.table.reading import InvalidValueError
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class Runner:
         for step in test.steps:
             try:
                 happened = self._happened(step, rehearsal)
-            except UnsoundError as error:
+            except InvalidValueError as error:
                 result.findings.append(error.diagnostic)
                 return result
             self._told(happened)

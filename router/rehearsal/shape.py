@@ -7,9 +7,8 @@ from pathlib import Path
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
 from router.table.compose import compose
-from router.table.nodes import MappingNode, Node, is_sound, key_at, node_at
-from router.table.sentences import Misfit, finding, subject
-from router.table.shape import misfits
+from router.table.nodes import MappingNode, Node, is_valid, key_at, node_at
+from router.table.schema import SchemaError, finding, schema_errors, subject
 from router.table.source import read_source
 
 SCHEMA = "schemas/table-test.schema.json"
@@ -25,7 +24,7 @@ def read_shape(path: Path) -> MappingNode:
     root = compose(source, {}, findings)
     if not isinstance(root, MappingNode):
         raise TableError([*findings, Diagnostic(root.span, Code.WRONG_TYPE, message)])
-    if not findings and is_sound(root):
+    if not findings and is_valid(root):
         findings += _findings(root, SourceSpan(source.file))
     if findings:
         raise TableError(sorted(findings, key=lambda found: (found.span, found.message)))
@@ -33,7 +32,7 @@ def read_shape(path: Path) -> MappingNode:
 
 
 def _findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
-    found = misfits(root, SCHEMA)
+    found = schema_errors(root, SCHEMA)
     misspelt = {misfit.path for misfit in found if misfit.keyword == "additionalProperties"}
     for misfit in found:
         if misfit.keyword == "additionalProperties":
@@ -51,7 +50,7 @@ def _findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
             yield finding(misfit, root)
 
 
-def _unknown_keys(misfit: Misfit, node: Node) -> Iterator[Diagnostic]:
+def _unknown_keys(misfit: SchemaError, node: Node) -> Iterator[Diagnostic]:
     assert isinstance(node, MappingNode)  # noqa: S101 - only a mapping has keys
     known = list(misfit.schema["properties"])
     owner = "a test file" if not misfit.path else subject(misfit.path)

@@ -15,7 +15,7 @@ from google.protobuf.message import Message
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.namespace import entries
 from router.rehearsal.rehearsal import START
-from router.table.quantities import duration
+from router.table.units import duration
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.values import float_text
 

@@ -1,6 +1,6 @@
 """Fields of a test file as what a message is expected, or given, to hold.
 
-Knows nodes and types. What does not fit is raised as UnsoundError, with its place.
+Knows nodes and types. What does not fit is raised as InvalidValueError, with its place.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What the user wrote: YAML text to RouteTable, with every finding of text and shape.
-
-Knows neither protobuf nor ROS: whether a name means something is the compiler's business.
-"""
+"""What the user wrote: YAML text to RouteTable, with every finding of text and shape."""
 
 from __future__ import annotations
 
@@ -10,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from router.errors import Diagnostic, Severity, TableError
+from router.table.addresses import outside_findings
 from router.table.build import build_table
 from router.table.extends import load_chain
 from router.table.model import RouteTable
-from router.table.networks import outside_findings
-from router.table.shape import check_shape
+from router.table.schema import check_shape
 from router.table.source import Source
 
 
@@ -22,7 +19,7 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
     """The table at `path` and what is wrong with it, in the order of the file.
 
     The table is None only when nothing usable could be built (unreadable, bad YAML, no envelope); else
-    it holds what is sound, and `broken` names what was left out. `environ` None means os.environ.
+    it holds what is valid, and `broken` names what was left out. `environ` None means os.environ.
     """
     sources: list[Source] = []
     findings: list[Diagnostic] = []

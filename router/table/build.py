@@ -1,73 +1,93 @@
-"""Nodes that have their shape to the typed route table; what has a finding is left out and named in `broken`.
+"""Nodes that fit the schema to the typed route table; what has a finding is left out and named in `broken`.
 
-Knows the schema's shape and relies on it. Routes are built in `build_routes`, gateways in `build_gateways`.
+Objects of the model are read key by key as its classes declare them (`structure`); what has a syntax of its own has a
+function here.
 """
 
 from __future__ import annotations
 
+import enum
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from ipaddress import IPv4Network
-from typing import TypeVar, Union
+from pathlib import Path
+from typing import Any, TypeVar, Union
 
 from router.assets import asset
-from router.errors import Code, Diagnostic
-from router.table.build_addresses import local_address, remote_address
-from router.table.build_gateways import build_gateway
-from router.table.build_routes import build_case, named
+from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
+from router.table.addresses import LOCAL, REMOTE, Address, parse_local
+from router.table.keys import Key, keys_of
 from router.table.model import (
-    DEFAULT_STALE_AFTER,
-    Address,
+    ROS,
+    Deadman,
+    Destination,
     Endpoint,
-    EndpointKind,
     EnvelopeSettings,
-    Framing,
+    Expression,
+    FieldEntry,
+    FieldMap,
     Gateway,
+    GatewayFormat,
     IgnoredGateway,
+    Inbound,
+    InboundDeadman,
     Listener,
-    Located,
     Networks,
     NodeSettings,
     RecordSettings,
+    Route,
     RouteTable,
+    Topic,
+    TopicPattern,
+    TopicRate,
+    Transport,
+    ZenohConfig,
+    ZenohSettings,
 )
-from router.table.nodes import Entry, MappingNode, Node, SequenceNode, is_sound, marked_broken
+from router.table.nodes import (
+    Entry,
+    MappingNode,
+    Node,
+    ScalarNode,
+    SequenceNode,
+    TextPlace,
+    is_valid,
+    marked_broken,
+    to_data,
+    valid_part,
+)
+from router.table.nodes import Path as Steps
 from router.table.reading import (
-    UnsoundError,
+    InvalidValueError,
     beside,
     boolean,
-    duration,
-    integer,
     located,
     mapping,
     optional_text,
-    text,
-    text_or,
+    parsed,
+    scalar,
+    sequence,
+    whole,
 )
-from router.table.salvage import sound_part
 from router.table.source import Source
-from router.table.units import (
-    parse_coalesce,
-    parse_data_rate,
-    parse_disk_size,
-    parse_duration,
-    parse_patience,
-    parse_size,
-)
+from router.table.units import TOPIC_RATE
 
 T = TypeVar("T")
+M = TypeVar("M")
 
-DEFAULT_NODE = NodeSettings("rover_router", "/")
-DEFAULT_RECEIVE_BUFFER = 4 << 20
-DEFAULT_COALESCE = 1_000_000
-DEFAULT_MAX_SIZE = 256 << 20
-DEFAULT_MAX_AGE = 600_000_000_000
-DEFAULT_KEEP = 4 << 30
+AUTO = "auto"
+DEFAULT_FORMATS: Mapping[Transport, GatewayFormat] = {
+    Transport.UDP: GatewayFormat.GATEWAY_V1,
+    Transport.TCP: GatewayFormat.GATEWAY_V1,
+    Transport.WEBSOCKET: GatewayFormat.JSON,
+    Transport.ZENOH: GatewayFormat.GATEWAY_V1,
+}
 
 
 def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Diagnostic]) -> RouteTable | None:
-    """The table of everything sound; None where the envelope or the routes as a whole are not, or are missing.
+    """The table of everything valid; None where the envelope or the routes as a whole are not, or are missing.
 
     What only the values themselves can tell, such as a size beyond what the kernel takes, is added to
     `findings`.
@@ -76,21 +96,22 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     envelope = builder.one(root, "envelope", _envelope)
     routes = root.entries.get("routes")
     endpoints = root.entries.get("endpoints")
-    if not all(entry is None or _is_group(entry) for entry in (routes, endpoints)):
+    if not all(entry is None or isinstance(entry.value, MappingNode) for entry in (routes, endpoints)):
         return None
     if (envelope is None or routes is None) and not _has_gateways_only(root):
         return None
-    gateways = builder.each(root, "gateways", build_gateway, salvage=sound_part)
+    gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
+    findings.extend(_misplaced_keys(root))
     return RouteTable(
         path=sources[0].path,
         files=tuple(source.path for source in sources),
         sha256=hashlib.sha256(b"".join(source.data for source in sources)).hexdigest(),
         envelope=envelope,
-        node=builder.one(root, "node", _node) or DEFAULT_NODE,
+        node=builder.one(root, "node", _node) or NodeSettings(),
         metrics=builder.one(root, "metrics", _address),
-        listeners=builder.each(root, "listen", _listener),
-        endpoints=builder.each(root, "endpoints", _endpoint),
-        routes=named(builder.each(root, "routes", build_case, salvage=sound_part).values()),
+        listeners=builder.each(root, "listen", _named(Listener)),
+        endpoints=builder.each(root, "endpoints", _named(Endpoint)),
+        routes=_with_names(builder.each(root, "routes", _case, salvage=valid_part).values()),
         routes_span=routes.key.span if routes else None,
         gateways={name: each for name, each in gateways.items() if isinstance(each, Gateway)},
         ignored_gateways={name: each for name, each in gateways.items() if isinstance(each, IgnoredGateway)},
@@ -102,8 +123,13 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     )
 
 
+def _has_gateways_only(root: MappingNode) -> bool:
+    """The table receives no datagrams, so it needs no envelope."""
+    return "gateways" in root.entries and not root.entries.keys() & {"listen", "routes"}
+
+
 Salvage = Callable[[Entry], Union[Entry, None]]
-"""What is sound in a part that is broken, if anything is."""
+"""What is valid in a part that is broken, if anything is."""
 
 
 def _nothing(_: Entry) -> None:
@@ -120,14 +146,10 @@ class _Builder:
     def one(self, root: MappingNode, name: str, build: Callable[[Entry], T]) -> T | None:
         """The part under a key of the root; None when it is absent or broken."""
         entry = root.entries.get(name)
-        return self._built(name, entry, build) if entry else None
+        return self._built(name, entry, build, _nothing) if entry else None
 
     def each(
-        self,
-        root: MappingNode,
-        name: str,
-        build: Callable[[Entry], T],
-        salvage: Salvage = _nothing,
+        self, root: MappingNode, name: str, build: Callable[[Entry], T], salvage: Salvage = _nothing
     ) -> Mapping[str, T]:
         """The parts by name under a key of the root, of a broken one what `salvage` leaves."""
         group = root.entries.get(name)
@@ -139,80 +161,107 @@ class _Builder:
         built = {key: self._built(f"{name}/{key}", entry, build, salvage) for key, entry in group.value.entries.items()}
         return {key: part for key, part in built.items() if part is not None}
 
-    def _built(
-        self,
-        name: str,
-        entry: Entry,
-        build: Callable[[Entry], T],
-        salvage: Salvage = _nothing,
-    ) -> T | None:
-        sound: Entry | None = entry
-        if not (is_sound(entry.key) and is_sound(entry.value)):
+    def _built(self, name: str, entry: Entry, build: Callable[[Entry], T], salvage: Salvage) -> T | None:
+        valid: Entry | None = entry
+        if not (is_valid(entry.key) and is_valid(entry.value)):
             self.broken.add(name)
-            sound = salvage(entry)
-        while sound:
+            valid = salvage(entry)
+        while valid:
             try:
-                return build(sound)
-            except UnsoundError as error:
+                return build(valid)
+            except InvalidValueError as error:
                 self._findings.append(error.diagnostic)
                 self.broken.add(name)
-                marked = replace(sound, value=marked_broken(sound.value, error.diagnostic.span))
-                sound = salvage(marked) if marked != sound else None
+                marked = replace(valid, value=marked_broken(valid.value, error.diagnostic.span))
+                valid = salvage(marked) if marked != valid else None
         return None
 
 
-def _has_gateways_only(root: MappingNode) -> bool:
-    """The table receives no datagrams, so it needs no envelope."""
-    return "gateways" in root.entries and not root.entries.keys() & {"listen", "routes"}
+def structure(model: type[M], settings: MappingNode, **given: Any) -> M:
+    """An object of a class of the model: `given`, and of the mapping every other key that the class declares."""
+    values = {
+        key.attribute: _value(key, entry)
+        for key in keys_of(model)
+        if key.attribute not in given and (entry := _entry(settings, key.name))
+    }
+    return model(**given, **values)
 
 
-def _is_group(entry: Entry) -> bool:
-    return isinstance(entry.value, MappingNode)
+def _entry(settings: MappingNode, name: str) -> Entry | None:
+    """The entry of a key, whose name has dots where it stands inside others."""
+    outer, _, inner = name.partition(".")
+    entry = settings.entries.get(outer)
+    return _entry(mapping(entry.value), inner) if entry and inner else entry
+
+
+def _value(key: Key, entry: Entry) -> object:
+    if not key.is_list:
+        return _read(key, entry.value, entry.key.span)
+    nodes = entry.value.items if isinstance(entry.value, SequenceNode) else (entry.value,)
+    return tuple(_read(key, node, _item_span(node)) for node in nodes)
+
+
+def _item_span(node: Node) -> SourceSpan:
+    """A mapping in a list has no key of its own; its first key stands for it."""
+    return next(iter(node.entries.values())).key.span if isinstance(node, MappingNode) and node.entries else node.span
+
+
+def _read(key: Key, node: Node, span: SourceSpan) -> object:
+    if read := _SYNTAX.get(key.type):
+        return read(node, span)
+    if isinstance(node, MappingNode):
+        return structure(key.type, node, span=span)
+    value = _scalar_value(key, scalar(node))
+    return Located(value, node.span) if key.is_located else value
+
+
+def _scalar_value(key: Key, found: ScalarNode) -> object:
+    if key.quantity is not None:
+        return parsed(key.quantity.parse, Located(found.value, found.span))
+    if key.type is bool:
+        return found.value is True
+    if key.type is int:
+        return whole(found)
+    if key.type is Path:
+        return beside(found.text, found.span)
+    return key.type(found.text) if issubclass(key.type, enum.Enum) else found.text
+
+
+# what stands at the root
+
+
+def _named(model: type[M]) -> Callable[[Entry], M]:
+    """A reader of what stands under a name of its own."""
+    return lambda entry: structure(model, mapping(entry.value), name=entry.key.text, span=entry.key.span)
 
 
 def _envelope(entry: Entry) -> EnvelopeSettings:
     settings = mapping(entry.value)
-    protos, lock = optional_text(settings, "protos"), optional_text(settings, "lock")
-    return EnvelopeSettings(
-        beside(protos) if protos else Located(asset("protos"), entry.key.span),
-        text(settings, "message"),
-        text(settings, "oneof"),
-        beside(lock) if lock else None,
-    )
+    ours = {} if settings.get("protos") else {"protos": Located(asset("protos"), entry.key.span)}
+    return structure(EnvelopeSettings, settings, **ours)
 
 
 def _node(entry: Entry) -> NodeSettings:
     settings = mapping(entry.value)
-    return NodeSettings(
-        text_or(settings, "name", DEFAULT_NODE.name),
-        text_or(settings, "namespace", DEFAULT_NODE.namespace),
-        settings.entries["diagnostics"].key.span if boolean(settings, "diagnostics") else None,
-        entry.key.span,
-    )
+    diagnostics = settings.entries["diagnostics"].key.span if boolean(settings, "diagnostics") else None
+    return structure(NodeSettings, settings, span=entry.key.span, diagnostics=diagnostics)
 
 
 def _address(entry: Entry) -> Located[Address]:
-    return local_address(text(mapping(entry.value), "address"))
+    written = located(mapping(entry.value).get("address"))
+    return Located(parsed(parse_local, written), written.span)
 
 
 def _record(entry: Entry) -> RecordSettings:
-    settings = mapping(entry.value)
-    directory, last = beside(text(settings, "directory")), duration(settings, "last")
-    return RecordSettings(
-        span=entry.key.span,
-        directory=directory.value,
-        continuous=settings.get("continuous") is None or boolean(settings, "continuous"),
-        last=last.value if last else None,
-        max_size=_parsed(settings, "max_size", parse_disk_size, DEFAULT_MAX_SIZE),
-        max_age=_parsed(settings, "max_age", parse_duration, DEFAULT_MAX_AGE),
-        keep=_parsed(settings, "keep", parse_disk_size, DEFAULT_KEEP),
-    )
+    return structure(RecordSettings, mapping(entry.value), span=entry.key.span)
+
+
+def _reload(entry: Entry) -> bool:
+    return boolean(mapping(entry.value), "on_change")
 
 
 def _networks(entry: Entry) -> Networks:
-    if not isinstance(entry.value, SequenceNode):
-        raise TypeError(f"a sequence, not {entry.value!r}")
-    return Networks(entry.key.span, tuple(map(_network, entry.value.items)))
+    return Networks(entry.key.span, tuple(map(_network, sequence(entry.value).items)))
 
 
 def _network(node: Node) -> IPv4Network:
@@ -221,42 +270,223 @@ def _network(node: Node) -> IPv4Network:
         return IPv4Network(written.value)
     except ValueError as error:  # not its form, which the schema has checked
         what = f"{written.value} is a host of the network {IPv4Network(written.value, strict=False)}"
-        raise UnsoundError(Diagnostic(written.span, Code.BAD_VALUE, what, "write the network")) from error
+        raise InvalidValueError(Diagnostic(written.span, Code.BAD_VALUE, what, "write the network")) from error
 
 
-def _reload(entry: Entry) -> bool:
-    return boolean(mapping(entry.value), "on_change")
+# routes
 
 
-def _parsed(settings: MappingNode, key: str, parse: Callable[[str], T], default: T) -> T:
-    written = optional_text(settings, key)
-    return UnsoundError.guard(parse, written) if written else default
+def _case(entry: Entry) -> tuple[Route, ...]:
+    """The routes of one payload case, all named after the case so far."""
+    if not isinstance(entry.value, SequenceNode):
+        return (_route(entry.key, entry.value, entry.key.span),)
+    return tuple(_route(entry.key, item, _item_span(item)) for item in entry.value.items)
 
 
-def _listener(entry: Entry) -> Listener:
-    settings = mapping(entry.value)
-    return Listener(
-        name=entry.key.text,
-        span=entry.key.span,
-        address=local_address(text(settings, "address")),
-        framing=Framing(text_or(settings, "framing", Framing.ZERO_TRIMMED.value)),
-        receive_buffer=_parsed(settings, "receive_buffer", parse_size, DEFAULT_RECEIVE_BUFFER),
-        coalesce=_parsed(settings, "coalesce", parse_coalesce, DEFAULT_COALESCE),
-        interface=optional_text(settings, "interface"),
+def _route(case: ScalarNode, node: Node, span: SourceSpan) -> Route:
+    settings = mapping(node)
+    deadman = settings.get("deadman")
+    reason = deadman.text if isinstance(deadman, ScalarNode) else None
+    return structure(Route, settings, name=case.text, span=span, case=Located(case.text, case.span), no_deadman=reason)
+
+
+def _with_names(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
+    """The routes of all cases, with names that tell them apart in metrics and log.
+
+    A case's only route keeps the case's name; of several each is named after its first source.
+    """
+    cases = tuple(cases)
+    taken = {route.name for routes in cases for route in routes}
+    found: list[Route] = []
+    for routes in cases:
+        for route in routes:
+            name = route.name if len(routes) == 1 else _free(f"{route.name}_from_{route.sources[0].value}", taken)
+            taken.add(name)
+            found.append(replace(route, name=name))
+    return tuple(found)
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """The name, or with the first of `_2`, `_3`, ... behind it with which it is not taken."""
+    free, number = name, 1
+    while free in taken:
+        number += 1
+        free = f"{name}_{number}"
+    return free
+
+
+def _misplaced_keys(root: MappingNode) -> Iterator[Diagnostic]:
+    """Keys that have no place in a route from ROS, or in one from elsewhere."""
+    routes = root.get("routes")
+    for entry in routes.entries.values() if isinstance(routes, MappingNode) else ():
+        for route in _mappings(entry.value):
+            with_ros = ROS in map(to_data, _members(route.get("source")))
+            yield from _misplaced(Route, route, with_ros)
+            for model, key in ((Destination, "destinations"), (Topic, "topics")):
+                for part in _mappings(route.get(key)):
+                    yield from _misplaced(model, part, with_ros)
+
+
+def _misplaced(model: type, settings: MappingNode, with_ros: bool) -> Iterator[Diagnostic]:
+    for key in keys_of(model):
+        entry = settings.entries.get(key.name)
+        if entry and key.misplaced and key.misplaced.with_ros == with_ros and is_valid(entry.value):
+            span = entry.value.span if isinstance(entry.value, ScalarNode) else entry.key.span
+            yield Diagnostic(span, Code.UNKNOWN_KEY, key.misplaced.message, key.misplaced.hint)
+
+
+def _members(node: Node | None) -> Sequence[Node]:
+    """The items of a list, or the one thing that stands in its place."""
+    return node.items if isinstance(node, SequenceNode) else (node,) if node else ()
+
+
+def _mappings(node: Node | None) -> Iterator[MappingNode]:
+    return (member for member in _members(node) if isinstance(member, MappingNode))
+
+
+def _destination(node: Node, span: SourceSpan) -> Destination:
+    if isinstance(node, ScalarNode):
+        return Destination(located(node), node.span)
+    return structure(Destination, mapping(node), span=span)
+
+
+def _deadman(node: Node, span: SourceSpan) -> Deadman | None:
+    """None for a text, which is the reason why there is none."""
+    if isinstance(node, ScalarNode):
+        return None
+    settings = mapping(node)
+    [payload] = mapping(settings.get("send")).entries.values()
+    return structure(Deadman, settings, span=span, case=located(payload.key), fields=_constants(payload))
+
+
+def _expression(node: Node, _: SourceSpan) -> Expression:
+    """A scalar as it was written, or a list of expressions."""
+    if isinstance(node, SequenceNode):
+        return Expression("", TextPlace(node.span), tuple(_expression(item, item.span) for item in node.items))
+    found = scalar(node)
+    return Expression(found.text, found.place)
+
+
+def _fields(node: Node, span: SourceSpan) -> FieldMap:
+    """`auto`, or a mapping of fields, with `auto` perhaps among them."""
+    if isinstance(node, ScalarNode):
+        return FieldMap(node.span, auto=True, entries=())
+    written = mapping(node)
+    own = replace(written, entries={key: entry for key, entry in written.entries.items() if key != AUTO})
+    return FieldMap(span, auto=boolean(written, AUTO), entries=tuple(_field_entries(own, (), ())))
+
+
+def _constants(entry: Entry) -> FieldMap:
+    """The fields of a payload that is not filled from a message; here `auto` is a field like any other."""
+    return FieldMap(entry.key.span, auto=False, entries=tuple(_field_entries(mapping(entry.value), (), ())))
+
+
+def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[SourceSpan, ...]) -> Iterator[FieldEntry]:
+    for name, entry in fields.entries.items():
+        inner = (*path, *name.split("."))
+        inner_spans = (*spans, *_part_spans(entry.key))
+        if isinstance(entry.value, MappingNode):
+            yield from _field_entries(entry.value, inner, inner_spans)
+        else:
+            yield FieldEntry(inner, inner_spans, _expression(entry.value, entry.key.span))
+
+
+def _part_spans(key: ScalarNode) -> Iterator[SourceSpan]:
+    """The places of the names between the dots of a key; the whole key where its text is not verbatim."""
+    start = 0
+    for part in key.text.split("."):
+        yield key.place.part(start, start + len(part))
+        start += len(part) + 1
+
+
+# gateways
+
+
+def _gateway(entry: Entry) -> Gateway | IgnoredGateway:
+    name, span, settings = entry.key.text, entry.key.span, mapping(entry.value)
+    if settings.get("ignore"):
+        return structure(IgnoredGateway, settings, name=name, span=span)
+    ((kind, chosen),) = mapping(settings.get("transport")).entries.items()
+    transport = Transport(kind)
+    format_ = optional_text(settings, "format")
+    return structure(
+        Gateway,
+        settings,
+        name=name,
+        span=span,
+        transport=Located(transport, chosen.key.span),
+        address=None if transport is Transport.ZENOH else _transport_address(transport, located(chosen.value)),
+        zenoh=structure(ZenohSettings, mapping(chosen.value)) if transport is Transport.ZENOH else None,
+        format=GatewayFormat(format_.value) if format_ else DEFAULT_FORMATS[transport],
+        rates=tuple(_rates(settings.get("rates"))),
     )
 
 
-def _endpoint(entry: Entry) -> Endpoint:
-    settings = mapping(entry.value)
-    budget = optional_text(settings, "budget")
-    return Endpoint(
-        name=entry.key.text,
-        span=entry.key.span,
-        address=remote_address(text(settings, "address")),
-        kind=EndpointKind(text(settings, "kind").value),
-        source_port=integer(settings, "source_port"),
-        trim_trailing_zeros=boolean(settings, "trim_trailing_zeros"),
-        budget=Located(UnsoundError.guard(parse_data_rate, budget), budget.span) if budget else None,
-        stale_after=_parsed(settings, "stale_after", parse_patience, DEFAULT_STALE_AFTER) or None,
-        listener=optional_text(settings, "listener"),
-    )
+def _transport_address(transport: Transport, written: Located[str]) -> Located[Address]:
+    kind = REMOTE if transport is Transport.UDP else LOCAL
+    return Located(parsed(kind.parse, written), written.span)
+
+
+def _zenoh_config(node: Node, span: SourceSpan) -> ZenohConfig:
+    """A mapping of settings, or the path of a file."""
+    if isinstance(node, MappingNode):
+        return ZenohConfig(span, json.dumps(to_data(node)), places=dict(_places(node)))
+    written = located(node)
+    path = beside(written.value, written.span)
+    try:
+        if path.exists() and not path.is_file():
+            raise OSError(0, "it is no ordinary file")
+        return ZenohConfig(written.span, path.read_text(encoding="utf-8"), path)
+    except (OSError, UnicodeDecodeError) as error:
+        why = (error.strerror or "").lower() if isinstance(error, OSError) else "it is not UTF-8"
+        what = f"'{written.value}' cannot be read: {why}"
+        hint = f"looked for {shown_path(path)}" if isinstance(error, FileNotFoundError) else ""
+        raise InvalidValueError(Diagnostic(written.span, Code.BAD_FILE, what, hint)) from error
+
+
+def _places(node: Node, here: Steps = ()) -> Iterator[tuple[Steps, SourceSpan]]:
+    """Of each key, and of each item of a list, by its path."""
+    if isinstance(node, MappingNode):
+        for key, entry in node.entries.items():
+            yield (*here, key), entry.key.span
+            yield from _places(entry.value, (*here, key))
+    elif isinstance(node, SequenceNode):
+        for index, item in enumerate(node.items):
+            yield (*here, index), item.span
+            yield from _places(item, (*here, index))
+
+
+def _pattern(node: Node, _: SourceSpan) -> TopicPattern:
+    is_regex = isinstance(node, MappingNode)
+    written = located(node.get("regex") if isinstance(node, MappingNode) else node)
+    return TopicPattern(written.value, is_regex, written.span)
+
+
+def _rates(node: Node | None) -> Iterator[TopicRate]:
+    for entry in mapping(node).entries.values() if node else ():
+        found = scalar(entry.value)
+        pattern = TopicPattern(entry.key.text, is_regex=False, span=entry.key.span)
+        yield TopicRate(pattern, parsed(TOPIC_RATE.parse, Located(found.value, found.span)))
+
+
+def _inbound(node: Node, span: SourceSpan) -> Inbound:
+    settings = mapping(node)
+    return structure(Inbound, settings, span=span, topic=structure(Topic, settings, span=span))
+
+
+def _inbound_deadman(node: Node, span: SourceSpan) -> InboundDeadman:
+    settings = mapping(node)
+    return structure(InboundDeadman, settings, span=span, fields=_constants(settings.entries["send"]))
+
+
+_SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
+    Deadman: _deadman,
+    Destination: _destination,
+    Expression: _expression,
+    FieldMap: _fields,
+    Inbound: _inbound,
+    InboundDeadman: _inbound_deadman,
+    TopicPattern: _pattern,
+    ZenohConfig: _zenoh_config,
+}
+"""Readers of what is more than a scalar or a mapping of keys; they get its node and its key's span."""

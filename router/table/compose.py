@@ -1,23 +1,22 @@
 """YAML text to nodes: PyYAML's parser events, composed without recursion and with bounds.
 
-Knows YAML, no key of a route table. What the text leaves no sense in is raised as TableError; what is
-merely wrong becomes a finding, and its node is marked broken.
+Plain scalars follow the core schema of YAML 1.2. What cannot be parsed is raised as TableError, in words that say what
+to do, at the line that has the mistake. What is merely wrong becomes a finding, and its node is marked broken.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import yaml
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, cut_off
-from router.table.places import TextPlace, locate
-from router.table.scalars import resolve, surprise
-from router.table.source import Source, unusable_character
-from router.table.variables import fill, has_variables
-from router.table.yaml_errors import explain
+from router.table.nodes import Entry, MappingNode, Node, Plain, ScalarNode, SequenceNode, TextPlace, cut_off, locate
+from router.table.source import Source, fill, has_variables, unusable_character
 
 MAX_DEPTH = 32
 MAX_NODES = 20_000
@@ -73,7 +72,7 @@ class _Composer:
             for event in yaml.parse(self._source.text, Loader=LOADER):
                 yield event
         except yaml.MarkedYAMLError as error:
-            raise TableError([explain(error, self._source, self._open_quote(event), self._open_bracket())]) from error
+            raise TableError([_explain(error, self._source, self._open_quote(event), self._open_bracket())]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
 
@@ -199,3 +198,157 @@ def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
     if start is None or end is None:
         raise TypeError("the parser sets marks on every event")
     return start.line, start.column, end.line, end.column
+
+
+_WORDS: dict[str, Plain] = {
+    **dict.fromkeys(("", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+_INT = re.compile(r"[-+]?[0-9]{1,300}")  # Python refuses to read far longer ones
+_HEX = re.compile(r"0x[0-9a-fA-F]{1,300}")
+_FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+
+
+class Surprise(NamedTuple):
+    """What some YAML readers take a scalar for, and how to say what one means."""
+
+    meaning: str
+    remedy: str
+
+
+_TRUTH = frozenset(spelling for word in ("yes", "no", "on", "off") for spelling in (word, word.title(), word.upper()))
+_OCTAL = Surprise("an octal number", "write a decimal number without leading zeros")
+_BINARY = Surprise("a binary number", "write a decimal number")
+_HEXADECIMAL = Surprise("a hexadecimal number", "write a decimal number")
+_GROUPED = Surprise("a number", "leave out the '_'")
+_SURPRISES = (
+    (re.compile("|".join(_TRUTH)), Surprise("a truth value", "write true or false")),
+    (re.compile("~"), Surprise("an empty value", "write null")),
+    (re.compile(r"[-+]?0[0-9_]+|0o[0-7]+"), _OCTAL),
+    (re.compile(r"[-+]?0b[01_]+"), _BINARY),
+    (re.compile(r"[-+]0x[0-9a-fA-F_]+|0x(?=.*_)[0-9a-fA-F_]+"), _HEXADECIMAL),
+    (re.compile(r"[-+]?[0-9][0-9_]*(?::[0-5]?[0-9])+(?:\.[0-9_]*)?"), Surprise("a number in base 60", "")),
+    (
+        re.compile(r"[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}(?:(?:[Tt]|[ \t]+)[0-9]{1,2}:[0-9:.]+[ \t]*[-+:0-9Z]*)?"),
+        Surprise("a date", ""),
+    ),
+    (re.compile(r"(?=.*_)[-+]?(?:[0-9][0-9_]*(?:\.[0-9_]*)?|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?"), _GROUPED),
+)
+
+
+def resolve(text: str) -> Plain:
+    """The value of a plain scalar. Infinities and NaN have no place in a table: `.inf` and `1e999` stay text."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INT.fullmatch(text):
+        return int(text)
+    if _HEX.fullmatch(text):
+        return int(text, 16)
+    if _FLOAT.fullmatch(text) and math.isfinite(number := float(text)):
+        return number
+    return text
+
+
+def surprise(text: str) -> Surprise | None:
+    """Why the plain scalar means different things to readers of YAML 1.1 and 1.2; None where it does not."""
+    return next((found for pattern, found in _SURPRISES if pattern.fullmatch(text)), None)
+
+
+class _Advice(NamedTuple):
+    """`at_start` blames the place where the thing that went wrong began, not the place where it was noticed."""
+
+    what: str
+    hint: str = ""
+    at_start: bool = False
+
+
+_TAB = _Advice("a tab indents this line", "indent with spaces")
+_OPEN_QUOTE = _Advice("this quote is not closed in its line", at_start=True)
+_NO_COLON = _Advice("this line has a key without ':'", at_start=True)
+_ADVICE = {
+    "did not find expected ',' or ']'": _Advice(
+        "this '[' is not closed by a ']', or a ',' is missing inside", at_start=True
+    ),
+    "did not find expected ',' or '}'": _Advice(
+        "this '{' is not closed by a '}', or a ',' is missing inside", at_start=True
+    ),
+    "found unexpected end of stream": _OPEN_QUOTE,
+    "found unexpected document indicator": _OPEN_QUOTE,
+    "found unknown escape character": _Advice(
+        "this backslash sequence does not exist", "single quotes take backslashes as they are"
+    ),
+    "mapping values are not allowed in this context": _Advice(
+        "a ':' cannot stand here", "indent keys of one mapping alike; quote text that has ': ' in it"
+    ),
+    "could not find expected ':'": _NO_COLON,
+    "did not find expected key": _Advice(
+        "no key begins here", "indent keys of one mapping alike; quote text that has special characters in it"
+    ),
+    "did not find expected '-' indicator": _Advice(
+        "this line does not begin with '-' as its neighbours do", "indent what belongs to the item above"
+    ),
+    "block sequence entries are not allowed in this context": _Advice(
+        "a '-' cannot begin an item here", "items of a sequence begin on lines of their own"
+    ),
+    "did not find expected node content": _Advice("a value is missing here"),
+    "did not find expected <document start>": _Advice(
+        "this line is indented less than the first key", "indent keys of one mapping alike"
+    ),
+    "found incompatible YAML document": _Advice("this is a YAML version that is not understood", "remove the line"),
+}
+_NOT_CLOSED = ("did not find expected ',' or ']'", "did not find expected ',' or '}'")
+_FOLLOW_A_BARE_WORD = ("mapping values are not allowed in this context", "did not find expected key")
+_COMMENT = re.compile(r"(?:^|\s)#.*")
+
+
+def _explain(
+    error: yaml.MarkedYAMLError, source: Source, open_quote: SourceSpan | None, open_bracket: SourceSpan | None
+) -> Diagnostic:
+    """The finding for one syntax error.
+
+    `open_quote` is where the quoted scalar before the error begins, if it goes over several lines: then
+    its closing quote is most likely the next one's opening quote. `open_bracket` is the innermost
+    bracket around the error: where the text ends within it, it lacks its counterpart.
+    """
+    line = error.problem_mark.line if error.problem_mark else 0
+    column = error.problem_mark.column if error.problem_mark else 0
+    advice = _advice(error, source, line, column)
+    if open_quote:
+        return Diagnostic(open_quote, Code.BAD_YAML, _OPEN_QUOTE.what)
+    if open_bracket and not any(text.strip() for text in source.lines[line:]):
+        return Diagnostic(open_bracket.part(0, 1), Code.BAD_YAML, "this bracket is never closed")
+    if error.problem in _FOLLOW_A_BARE_WORD and (bare := _line_without_colon(source, line)) is not None:
+        line, column = bare, _indent(source.lines[bare])
+        advice = _NO_COLON
+    elif advice.at_start and error.context_mark:
+        line, column = error.context_mark.line, error.context_mark.column
+    return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, advice.what, advice.hint)
+
+
+def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int) -> _Advice:
+    character = source.lines[line][column : column + 1] if line < len(source.lines) else ""
+    if character == "\t":
+        return _TAB
+    problem = error.problem or str(error)
+    if problem in _NOT_CLOSED and character in ("[", "{") and source.lines[line][:column][-1:].strip():
+        return _Advice(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
+    if problem == "found character that cannot start any token":
+        return _Advice(f"a value cannot begin with '{character}'", "put quotes around it")
+    passed_on = _Advice(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
+    return _ADVICE.get(problem, passed_on)
+
+
+def _line_without_colon(source: Source, line: int) -> int | None:
+    """The line before `line` if it is indented alike and lacks the ':' that makes it a key."""
+    before = line - 1
+    while before >= 0 and not _COMMENT.sub("", source.lines[before]).strip():
+        before -= 1
+    if before < 0 or _indent(source.lines[before]) != _indent(source.lines[line]):
+        return None
+    return None if ":" in _COMMENT.sub("", source.lines[before]) else before
+
+
+def _indent(text: str) -> int:
+    """How far in the first key of a line stands; the dash of an item counts as indentation."""
+    return len(text) - len(text.lstrip(" -"))

@@ -1,8 +1,8 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
-Knows `extends`, that a route or gateway is either there or ignored, that a deadman sends one payload, and a gateway has
-one transport. Mappings merge key by key, everything else replaces; every node keeps the span of the file where it was
-written.
+Mappings merge key by key, everything else replaces. Three mappings replace as well: a route or gateway that one of the
+two files ignores, the payload that a deadman sends, and the transport of a gateway. Every node keeps the span of the
+file where it was written.
 """
 
 from __future__ import annotations

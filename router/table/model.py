@@ -1,7 +1,7 @@
 """The route table as typed, frozen data. Every value that a finding may blame keeps its span.
 
-Knows shapes and places only: whether a payload case, a field or a ROS type exists is the compiler's
-business.
+The fields declare the keys of the table (see `keys`). Whether a payload case, a field or a ROS type exists is checked
+by the compiler.
 """
 
 from __future__ import annotations
@@ -11,30 +11,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Annotated
 
-from router.errors import SourceSpan
-from router.table.places import TextPlace
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class Located(Generic[T]):
-    """A value and the place in the table that it was read from."""
-
-    value: T
-    span: SourceSpan
-
-
-class Address(NamedTuple):
-    """An IPv4 address and a UDP (for metrics: TCP) port."""
-
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        return f"{self.host}:{self.port}"
+from router.errors import Located, SourceSpan
+from router.table.addresses import LOCAL, REMOTE, Address
+from router.table.keys import Misplaced, Named, Words
+from router.table.nodes import TextPlace
+from router.table.units import (
+    COALESCE,
+    DATA_RATE,
+    DATAGRAM_SIZE,
+    DISK_SIZE,
+    DURATION,
+    INTERVAL,
+    MESSAGE_SIZE,
+    PATIENCE,
+    PERIOD,
+    RATE,
+    SIZE,
+    Quantity,
+    topic_rate,
+)
 
 
 def bound_to(address: Address, interface: str | None) -> str:
@@ -101,8 +98,8 @@ class EnvelopeSettings:
 class NodeSettings:
     """`diagnostics` is where the table asks for /diagnostics, None where it does not; `span` is the key `node`."""
 
-    name: str
-    namespace: str
+    name: str = "rover_router"
+    namespace: str = "/"
     diagnostics: SourceSpan | None = None
     span: SourceSpan | None = None
 
@@ -116,19 +113,15 @@ class Listener:
 
     name: str
     span: SourceSpan
-    address: Located[Address]
-    framing: Framing
-    receive_buffer: int
-    coalesce: int
-    interface: Located[str] | None = None
+    address: Annotated[Located[Address], LOCAL]
+    framing: Framing = Framing.ZERO_TRIMMED
+    receive_buffer: Annotated[int, SIZE] = 4 << 20
+    coalesce: Annotated[int, COALESCE] = 1_000_000
+    interface: str | None = None
 
     @property
     def bound_to(self) -> str:
-        return bound_to(self.address.value, self.interface.value if self.interface else None)
-
-
-DEFAULT_STALE_AFTER = 5_000_000_000
-"""ns."""
+        return bound_to(self.address.value, self.interface)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,12 +134,12 @@ class Endpoint:
 
     name: str
     span: SourceSpan
-    address: Located[Address]
+    address: Annotated[Located[Address], REMOTE]
     kind: EndpointKind
-    source_port: Located[int] | None
-    trim_trailing_zeros: bool
-    budget: Located[int] | None = None
-    stale_after: int | None = DEFAULT_STALE_AFTER
+    source_port: Located[int] | None = None
+    trim_trailing_zeros: bool = False
+    budget: Annotated[int | None, DATA_RATE] = None
+    stale_after: Annotated[int | None, PATIENCE] = 5_000_000_000
     listener: Located[str] | None = None
 
 
@@ -159,11 +152,11 @@ class RecordSettings:
 
     span: SourceSpan
     directory: Path
-    continuous: bool
-    last: int | None
-    max_size: int
-    max_age: int
-    keep: int
+    continuous: bool = True
+    last: Annotated[int | None, DURATION] = None
+    max_size: Annotated[int, DISK_SIZE] = 256 << 20
+    max_age: Annotated[int, DURATION] = 600_000_000_000
+    keep: Annotated[int, DISK_SIZE] = 4 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +173,9 @@ class Expression:
     @property
     def span(self) -> SourceSpan:
         return self.place.whole
+
+    def __str__(self) -> str:
+        return self.text if self.items is None else f"[{', '.join(map(str, self.items))}]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +201,12 @@ class FieldMap:
     auto: bool
     entries: tuple[FieldEntry, ...]
 
+    def __str__(self) -> str:
+        """`{brake: true}`."""
+        entries = ["auto"] if self.auto else []
+        entries += [f"{'.'.join(entry.path)}: {entry.value}" for entry in self.entries]
+        return f"{{{', '.join(entries)}}}"
+
 
 @dataclass(frozen=True, slots=True)
 class Qos:
@@ -216,37 +218,65 @@ class Qos:
     durability: Located[str] | None = None
     history: Located[str] | None = None
     depth: Located[int] | None = None
-    deadline: Located[int] | None = None
-    lifespan: Located[int] | None = None
+    deadline: Annotated[Located[int] | None, DURATION] = None
+    lifespan: Annotated[Located[int] | None, DURATION] = None
     liveliness: Located[str] | None = None
-    liveliness_lease_duration: Located[int] | None = None
+    liveliness_lease_duration: Annotated[Located[int] | None, DURATION] = None
 
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """A destination endpoint of a route. `max_rate` is in Hz; `keep` stands beside it only."""
+    """A destination endpoint of a route. `max_rate` is in Hz."""
 
     endpoint: Located[str]
     span: SourceSpan
-    when: Expression | None = None
-    max_rate: Located[float] | None = None
-    keep: Located[Keep] | None = None
-    fields: FieldMap | None = None
+    when: Annotated[Expression | None, Words("when {}")] = None
+    max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
+    keep: Annotated[Keep, Words("keeping the {}", beside="max_rate")] = Keep.FIRST
+    fields: Annotated[
+        FieldMap | None,
+        Misplaced(
+            with_ros=False,
+            message="a datagram is forwarded unchanged",
+            hint="'fields' of a destination belongs to `source: ros`",
+        ),
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A ROS topic of a route: published for a UDP source, subscribed to for `source: ros`."""
+    """A ROS topic of a route: published for a UDP source, subscribed to for `source: ros`. `max_rate` is in Hz."""
 
     topic: Located[str]
     type: Located[str]
     span: SourceSpan
     queue_depth: Located[int] | None = None
     qos: Qos | None = None
-    when: Expression | None = None
-    max_rate: Located[float] | None = None
-    keep: Located[Keep] | None = None
-    fields: FieldMap | None = None
+    when: Annotated[Expression | None, Words("when {}")] = None
+    max_rate: Annotated[
+        float | None,
+        RATE,
+        Words("at most {}"),
+        Misplaced(
+            with_ros=True,
+            message="with `source: ros` it is destinations that take a 'max_rate'",
+            hint="move it to {endpoint: NAME, max_rate: ...}",
+        ),
+    ] = None
+    keep: Annotated[Keep, Words("keeping the {}", beside="max_rate")] = Keep.FIRST
+    fields: Annotated[
+        FieldMap | None,
+        Misplaced(
+            with_ros=True,
+            message="with `source: ros` the fields to fill are the payload's",
+            hint="move 'fields' up to the route",
+        ),
+    ] = None
+
+
+AT_START = Quantity(parse=lambda word: word == "send", show=lambda sends: "send" if sends else "silent")
+DEFAULT_REPEAT = Located(100_000_000, SourceSpan("the default"))
+"""How often a deadman sends, in ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,13 +288,13 @@ class Deadman:
     """
 
     span: SourceSpan
-    timeout: Located[int]
+    timeout: Annotated[Located[int], DURATION]
     case: Located[str]
     fields: FieldMap
     to: tuple[Located[str], ...]
-    repeat: Located[int]
+    repeat: Annotated[Located[int], DURATION] = DEFAULT_REPEAT
     hands_over_to: tuple[Located[str], ...] = ()
-    at_start: bool = True
+    at_start: Annotated[bool, AT_START] = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,7 +305,7 @@ class Collect:
     by: Expression
     count: Expression
     order: Expression
-    timeout: Located[int]
+    timeout: Annotated[Located[int], DURATION]
 
 
 ANY = "any"
@@ -296,17 +326,24 @@ class Route:
     name: str
     span: SourceSpan
     case: Located[str]
-    sources: tuple[Located[str], ...]
-    destinations: tuple[Destination, ...]
-    topics: tuple[Topic, ...]
-    fields: FieldMap | None = None
-    ignore: Located[str] | None = None
-    ttl: Located[int] | None = None
+    sources: Annotated[tuple[Located[str], ...], Named("source")] = ()
+    destinations: tuple[Destination, ...] = ()
+    topics: tuple[Topic, ...] = ()
+    fields: Annotated[
+        FieldMap | None,
+        Misplaced(
+            with_ros=False,
+            message="'fields' of a route belongs to `source: ros`",
+            hint="a topic has its own 'fields'",
+        ),
+    ] = None
+    ignore: str | None = None
+    ttl: Annotated[Located[int] | None, DURATION, Words("dropped when older than {}")] = None
     deadman: Deadman | None = None
-    no_deadman: Located[str] | None = None
+    no_deadman: str | None = None
     for_each: Expression | None = None
     collect: Collect | None = None
-    priority: Located[Priority] | None = None
+    priority: Priority | None = None
 
     @property
     def is_outbound(self) -> bool:
@@ -347,6 +384,9 @@ class TopicPattern:
     is_regex: bool
     span: SourceSpan
 
+    def __str__(self) -> str:
+        return f"{{regex: {self.text}}}" if self.is_regex else self.text
+
 
 EACH = 0
 """The period of a gateway that sends every message."""
@@ -358,6 +398,9 @@ class TopicRate:
 
     pattern: TopicPattern
     period: int
+
+    def __str__(self) -> str:
+        return f"{self.pattern}: {topic_rate(self.period)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,20 +438,19 @@ class InboundDeadman:
     """
 
     span: SourceSpan
-    timeout: Located[int]
-    fields: FieldMap
-    repeat: Located[int]
-    at_start: bool = True
+    timeout: Annotated[Located[int], DURATION]
+    fields: Annotated[FieldMap, Named("send")]
+    repeat: Annotated[Located[int], DURATION] = DEFAULT_REPEAT
+    at_start: Annotated[bool, AT_START] = True
 
 
 @dataclass(frozen=True, slots=True)
 class Inbound:
-    """A topic that a gateway's clients may publish on. `max_rate` in Hz, `ttl` in ns."""
+    """A topic that a gateway's clients may publish on. `ttl` in ns."""
 
     topic: Topic
     span: SourceSpan
-    ttl: Located[int] | None = None
-    max_rate: Located[float] | None = None
+    ttl: Annotated[Located[int] | None, DURATION, Words("dropped when older than {}")] = None
     deadman: InboundDeadman | None = None
 
 
@@ -426,20 +468,20 @@ class Gateway:
     transport: Located[Transport]
     address: Located[Address] | None
     zenoh: ZenohSettings | None
-    receive: Located[Address] | None
     format: GatewayFormat
-    include: tuple[TopicPattern, ...]
-    exclude: tuple[TopicPattern, ...]
-    publish_period: int
-    schema_period: int
-    discovery_period: int
-    compression: int
-    rates: tuple[TopicRate, ...]
-    max_datagram: int
-    max_message: int
-    max_clients: int
-    max_clients_per_host: int
-    inbound: tuple[Inbound, ...]
+    receive: Annotated[Located[Address] | None, LOCAL] = None
+    include: Annotated[tuple[TopicPattern, ...], Named("topics.include")] = ()
+    exclude: Annotated[tuple[TopicPattern, ...], Named("topics.exclude")] = ()
+    publish_period: Annotated[int, PERIOD] = 500_000_000
+    schema_period: Annotated[int, INTERVAL] = 5_000_000_000
+    discovery_period: Annotated[int, INTERVAL] = 5_000_000_000
+    compression: Annotated[int, Named("compression.zstd")] = 0
+    rates: tuple[TopicRate, ...] = ()
+    max_datagram: Annotated[int, DATAGRAM_SIZE] = 1400
+    max_message: Annotated[int, MESSAGE_SIZE] = 16 << 20
+    max_clients: int = 1024
+    max_clients_per_host: int = 16
+    inbound: tuple[Inbound, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -448,7 +490,7 @@ class IgnoredGateway:
 
     name: str
     span: SourceSpan
-    reason: str
+    reason: Annotated[str, Named("ignore")]
 
 
 @dataclass(frozen=True, slots=True)

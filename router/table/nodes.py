@@ -1,6 +1,6 @@
-"""A YAML document as data with positions: scalars, mappings, sequences, each with its span.
+"""A YAML document as data with positions: scalars, mappings and sequences, each with its span.
 
-Knows no key and no meaning. `broken` marks what already has a finding, so that nobody reports it again.
+`broken` marks what has a finding already, so that nobody reports it again.
 """
 
 from __future__ import annotations
@@ -10,7 +10,54 @@ from dataclasses import dataclass, replace
 from typing import Union
 
 from router.errors import SourceSpan
-from router.table.places import TextPlace
+
+
+@dataclass(frozen=True, slots=True)
+class TextPlace:
+    """`stretches` are the parts of the text that one line of the file has word for word: each with the
+    offset into the text at which it begins. There are none where the text was made of something else
+    (escapes, a value from a variable); then findings blame the whole.
+    """
+
+    whole: SourceSpan
+    stretches: tuple[tuple[int, SourceSpan], ...] = ()
+
+    def part(self, start: int, end: int) -> SourceSpan:
+        """The span of characters `start` to `end` of the text (from 0, `end` exclusive), as far as its line goes."""
+        for offset, span in reversed(self.stretches):
+            if offset <= start:
+                return span.part(start - offset, min(end - offset, span.end_column - span.column))
+        return self.whole
+
+    @property
+    def is_whole_line(self) -> bool:
+        """The text stands in the file as it is, on one line and without quotes."""
+        return [span for _, span in self.stretches] == [self.whole]
+
+
+def locate(text: str, whole: SourceSpan, pieces: Iterable[tuple[int, int, str]]) -> TextPlace:
+    """The place of a text that was written in `pieces`, one for each line: line and column from 1, and what is there.
+
+    Blanks at the ends of a piece, and what the text has in place of a line end, do not count.
+    """
+    stretches: list[tuple[int, SourceSpan]] = []
+    offset = _after_blanks(text, 0)
+    for line, column, piece in pieces:
+        words = piece.strip()
+        if not text.startswith(words, offset):
+            return TextPlace(whole)
+        if words:
+            start = column + piece.index(words)
+            stretches.append((offset, SourceSpan(whole.file, line, start, start + len(words))))
+        offset = _after_blanks(text, offset + len(words))
+    return TextPlace(whole, tuple(stretches) if offset == len(text) else ())
+
+
+def _after_blanks(text: str, offset: int) -> int:
+    while offset < len(text) and text[offset].isspace():
+        offset += 1
+    return offset
+
 
 Path = tuple[Union[str, int], ...]
 """How to get from a document's root to a node: keys and indexes."""
@@ -85,13 +132,13 @@ def to_data(node: Node) -> object:
     return node.value
 
 
-def is_sound(node: Node) -> bool:
+def is_valid(node: Node) -> bool:
     """Nothing in it has a finding."""
     if node.broken:
         return False
     if isinstance(node, MappingNode):
-        return all(is_sound(entry.key) and is_sound(entry.value) for entry in node.entries.values())
-    return not isinstance(node, SequenceNode) or all(map(is_sound, node.items))
+        return all(is_valid(entry.key) and is_valid(entry.value) for entry in node.entries.values())
+    return not isinstance(node, SequenceNode) or all(map(is_valid, node.items))
 
 
 def marked_broken(node: Node, span: SourceSpan) -> Node:
@@ -140,3 +187,55 @@ def _child(node: Node, step: str | int) -> Node:
     if isinstance(node, SequenceNode) and isinstance(step, int):
         return node.items[step]
     raise LookupError(f"a {type(node).__name__} has no member {step!r}")
+
+
+_INDISPENSABLE = frozenset(
+    {"source", "ignore", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count", "order", "transport"}
+)
+"""Keys without which a route, a topic, a destination, a deadman, a collect or a gateway says nothing."""
+
+_SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"}, {"transport"})
+"""Keys with which it says something, whatever else it lacks or has too much."""
+
+_USES_NAMES_OF = {"for_each": ("fields", "destinations", "topics"), "collect": ("topics",)}
+"""Where a route's expressions use names (`item`, `items`) that there are only with this key."""
+
+
+def valid_part(entry: Entry) -> Entry | None:
+    """A case or a gateway without what has findings of its own, so that the rest is checked in the same run."""
+    value = None if entry.key.broken else _valid_part(entry.value)
+    return Entry(entry.key, value) if value else None
+
+
+def _valid_part(node: Node) -> Node | None:
+    if isinstance(node, MappingNode):
+        return _valid_mapping(node)
+    if node.broken:
+        return None
+    if isinstance(node, SequenceNode) and any(map(_says_something, node.items)):
+        return replace(node, items=tuple(part for item in node.items if (part := _valid_part(item))))
+    return node if is_valid(node) else None
+
+
+def _valid_mapping(node: MappingNode) -> MappingNode | None:
+    if node.broken and not _says_something(node):
+        return None
+    invalid = {key for key, entry in node.entries.items() if not is_valid(entry.value)}
+    if invalid & _INDISPENSABLE:
+        return None
+    left_out = {user for key, users in _USES_NAMES_OF.items() if key in invalid for user in users}
+    parts = {
+        key: _valid_entry(entry) if key in invalid else entry
+        for key, entry in node.entries.items()
+        if key not in left_out
+    }
+    return replace(node, entries={key: part for key, part in parts.items() if part})
+
+
+def _valid_entry(entry: Entry) -> Entry | None:
+    """What stands under a key of a route: broken as a whole it may be a mapping where a list belongs."""
+    return None if entry.value.broken else valid_part(entry)
+
+
+def _says_something(node: Node) -> bool:
+    return isinstance(node, MappingNode) and any(keys <= node.entries.keys() for keys in _SUFFICIENT)

@@ -1,13 +1,16 @@
-"""Numbers with units: durations, sizes, rates. Exact: what does not come to a whole base unit is refused.
+"""Numbers with units: durations, sizes and rates, from the text of a table and back.
 
-Knows text only. Everything raises ValueError with a sentence that says what is wrong.
+Parsing is exact: what does not come to a whole base unit is refused. Every `parse_*` raises ValueError with a sentence
+that says what is wrong. Formatting gives the shortest text that is parsed as the same number.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 _QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,9}))? ?([A-Za-z]+(?:/s)?)")
 _NANOSECONDS = {
@@ -52,6 +55,19 @@ LARGEST_DATAGRAM = 65_507
 """Bytes that one UDP datagram over IPv4 can carry."""
 
 MIN_MESSAGE, MAX_MESSAGE = 1000, 256 << 20
+
+_WHOLE = {"h": 3600 * 10**9, "min": 60 * 10**9}
+"""Nobody writes 1.5 min."""
+_DECIMAL = {"s": 10**9, "ms": 10**6, "us": 10**3}
+_MAX_DECIMALS = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """How a table writes a kind of number: `parse` reads a scalar's value, `show` gives its text."""
+
+    parse: Callable[[Any], Any]
+    show: Callable[[Any], str]
 
 
 def parse_duration(text: str) -> int:
@@ -143,3 +159,81 @@ def _exact(text: str, units: Mapping[str, int], base: str, largest: int, smalles
         least = "above zero" if smallest == 1 else f"at least {smallest}"
         raise ValueError(f"'{text}' must be {least} and at most {largest} {base}")
     return amount
+
+
+def duration(ns: int) -> str:
+    """`500 ms`, `1.5 s`, `1 h`."""
+    for unit, size in _WHOLE.items():
+        if ns >= size and ns % size == 0:
+            return f"{ns // size} {unit}"
+    for unit, size in _DECIMAL.items():
+        if ns >= size:
+            whole, rest = divmod(ns, size)
+            digits = f"{rest:0{len(str(size)) - 1}}".rstrip("0")
+            return f"{whole}.{digits} {unit}" if digits else f"{whole} {unit}"
+    return f"{ns} ns"
+
+
+def duration_or_never(ns: int) -> str:
+    """0 is never."""
+    return duration(ns) if ns else NEVER
+
+
+def period(ns: int) -> str:
+    """`500 ms`, or `each` for 0."""
+    return duration(ns) if ns else EACH
+
+
+def size(count: int) -> str:
+    """`4 MiB`, `64 kB`, `1400 B`, for buffers and messages."""
+    return _in_bytes(count, _BYTES)
+
+
+def disk_size(count: int) -> str:
+    """`4 GiB`."""
+    return _in_bytes(count, _DISK_BYTES)
+
+
+def data_rate(count: int) -> str:
+    """`500 kB/s`."""
+    return f"{_in_bytes(count, _BYTES)}/s"
+
+
+def rate(hertz: float) -> str:
+    """`30 Hz`."""
+    return _in_hertz(hertz, lambda text: parse_rate(text) == hertz)
+
+
+def topic_rate(ns: int) -> str:
+    """A gateway's period as `50 Hz`, or `each` for 0."""
+    return _in_hertz(1e9 / ns, lambda text: parse_topic_rate(text) == ns) if ns else EACH
+
+
+def _in_bytes(count: int, units: Mapping[str, int]) -> str:
+    """In the largest unit that gives a whole number."""
+    unit = next(unit for unit in reversed([*units]) if count % units[unit] == 0)
+    return f"{count // units[unit]} {unit}"
+
+
+def _in_hertz(hertz: float, is_same: Callable[[str], bool]) -> str:
+    """With as few decimals as say the same."""
+    for decimals in range(_MAX_DECIMALS):
+        text = f"{hertz:.{decimals}f} Hz"
+        if float(text[:-3]) and is_same(text):
+            return text
+    return f"{hertz:.{_MAX_DECIMALS}f} Hz"
+
+
+DURATION = Quantity(parse_duration, duration)
+PATIENCE = Quantity(lambda text: parse_patience(text) or None, lambda ns: duration_or_never(ns or 0))
+"""None for `never`."""
+COALESCE = Quantity(parse_coalesce, duration_or_never)
+PERIOD = Quantity(parse_period, period)
+INTERVAL = Quantity(parse_interval, duration)
+SIZE = Quantity(parse_size, size)
+DATAGRAM_SIZE = Quantity(parse_datagram_size, size)
+MESSAGE_SIZE = Quantity(parse_message_size, size)
+DISK_SIZE = Quantity(parse_disk_size, disk_size)
+DATA_RATE = Quantity(parse_data_rate, data_rate)
+RATE = Quantity(parse_rate, rate)
+TOPIC_RATE = Quantity(parse_topic_rate, topic_rate)

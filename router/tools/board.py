@@ -57,7 +57,7 @@ def command_cases(table: RouteTable, board: str) -> frozenset[str]:
     return frozenset(
         route.case.value
         for route in table.routes
-        if (route.priority is None or route.priority.value is Priority.COMMAND)
+        if route.priority in (None, Priority.COMMAND)
         and any(destination.endpoint.value == board for destination in route.destinations)
     )
 

@@ -17,7 +17,7 @@ from router.compiler.source import Source
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, Diagnostic, SourceSpan, UsageError
 from router.table.model import Expression
-from router.table.places import TextPlace
+from router.table.nodes import TextPlace
 from router.types.model import Enum, List, MessageType, Type
 from router.types.protobuf import PayloadCase
 

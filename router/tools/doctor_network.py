@@ -11,9 +11,10 @@ from contextlib import suppress
 from time import monotonic
 
 from router.compiler.program import Program
+from router.errors import Located
 from router.net.kernel import interface_is_up, port_holder
-from router.table.address import LOCATOR, BadAddressError, parse_address
-from router.table.model import Address, Located, Transport, bound_to
+from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
+from router.table.model import Transport, bound_to
 from router.tools.doctor_report import Finding, fine, problem, warning
 
 PATIENCE = 1.0

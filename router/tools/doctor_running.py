@@ -11,7 +11,7 @@ from router.compiler.program import Program
 from router.errors import TransportError
 from router.observe.snapshot import Snapshot, parse_metrics
 from router.table.model import RouteTable
-from router.table.quantities import duration
+from router.table.units import duration
 from router.tools.doctor_report import Finding, fine, problem, warning
 from router.tools.running_router import metrics, url_of
 

@@ -19,6 +19,7 @@ from router.compiler.topics import qos_of, resolved
 from router.errors import StartError, shown_path
 from router.gateway.publishers import by_frequency
 from router.ros.environment import check_environment, ros_remedy
+from router.table.keys import flat, phrases
 from router.table.model import (
     ANY,
     EACH,
@@ -34,8 +35,7 @@ from router.table.model import (
     Transport,
     ZenohSettings,
 )
-from router.table.quantities import duration
-from router.tools.settings_text import field_map, flat
+from router.table.units import duration
 from router.types.sizes import framed_size
 
 _WIDEST_CELL = 48
@@ -52,7 +52,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
         datagram = framed_size(case.number, case.max_size)
         yield f"  largest encoding: {case.max_size} bytes, {datagram} in its envelope"
     if route.ignore is not None:
-        yield f"  ignored: {route.ignore.value}"
+        yield f"  ignored: {route.ignore}"
         return
     yield f"  source: {', '.join(_source(source.value, table) for source in route.sources)}"
     yield from _settings(checked)
@@ -91,14 +91,14 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
         if deadman.hands_over_to:
             yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
     if route.no_deadman is not None:
-        yield f"  no deadman: {route.no_deadman.value}"
+        yield f"  no deadman: {route.no_deadman}"
 
 
 def _sent(route: Route) -> str:
     """What the deadman of a route sends."""
     assert route.deadman is not None  # noqa: S101 - the caller's choice
     fields = route.deadman.fields
-    return f"{route.deadman.case.value} {field_map(fields)}" if fields.entries else route.deadman.case.value
+    return f"{route.deadman.case.value} {fields}" if fields.entries else route.deadman.case.value
 
 
 def _source(name: str, table: RouteTable) -> str:
@@ -116,7 +116,7 @@ def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: st
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
     yield f"  destination {target.name} ({endpoint.address.value}): {how}{trimmed}  ({target.span})"
     if endpoint.budget is not None:
-        yield f"    {target.priority.value} within a budget of {endpoint.budget.value} bytes/s"
+        yield f"    {target.priority.value} within a budget of {endpoint.budget} bytes/s"
     if others := [other for other in target.deadmen if other != route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
     named = next(each for each in route.destinations if each.endpoint.value == target.name)
@@ -137,10 +137,11 @@ def _topic(served: CheckedTarget) -> Iterator[str]:
 def _served(served: CheckedTarget, named: Destination | Topic) -> Iterator[str]:
     """What a target is served with, and when."""
     target = served.target
-    if named.when is not None:
-        yield f"    when {named.when.text}"
-    if target.max_rate is not None:
-        yield f"    at most {target.max_rate:g} Hz, keeping the {target.keep.value}"
+    words = phrases(named)
+    if when := words.pop("when", None):
+        yield f"    {when}"
+    if words:
+        yield f"    {', '.join(words.values())}"
     yield from _mapping(served.rows)
     if target.plan is not None and (unset := list(_unset(target.plan, ""))):
         yield f"    left at their defaults: {', '.join(unset)}"
@@ -270,10 +271,9 @@ def _inbound(entry: CheckedInbound) -> Iterator[str]:
     inbound = entry.inbound
     yield f"  from clients {entry.topic}: {entry.type}  ({inbound.span})"
     yield _quality(inbound.topic)
-    if inbound.ttl is not None:
-        yield f"    dropped when older than {duration(inbound.ttl.value)}"
-    if inbound.max_rate is not None:
-        yield f"    at most {inbound.max_rate.value:g} Hz"
+    yield from (f"    {words}" for words in phrases(inbound).values())
+    if inbound.topic.max_rate is not None:
+        yield f"    {phrases(inbound.topic)['max_rate']}"
     if inbound.deadman is not None and entry.stop is not None:
         timeout, repeat = duration(inbound.deadman.timeout.value), duration(inbound.deadman.repeat.value)
         start = _at_start(inbound.deadman.at_start)

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
-from router.table.model import Address
+from router.table.addresses import Address
 from router.tools.listening import Arrival
 
 _TRY_AGAIN = 0.5

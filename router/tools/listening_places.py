@@ -11,8 +11,9 @@ from collections.abc import Callable, Sequence
 from urllib.parse import parse_qs
 
 from router.compiler.selection import matcher, pattern_problem
-from router.errors import SourceSpan, UsageError, did_you_mean
-from router.table.model import Address, GatewayFormat, Located, TopicPattern, ZenohSettings
+from router.errors import Located, SourceSpan, UsageError, did_you_mean
+from router.table.addresses import Address
+from router.table.model import GatewayFormat, TopicPattern, ZenohSettings
 from router.tools import places
 from router.tools.listening import Source
 

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
 from router.gateway.packets import PacketError
-from router.table.model import Address, GatewayFormat
+from router.table.addresses import Address
+from router.table.model import GatewayFormat
 from router.tools.listening_connected import ConnectedSource
 from router.tools.listening_streams import Splitter
 

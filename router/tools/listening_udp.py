@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from router.gateway.packets import Packet, pack
 from router.net.kernel import ask_for_receive_buffer, drops
-from router.table.model import Address
+from router.table.addresses import Address
 from router.table.units import LARGEST_DATAGRAM
 from router.tools import places
 from router.tools.listening import Arrival

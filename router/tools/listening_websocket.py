@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
-from router.table.model import Address
+from router.table.addresses import Address
 from router.tools.listening_connected import CONNECT_TIMEOUT, ConnectedSource
 from router.tools.listening_streams import LONGEST
 

@@ -11,8 +11,8 @@ from pathlib import Path, PurePosixPath
 
 from router.compiler import Checked
 from router.errors import UsageError, did_you_mean, nearest, shown_path
+from router.table.compose import resolve, surprise
 from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, RouteTable
-from router.table.scalars import resolve, surprise
 from router.types.lock_file import read_lock
 from router.types.model import Enum, MessageType
 from router.types.protobuf import Envelope, ProtoSchema, load_protos

@@ -13,7 +13,8 @@ from functools import cache
 from router.compiler.network import recognisers
 from router.errors import UsageError, did_you_mean
 from router.net.kernel import interface_address
-from router.table.model import Address, Listener, RouteTable
+from router.table.addresses import Address
+from router.table.model import Listener, RouteTable
 
 ANY_HOST = "0.0.0.0"
 LOOPBACK = "127.0.0.1"
@@ -69,7 +70,7 @@ def reachable(address: Address, interface: str | None = None) -> Address:
 
 def listener_address(listener: Listener) -> Address:
     """Where to send from this computer so that a router of the table receives it there. Raises UsageError."""
-    return reachable(listener.address.value, listener.interface.value if listener.interface else None)
+    return reachable(listener.address.value, listener.interface)
 
 
 def peer_names(table: RouteTable | None) -> Callable[..., str]:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 
 from router.errors import TransportError, UsageError, did_you_mean
 from router.recording.reader_mcap import Recorded, Recording
-from router.table.model import Address, RouteTable
+from router.table.addresses import Address
+from router.table.model import RouteTable
 from router.tools import places
 
 MOST_SOCKETS = 256

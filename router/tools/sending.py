@@ -6,7 +6,7 @@ import socket
 from dataclasses import dataclass
 
 from router.errors import TransportError
-from router.table.model import Address
+from router.table.addresses import Address
 from router.tools.pacing import paced
 
 

@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from router.compiler.program import DeadmanPlan
 from router.engine.wire import Wire
 from router.errors import UsageError
-from router.table.model import Address, Endpoint, RouteTable
+from router.table.addresses import Address
+from router.table.model import Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, boards
 from router.tools.inbox import Inbox

@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
-from router.table.quantities import duration
+from router.table.units import duration
 from router.tools.top import Order, RouteRow, TargetRow, View, ordered, unwanted
 from router.values import rate_text
 

@@ -19,8 +19,8 @@ from pathlib import Path
 from google.protobuf.descriptor import Descriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
-from router.table.model import ENVELOPE, ONEOF, Located
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, shown_path
+from router.table.model import ENVELOPE, ONEOF
 from router.types.descriptors import declared_type
 from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, by_number, read_lock, short_name
 from router.types.proto_source import Part

@@ -18,7 +18,8 @@ from router.compiler.program import ListenerPlan
 from router.errors import SourceSpan
 from router.net import udp
 from router.net.udp import Inherited, Listener
-from router.table.model import Address, Framing
+from router.table.addresses import Address
+from router.table.model import Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 SO_TIMESTAMPNS = 35

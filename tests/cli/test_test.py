@@ -17,7 +17,7 @@ from router.compiler.lookup import Definitions
 from router.rehearsal.reading import read_test_file
 from router.rehearsal.shape import SCHEMA
 from router.rehearsal.tests import prove
-from router.table import shape
+from router.table.schema import table_schema
 from tests.tables import PROTOS, RIG, ROUTES
 
 REPOSITORY = Path(__file__).parents[2]
@@ -241,4 +241,4 @@ def test_schema_is_one_and_describes_every_key() -> None:
     for definition in schema["definitions"].values():
         for name, key in definition.get("properties", {}).items():
             assert "$ref" in key or key.get("description"), name
-    assert shape.table_schema()["$schema"] == schema["$schema"]
+    assert table_schema()["$schema"] == schema["$schema"]

@@ -17,7 +17,7 @@ from router.engine.delivery import MAPPING_FAILURES, Report
 from router.engine.freshness import Freshness
 from router.errors import Diagnostic, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
-from router.table.places import TextPlace
+from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
 from tests.engine.plain import plain_outlets
 from tests.oracles.reference import fill

@@ -14,7 +14,8 @@ from router.compiler.mapping import build
 from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
 from router.compiler.source import Source
-from router.table.model import EnvelopeSettings, FieldMap, Located
+from router.errors import Located
+from router.table.model import EnvelopeSettings, FieldMap
 from router.types.model import Field, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of

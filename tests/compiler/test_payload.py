@@ -15,7 +15,7 @@ import pytest
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, MappingError, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
-from router.table.places import TextPlace
+from router.table.nodes import TextPlace
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import AUTO, RECEIVED_AT, SPAN, field_map, findings_of, scope_of
 from tests.compiler.payloads import assert_same_bytes, compiled_envelope, made, made_wire, reference_envelope

@@ -12,17 +12,11 @@ from hypothesis import strategies as st
 
 from router.compiler import selection
 from router.compiler.selection import TopicSelector, is_hidden, matcher, pattern_problem
-from router.errors import SourceSpan
-from router.table.build_gateways import DEFAULT_PUBLISH_PERIOD
-from router.table.model import EACH, Gateway, GatewayFormat, Located, TopicPattern, TopicRate, Transport
+from router.errors import Located, SourceSpan
+from router.table.model import EACH, Gateway, GatewayFormat, TopicPattern, TopicRate, Transport
 
 SPAN = SourceSpan("table.yaml", 1, 1, 2)
-GATEWAY = Gateway(
-    name="it", span=SPAN, transport=Located(Transport.UDP, SPAN), address=None, zenoh=None, receive=None,
-    format=GatewayFormat.GATEWAY_V1, include=(), exclude=(), publish_period=DEFAULT_PUBLISH_PERIOD, schema_period=1,
-    discovery_period=1, compression=0, rates=(), max_datagram=1400, max_message=1000, max_clients=1,
-    max_clients_per_host=1, inbound=(),
-)  # fmt: skip
+GATEWAY = Gateway("it", SPAN, Located(Transport.UDP, SPAN), None, None, GatewayFormat.GATEWAY_V1)
 
 
 NO_RATES: Mapping[str, int] = {}
@@ -145,7 +139,7 @@ def test_the_first_pattern_that_includes_a_topic_is_known() -> None:
 
 def test_the_first_rate_that_matches_counts_and_others_have_the_publish_period() -> None:
     rates = selector(rates={"/a/imu": 20, "/a/**": EACH, "/a/b": 7})
-    assert [rates.period(topic) for topic in ("/a/imu", "/a/b", "/b")] == [20, EACH, DEFAULT_PUBLISH_PERIOD]
+    assert [rates.period(topic) for topic in ("/a/imu", "/a/b", "/b")] == [20, EACH, GATEWAY.publish_period]
     rated = rates.rated_by("/a/b")
     assert rated
     assert rated.text == "/a/**"

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.compiler.topics import PROFILES, qos_of, resolved, topic_name_finding
-from router.errors import Code, SourceSpan
-from router.table.model import Located, NodeSettings, Qos, Topic
+from router.errors import Code, Located, SourceSpan
+from router.table.model import NodeSettings, Qos, Topic
 from tests.compiler.conftest import CheckText
 
 SPAN = SourceSpan("table.yaml")

@@ -9,8 +9,8 @@ from typing import cast
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from hypothesis import strategies as st
 
-from router.errors import SourceSpan
-from router.table.model import EnvelopeSettings, Located
+from router.errors import Located, SourceSpan
+from router.table.model import EnvelopeSettings
 from router.types.protobuf import Envelope, find_envelope, load_protos
 from tests.tables import PROTOS
 

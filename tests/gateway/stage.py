@@ -25,7 +25,7 @@ from router.gateway.style import Style
 from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Client, Events, Frame
 from router.ros.topics import RosTopics, SeenPublisher
-from router.table.model import Address
+from router.table.addresses import Address
 from router.types.model import MessageType
 from router.types.ros import ros_interfaces
 from tests.tables import PROTOS

@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from router.clock import wall_ns
-from router.errors import SourceSpan
+from router.errors import Located, SourceSpan
 from router.gateway.transport import arrival as gateway_arrival
 from router.gateway.transport.arrival import AWAY_NS, CATCH_UP_NS, LoopClock
 from router.gateway.transport.base import Transport
@@ -22,7 +22,8 @@ from router.gateway.transport.stream import Limits, StreamTransport
 from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.websocket import WebsocketTransport
 from router.gateway.transport.zenoh import ZenohTransport
-from router.table.model import Address, Located, ZenohSettings
+from router.table.addresses import Address
+from router.table.model import ZenohSettings
 from tests.gateway.transport_events import Events, opened, until
 from tests.ports import free_port
 

@@ -21,7 +21,7 @@ from router.gateway.transport import stream as gateway_stream
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client
 from router.gateway.transport.stream import READ_PER_TURN, Limits
 from router.gateway.transport.tcp import TcpTransport
-from router.table.model import Address
+from router.table.addresses import Address
 from tests.gateway.transport_events import Events, close_while_clients_come, data, opened, resident_kib, until
 
 ANY = Address("127.0.0.1", 0)

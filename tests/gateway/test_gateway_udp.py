@@ -16,7 +16,7 @@ from router.gateway.transport import binding as gateway_binding
 from router.gateway.transport import udp as gateway_udp
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER
 from router.gateway.transport.udp import UdpTransport
-from router.table.model import Address
+from router.table.addresses import Address
 from tests.gateway.transport_events import Events, data, opened, until
 from tests.ports import free_port
 

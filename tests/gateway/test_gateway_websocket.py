@@ -20,7 +20,7 @@ from router.gateway.transport import websocket as gateway_websocket
 from router.gateway.transport.base import HIGH_WATER, Client
 from router.gateway.transport.stream import Limits
 from router.gateway.transport.websocket import WebsocketTransport
-from router.table.model import Address
+from router.table.addresses import Address
 from tests.gateway.transport_events import Events, close_while_clients_come, data, opened, resident_kib, until
 
 ANY = Address("127.0.0.1", 0)

@@ -13,12 +13,12 @@ import pytest
 import zenoh
 from structlog.testing import capture_logs
 
-from router.errors import SourceSpan, StartError
+from router.errors import Located, SourceSpan, StartError
 from router.gateway.transport import zenoh as gateway_zenoh
 from router.gateway.transport.base import HIGH_WATER, Client, Frame
 from router.gateway.transport.zenoh import ZenohTransport
 from router.gateway.transport.zenoh_session import session_config
-from router.table.model import Located, ZenohConfig, ZenohSettings
+from router.table.model import ZenohConfig, ZenohSettings
 from tests.gateway.transport_events import Events, data, opened, until
 from tests.ports import free_port
 

@@ -15,7 +15,7 @@ from router.gateway.transport import websocket as gateway_websocket
 from router.gateway.transport.stream import Limits, StreamTransport
 from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.websocket import WebsocketTransport
-from router.table.model import Address
+from router.table.addresses import Address
 from tests.gateway.transport_events import Events, opened, until
 
 ANY = Address("127.0.0.1", 0)

@@ -18,9 +18,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not 
 
 from structlog.testing import capture_logs
 
-from router.errors import SourceSpan
+from router.errors import Located, SourceSpan
 from router.gateway.transport.zenoh import ZenohTransport
-from router.table.model import Located, ZenohConfig, ZenohSettings
+from router.table.model import ZenohConfig, ZenohSettings
 from tests.gateway.transport_events import Events
 
 HERE = SourceSpan("routes/rover.yaml")

@@ -24,7 +24,8 @@ from router.net import receiver
 from router.net.kernel import SO_RCVBUFFORCE
 from router.net.receiver import FOR_SOCKETS, SAMPLE, Coalescing, ReceiveThread
 from router.net.udp import Listener, Sender
-from router.table.model import Address, Framing
+from router.table.addresses import Address
+from router.table.model import Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 LIMIT = 1000

@@ -18,12 +18,12 @@ from websockets.sync.client import connect
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.errors import SourceSpan, StartError
+from router.errors import Located, SourceSpan, StartError
 from router.observe import foxglove
 from router.observe.foxglove import FoxgloveServer
 from router.observe.running import Running
 from router.recording.mirror import Consumer, MirroredDatagram
-from router.table.model import Address, Located
+from router.table.addresses import Address
 from tests.observe.foxglove_client import PATIENCE, FoxgloveClient
 from tests.tables import PROTOS, ROUTES
 

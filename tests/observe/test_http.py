@@ -28,7 +28,8 @@ from router.observe.responses import plain
 from router.observe.route_map import Measures, RouteMap, route_map
 from router.observe.running import ReloadResult
 from router.observe.tap import MAGIC
-from router.table.model import Address, RouteTable
+from router.table.addresses import Address
+from router.table.model import RouteTable
 from tests.acceptance.site import wait_until
 from tests.observe.fake_running import FakeRunning, sim_program
 

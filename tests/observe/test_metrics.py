@@ -18,7 +18,7 @@ from router.errors import SourceSpan, StartError
 from router.observe.http import HttpServer
 from router.observe.metrics import CountersCollector
 from router.observe.running import Running
-from router.table.model import Address
+from router.table.addresses import Address
 
 SPAN = SourceSpan("routes/rover.yaml", 8, 20, 34)
 LOOPBACK = Address("127.0.0.1", 0)

@@ -15,7 +15,7 @@ from router.errors import SourceSpan
 from router.observe import responses
 from router.observe.http import HttpServer
 from router.observe.last_values import LastValues
-from router.table.model import Address
+from router.table.addresses import Address
 from tests.gateway.browser import Browser, Page, executable
 from tests.observe.fake_running import FakeRunning, sim_program
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from router.engine.wire import Wire, wire_of_protos
-from router.errors import SourceSpan
+from router.errors import Located, SourceSpan
 from router.observe.running import Running
 from router.recording.channels import Channels
 from router.recording.chunk import Chunk
@@ -19,7 +19,8 @@ from router.recording.encoding import Encoder
 from router.recording.file import RecordingFile
 from router.recording.mirror import Classifier, MirroredDatagram
 from router.recording.reader_mcap import Recorded, Recording
-from router.table.model import Address, Endpoint, EndpointKind, Framing, Located, RecordSettings, RouteTable
+from router.table.addresses import Address
+from router.table.model import Endpoint, EndpointKind, Framing, RecordSettings, RouteTable
 from tests.tables import PROTOS
 
 SPAN = SourceSpan("table.yaml", 3)

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.assets import asset
-from router.table.address import BadAddressError, parse_address
-from router.table.model import Address
-from router.table.shape import SCHEMA
+from router.table.addresses import Address, BadAddressError, parse_address
+from router.table.schema import SCHEMA
 
 PATTERN = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))["definitions"]["address"]["pattern"]
 

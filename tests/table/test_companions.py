@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from router.table.model import Address, RouteTable
+from router.table.addresses import Address
+from router.table.model import RouteTable
 from tests.table.tables import load
 
 HEAD = """\

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from router.errors import Code
-from router.table.model import Address
+from router.table.addresses import Address
 from tests.table.tables import GOOD, load
 
 

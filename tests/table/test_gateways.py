@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from router.errors import Code, Diagnostic
-from router.table.model import EACH, Address, Gateway, GatewayFormat, RouteTable, Transport, ZenohSettings
+from router.table.addresses import Address
+from router.table.model import EACH, Gateway, GatewayFormat, RouteTable, Transport, ZenohSettings
 from tests.table.tables import GATEWAY, load, places
 
 HEAD = """\
@@ -53,14 +54,13 @@ def test_what_clients_may_publish_is_typed(tmp_path: Path) -> None:
     first, second = table_with(tmp_path, GATEWAY)[0].gateways["vr_headset"].inbound
     assert (first.topic.topic.value, first.topic.type.value) == ("/cmd_vel", "geometry_msgs/msg/Twist")
     assert first.ttl
-    assert first.max_rate
     assert first.deadman
-    assert (first.ttl.value, first.max_rate.value) == (300_000_000, 20.0)
+    assert (first.ttl.value, first.topic.max_rate) == (300_000_000, 20.0)
     assert (first.deadman.timeout.value, first.deadman.repeat.value) == (500_000_000, 100_000_000)
     assert [entry.path for entry in first.deadman.fields.entries] == [("linear", "x"), ("angular", "z")]
     assert second.deadman
     assert (second.deadman.repeat.value, second.deadman.fields.entries) == (50_000_000, ())
-    assert (second.ttl, second.max_rate) == (None, None)
+    assert (second.ttl, second.topic.max_rate) == (None, None)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from router.errors import Code
-from router.table.networks import ADDRESSES
-from router.table.shape import table_schema
+from router.table.addresses import ADDRESSES
+from router.table.schema import table_schema
 from tests.table.tables import load
 
 LOCAL = """\

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
+from router.table.compose import resolve, surprise
 from router.table.nodes import Plain
-from router.table.scalars import resolve, surprise
 
 
 @pytest.mark.parametrize(

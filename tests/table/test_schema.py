@@ -6,12 +6,26 @@ from collections.abc import Iterator
 from typing import Any
 
 import jsonschema
+import pytest
 
-from router.table import build_gateways
-from router.table.build import DEFAULT_NODE, DEFAULT_RECEIVE_BUFFER
-from router.table.build_routes import DEFAULT_REPEAT
-from router.table.shape import table_schema
-from router.table.units import parse_duration, parse_size
+from router.table.keys import keys_of
+from router.table.model import (
+    Collect,
+    Deadman,
+    Destination,
+    Endpoint,
+    Gateway,
+    Inbound,
+    InboundDeadman,
+    Listener,
+    NodeSettings,
+    Qos,
+    RecordSettings,
+    Route,
+    Topic,
+    ZenohSettings,
+)
+from router.table.schema import table_schema
 
 
 def keys(schema: object, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
@@ -51,36 +65,54 @@ def test_mappings_with_known_keys_refuse_others() -> None:
     assert all(schema["additionalProperties"] is False for schema in [table_schema(), *closed])
 
 
-def test_documented_defaults_are_those_of_the_code() -> None:
-    properties = table_schema()["properties"]
-    assert properties["node"]["default"] == {"name": DEFAULT_NODE.name, "namespace": DEFAULT_NODE.namespace}
-    buffer = table_schema()["definitions"]["listener"]["properties"]["receive_buffer"]
-    assert parse_size(buffer["default"]) == DEFAULT_RECEIVE_BUFFER
-    repeat = table_schema()["definitions"]["deadman"]["else"]["properties"]["repeat"]
-    assert parse_duration(repeat["default"]) == DEFAULT_REPEAT
+MODELS: list[tuple[str, type, set[str]]] = [
+    ("listener", Listener, set()),
+    ("endpoint", Endpoint, set()),
+    ("destination", Destination, set()),
+    ("topic", Topic, set()),
+    ("qos", Qos, set()),
+    ("route", Route, {"case", "no_deadman"}),
+    ("deadman", Deadman, {"case", "fields"}),
+    ("collect", Collect, set()),
+    ("gateway", Gateway, {"address", "zenoh"}),
+    ("zenoh", ZenohSettings, set()),
+    ("inbound", Inbound, {"topic"}),
+    ("inbound_deadman", InboundDeadman, set()),
+]
+"""Definitions, the classes that declare their keys, and which of the fields are no keys of their own."""
+WITHIN = {("deadman", "send"), ("gateway", "ignore")}
+"""Keys that are read with the mapping that they stand in."""
 
 
-def test_documented_defaults_of_gateways_are_those_of_the_code() -> None:
-    definitions = table_schema()["definitions"]
-    given = {key: schema.get("default") for key, schema in definitions["gateway"]["properties"].items()}
-    assert parse_duration(given["publish_period"]) == build_gateways.DEFAULT_PUBLISH_PERIOD
-    assert parse_duration(given["schema_period"]) == build_gateways.DEFAULT_INTERVAL
-    assert parse_duration(given["discovery_period"]) == build_gateways.DEFAULT_INTERVAL
-    assert parse_size(given["max_datagram"]) == build_gateways.DEFAULT_MAX_DATAGRAM
-    assert parse_size(given["max_message"]) == build_gateways.DEFAULT_MAX_MESSAGE
-    assert given["max_clients"] == build_gateways.DEFAULT_MAX_CLIENTS
-    assert given["max_clients_per_host"] == build_gateways.DEFAULT_MAX_CLIENTS_PER_HOST
-    assert definitions["zenoh"]["properties"]["mode"]["default"] == build_gateways.DEFAULT_MODE
-    repeat = definitions["inbound_deadman"]["properties"]["repeat"]
-    assert parse_duration(repeat["default"]) == DEFAULT_REPEAT
+def properties(definition: str) -> dict[str, Any]:
+    """What a mapping may have; of the kinds of a part the one that is a mapping."""
+    schema = table_schema()["definitions"][definition]
+    found = next(part["properties"] for part in (schema, schema.get("then", {}), schema.get("else", {}))
+                 if "properties" in part)  # fmt: skip
+    return dict(found)
 
 
-def test_documented_default_formats_are_those_of_the_code() -> None:
-    conditions = table_schema()["definitions"]["gateway"]["allOf"]
-    formats = {}
-    for condition in conditions:
-        for part in condition.get("then", {}).get("allOf", ()):
-            if "properties" in part:
-                [transport] = condition["if"]["properties"]["transport"]["required"]
-                formats[transport] = part["properties"]["format"]["default"]
-    assert formats == {transport.value: default.value for transport, default in build_gateways.DEFAULT_FORMATS.items()}
+@pytest.mark.parametrize(("definition", "model", "others"), MODELS)
+def test_the_model_declares_the_keys_of_the_schema(definition: str, model: type, others: set[str]) -> None:
+    declared = {key.name.partition(".")[0] for key in keys_of(model) if key.attribute not in others | {"name"}}
+    inherited = {key.name for key in keys_of(Topic)} if model is Inbound else set()
+    known = {name for name in properties(definition) if (definition, name) not in WITHIN}
+    assert (declared - known, known - declared - inherited) == (set(), set())
+
+
+def test_documented_defaults_are_those_of_the_model() -> None:
+    named = [(model, properties(definition)) for definition, model, _ in MODELS]
+    top = table_schema()["properties"]
+    compared = 0
+    for model, known in [
+        *named,
+        (RecordSettings, top["record"]["properties"]),
+        (NodeSettings, top["node"]["properties"]),
+    ]:
+        for key in keys_of(model):
+            documented = resolved(known.get(key.name, {})).get("default")
+            if documented not in (None, [], {}) and key.default is not None:
+                assert key.text(key.default).replace(" ", "").lower() == str(documented).lower(), (model, key.name)
+                compared += 1
+    assert compared > 20
+    assert top["node"]["default"] == {"name": NodeSettings().name, "namespace": NodeSettings().namespace}

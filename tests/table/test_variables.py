@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from router.errors import Code
-from router.table.variables import fill
+from router.table.source import fill
 
 ENVIRON = {"HOST": "10.0.0.1", "EMPTY": "", "NESTED": "${HOST}"}
 

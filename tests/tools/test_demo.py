@@ -32,8 +32,10 @@ from demo.page import Shown, look
 from demo.places import free_ros_domain, taken_places
 from demo.recorded import Recorded, first_of
 from demo.verdict import judge
+from router.errors import Located
 from router.table import read_table
-from router.table.model import Address, Located, RouteTable
+from router.table.addresses import Address
+from router.table.model import RouteTable
 from router.tools.places import open_udp
 from router.tools.top import RouteRow, TargetRow, View
 from tests.ports import free_port

@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 
 from router.errors import UsageError
-from router.table.model import Address, GatewayFormat
+from router.table.addresses import Address
+from router.table.model import GatewayFormat
 from router.tools.listening_places import open_source, remote, topic_filter
 from tests.ports import free_port
 

@@ -12,8 +12,10 @@ import pytest
 import zenoh
 from websockets.sync.server import ServerConnection, serve
 
+from router.errors import Located
 from router.gateway.packets import unpack
-from router.table.model import Address, GatewayFormat, Located, ZenohSettings
+from router.table.addresses import Address
+from router.table.model import GatewayFormat, ZenohSettings
 from router.tools.listening import Source
 from router.tools.listening_places import open_source
 from router.tools.listening_tcp import TcpSource

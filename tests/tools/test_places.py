@@ -8,7 +8,8 @@ import pytest
 
 from router.errors import UsageError
 from router.table import read_table
-from router.table.model import Address, RouteTable
+from router.table.addresses import Address
+from router.table.model import RouteTable
 from router.tools import places
 
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import socket
 
-from router.table.model import Address
+from router.table.addresses import Address
 from router.tools.places import open_udp
 from router.tools.sending import Sent, send
 

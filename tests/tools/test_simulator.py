@@ -13,7 +13,8 @@ import pytest
 from router.engine.wire import Wire
 from router.errors import UsageError
 from router.table import read_table
-from router.table.model import Address, RouteTable
+from router.table.addresses import Address
+from router.table.model import RouteTable
 from router.tools.board import State
 from router.tools.places import LOOPBACK, open_udp, reachable
 from router.tools.sim_view import SimView

@@ -4,7 +4,7 @@ import json
 import socket
 
 from router.engine.wire import Wire
-from router.table.model import Address
+from router.table.addresses import Address
 from router.tools.places import open_udp
 from router.tools.tap import heard, listen
 from router.values import payload

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from router.errors import Diagnostic, SourceSpan, TableError
-from router.table.model import EnvelopeSettings, Located
+from router.errors import Diagnostic, Located, SourceSpan, TableError
+from router.table.model import EnvelopeSettings
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.tables import PROTOS
 

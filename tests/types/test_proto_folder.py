@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.table.model import EnvelopeSettings, Located
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError
+from router.table.model import EnvelopeSettings
 from router.types.protobuf import load_protos
 from tests.types.conftest import settings
 

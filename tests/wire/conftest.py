@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from router.errors import SourceSpan
-from router.table.model import EnvelopeSettings, Located
+from router.errors import Located, SourceSpan
+from router.table.model import EnvelopeSettings
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.tables import PROTOS
 

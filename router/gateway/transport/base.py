@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
-from router.table.model import Address
+from router.table.addresses import Address
 
 HIGH_WATER = 256 * 1024
 """Bytes waiting for a client from which on nothing more is written to it."""

@@ -11,7 +11,7 @@ from contextlib import suppress
 from router.errors import StartError
 from router.log import logger
 from router.net.kernel import port_taken
-from router.table.model import Address
+from router.table.addresses import Address
 
 RETRY_SECONDS = 1.0
 """Between two attempts at an address that this machine does not have."""

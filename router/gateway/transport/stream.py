@@ -15,7 +15,7 @@ from router.gateway.transport.arrival import LoopClock
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import MOST_UNACCEPTED, Binding, listen_at
 from router.log import FloodLog, logger
-from router.table.model import Address
+from router.table.addresses import Address
 
 PIECE = 64 * 1024
 """Bytes written to a connection at a time. Frames are shared by all clients; only one piece is copied for each."""

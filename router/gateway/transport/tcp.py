@@ -19,7 +19,7 @@ from router.gateway.transport.stream import (
     StreamClient,
     StreamTransport,
 )
-from router.table.model import Address
+from router.table.addresses import Address
 
 LENGTH = struct.Struct("<I")
 """Precedes each packet."""

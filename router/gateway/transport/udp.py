@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client, Events, Frame
 from router.gateway.transport.binding import Binding
 from router.net.kernel import arrivals, ask_for_receive_buffer, drops
-from router.table.model import Address
+from router.table.addresses import Address
 from router.table.units import LARGEST_DATAGRAM
 
 SEND_BUFFER = 4 << 20

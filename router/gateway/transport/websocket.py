@@ -33,7 +33,7 @@ from router.gateway.transport.stream import (
     StreamTransport,
 )
 from router.log import logger
-from router.table.model import Address
+from router.table.addresses import Address
 
 PING_SECONDS = 20.0
 """Interval of pings, and the time a client has to answer one."""

@@ -30,7 +30,8 @@ from router.gateway.transport.zenoh_session import (
     this_owner,
 )
 from router.log import logger
-from router.table.model import Address, ZenohSettings
+from router.table.addresses import Address
+from router.table.model import ZenohSettings
 from router.threads import DaemonThread
 
 MOST = 16 << 20

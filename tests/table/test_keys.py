@@ -1,17 +1,19 @@
-"""Settings as flat text: what is told of a table can be written into one, and means the same there."""
+"""Keys as they are shown: what is shown of a table can be written into one, and means the same there."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from router.table import model
+from router.table.keys import flat, keys_of
 from router.table.model import RouteTable
-from router.table.shape import table_schema
-from router.tools.settings_text import NUMBERS, flat
+from router.table.schema import table_schema
 from tests.table.tables import load
 
 TABLE = """\
@@ -63,22 +65,22 @@ def table_of(folder: Path, chosen: dict[str, dict[str, str]]) -> RouteTable:
     return table
 
 
-def told(table: RouteTable) -> dict[str, dict[str, str]]:
+def shown(table: RouteTable) -> dict[str, dict[str, str]]:
     parts = {
         "listener": table.listeners["rover"],
         "endpoint": table.endpoints["arm"],
         "record": table.record,
         "gateway": table.gateways["dashboard"],
     }
-    return {part: {key: flat(model)[key] for key in SETTINGS[part]} for part, model in parts.items()}
+    return {part: {key: flat(settings)[key] for key in SETTINGS[part]} for part, settings in parts.items()}
 
 
-def test_what_is_told_of_a_setting_means_the_same_in_a_table(tmp_path: Path) -> None:
+def test_what_is_shown_of_a_setting_means_the_same_in_a_table(tmp_path: Path) -> None:
     @settings(max_examples=25)
     @given(st.fixed_dictionaries({part: st.fixed_dictionaries(keys) for part, keys in SETTINGS.items()}))
     def holds(chosen: dict[str, dict[str, str]]) -> None:
         table = table_of(tmp_path, chosen)
-        again = table_of(tmp_path, told(table))
+        again = table_of(tmp_path, shown(table))
         for part in ("listeners", "endpoints", "gateways"):
             assert flat(getattr(again, part)) == flat(getattr(table, part))
         assert again.record == table.record
@@ -87,8 +89,10 @@ def test_what_is_told_of_a_setting_means_the_same_in_a_table(tmp_path: Path) -> 
     holds()
 
 
-def test_every_number_with_a_unit_is_told_with_it() -> None:
-    assert set(_with_units(table_schema(), "")) - set(NUMBERS) == set()
+def test_every_number_with_a_unit_is_shown_with_it() -> None:
+    models = [part for part in vars(model).values() if is_dataclass(part) and isinstance(part, type)]
+    shown = {key.name for part in models for key in keys_of(part) if key.quantity is not None}
+    assert set(_with_units(table_schema(), "")) - shown == set()
 
 
 def _with_units(node: Any, key: str) -> Iterator[str]:

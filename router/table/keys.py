@@ -1,0 +1,174 @@
+"""Keys of a table. Each is declared once, as a field of a class in `model`.
+
+The field's name, type and default are those of the key. Marks in `Annotated` say the rest:
+
+    max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
+
+A `Quantity` parses and shows a number with a unit. `Named`, `Words` and `Misplaced` are below. `build` reads objects by
+these declarations, `flat` and `phrases` show them.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+from router.errors import Located, SourceSpan
+from router.table.nodes import TextPlace
+from router.table.units import Quantity
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """The name of a key that is not that of its field; with dots where it stands inside other keys."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """How people are told of the key's value, which replaces `{}`; said only where the table has `beside` as well."""
+
+    text: str
+    beside: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Misplaced:
+    """The finding for the key in a route from ROS (`with_ros`), or in any other route."""
+
+    with_ros: bool
+    message: str
+    hint: str
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key as its field declares it. `type` is that of the value, of one item where it `is_list`."""
+
+    name: str
+    attribute: str
+    type: Any
+    is_list: bool
+    is_located: bool
+    quantity: Quantity | None
+    words: Words | None
+    misplaced: Misplaced | None
+    default: Any
+
+    def text(self, value: Any) -> str:
+        """The value as a table writes it."""
+        if self.quantity is not None:
+            return self.quantity.show(value.value if isinstance(value, Located) else value)
+        return _text(value)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, Located):
+        return _text(value.value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, enum.Enum):
+        return str(value.value)
+    if type(value) is tuple:
+        return ", ".join(map(_text, value))
+    return str(value)
+
+
+def keys_of(model: type) -> tuple[Key, ...]:
+    """The keys that a class of the model declares."""
+    if model not in _KEYS:
+        hints = get_type_hints(model, include_extras=True)
+        _KEYS[model] = tuple(_key(field, hints[field.name]) for field in fields(model) if field.name != "span")
+    return _KEYS[model]
+
+
+_KEYS: dict[type, tuple[Key, ...]] = {}
+
+
+def _key(field: Field[Any], hint: Any) -> Key:
+    marks: dict[type, Any] = {}
+    if get_origin(hint) is Annotated:
+        hint, *found = get_args(hint)
+        marks = {type(mark): mark for mark in found}
+    if get_origin(hint) in (Union, UnionType):
+        hint = next(each for each in get_args(hint) if each is not type(None))
+    if is_list := get_origin(hint) is tuple:
+        hint = get_args(hint)[0]
+    if is_located := get_origin(hint) is Located:
+        (hint,) = get_args(hint)
+    return Key(
+        name=marks[Named].name if Named in marks else field.name,
+        attribute=field.name,
+        type=hint,
+        is_list=is_list,
+        is_located=is_located,
+        quantity=marks.get(Quantity),
+        words=marks.get(Words),
+        misplaced=marks.get(Misplaced),
+        default=None if field.default is MISSING else field.default,
+    )
+
+
+def phrases(part: Any) -> dict[str, str]:
+    """What is told of a part of the table, by key: `at most 30 Hz` for `max_rate`."""
+    told = {}
+    for key in keys_of(type(part)):
+        value = getattr(part, key.attribute)
+        if key.words is None or value is None:
+            continue
+        if key.words.beside is None or getattr(part, key.words.beside) is not None:
+            told[key.name] = key.words.text.format(key.text(value))
+    return told
+
+
+def flat(part: object) -> dict[str, str]:
+    """Every setting of a part of the table as the table writes it, by its key with dots, without what is not set.
+
+    Of a mapping, its values by name.
+    """
+    return dict(_flat(part, ""))
+
+
+def _flat(part: object, prefix: str) -> Iterator[tuple[str, str]]:
+    for name, value, show in _settings(part):
+        if isinstance(value, Mapping) or _has_keys(value):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif not isinstance(value, (SourceSpan, TextPlace)):
+            yield prefix + name, show(value)
+
+
+def _settings(part: object) -> Iterator[tuple[str, Any, Callable[[Any], str]]]:
+    """Name, value and how it is shown, of all that is set; None counts where it is not the default."""
+    if isinstance(part, Mapping):
+        yield from ((name, value, _text) for name, value in part.items() if value is not None)
+        return
+    for key in keys_of(type(part)):
+        value = getattr(part, key.attribute)
+        if value != () and (value is not None or key.default is not None):
+            yield key.name, value, key.text
+
+
+def _has_keys(value: object) -> bool:
+    """Whether it is a part with keys of its own, and no value with a text of its own."""
+    return is_dataclass(value) and not isinstance(value, Located) and type(value).__str__ is object.__str__
+
+
+def are_same(one: object, other: object) -> bool:
+    """Whether two tables, or parts of them, say the same, wherever in their files they say it."""
+    return _without_places(one) == _without_places(other)
+
+
+def _without_places(value: object) -> object:
+    if isinstance(value, SourceSpan):
+        return None
+    if is_dataclass(value) and not isinstance(value, type):
+        return type(value), *(_without_places(getattr(value, field.name)) for field in fields(value))
+    if isinstance(value, Mapping):
+        return tuple((key, _without_places(member)) for key, member in value.items())
+    if isinstance(value, (tuple, list)):
+        return tuple(map(_without_places, value))
+    return value
