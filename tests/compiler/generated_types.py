@@ -7,10 +7,14 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from router.compiler.expressions.kinds import INT32
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+
+EACH_TYPE = settings(max_examples=settings().max_examples // 4, suppress_health_check=list(HealthCheck))
+"""For a test of many types, each of which it tries."""
 
 INTS = [Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (True, False)]
 STATE = Enum("State", (("IDLE", 0), ("BUSY", 1), ("BROKEN", 300)))

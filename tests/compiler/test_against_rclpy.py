@@ -1,24 +1,30 @@
-"""The bytes that are published equal those of rclpy, for every type in use and for many that could be."""
+"""The bytes that are published equal those of rclpy, and what rclpy has serialized is read as rclpy reads it."""
 
 from __future__ import annotations
 
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 
+from router.compiler import Checked
 from router.compiler.lookup import Definitions
 from router.engine.delivery import MAPPING_FAILURES
 from router.types.model import MessageType
-from tests.compiler.comparing import assert_same_message, same
+from tests.compiler.comparing import assert_same_message, same, without_nul
 from tests.compiler.compiling import AUTO, context_of, outcome, scope_of, serializer
-from tests.compiler.generated_types import mirror, values
-from tests.compiler.in_use import ROS_TYPES
+from tests.compiler.generated_types import EACH_TYPE, mirror, values
+from tests.compiler.reading import WHOLE, at, field_values, plain, reader, wanted_paths
 from tests.oracles.reference import fill
 
 pytest.importorskip("rclpy")
 
-from tests.compiler.ros_objects import deserialized, serialized
+from rclpy.serialization import deserialize_message, serialize_message
+
+from tests.compiler.ros_objects import deserialized, message_class, serialized, to_object
 
 OTHERS = [
     "geometry_msgs/msg/PolygonStamped", "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -43,15 +49,68 @@ def assert_equal_bytes(declared: MessageType, source: MessageType, message: Any)
     assert same(deserialized(declared.name, ours), value)
 
 
-@pytest.mark.parametrize("name", [*ROS_TYPES, *OTHERS])
+def test_types_in_use_are_written_as_rclpy_does(rover: Checked) -> None:
+    types = {target.type.name: target.type for route in rover.routes for target in route.targets if target.type}
+    assert types
+    for declared in types.values():
+        assert_written_as_rclpy_does(declared)
+
+
+@pytest.mark.parametrize("name", OTHERS)
 def test_type_is_written_as_rclpy_does(definitions: Definitions, name: str) -> None:
     declared = definitions.interfaces.get(name)
     assert declared is not None
+    assert_written_as_rclpy_does(declared)
+
+
+def assert_written_as_rclpy_does(declared: MessageType) -> None:
     source = mirror(declared)
 
-    @settings(max_examples=25, suppress_health_check=list(HealthCheck))
+    @EACH_TYPE
     @given(values(source))
     def equal(message: Any) -> None:
         assert_equal_bytes(declared, source, message)
+
+    equal()
+
+
+PACKAGES = ("builtin_interfaces", "geometry_msgs", "sensor_msgs", "std_msgs")
+
+
+def is_installed(package: str, name: str) -> bool:
+    home, _, short = name.partition("/msg/")
+    return home == package and find_spec(f"{home}.msg") is not None and hasattr(message_package(home), short)
+
+
+def message_package(name: str) -> ModuleType:
+    return import_module(f"{name}.msg")
+
+
+@pytest.mark.parametrize("package", ["comms", *(pytest.param(each, marks=pytest.mark.slow) for each in PACKAGES)])
+def test_types_are_read_as_rclpy_does(definitions: Definitions, package: str) -> None:
+    names = [name for name in definitions.interfaces.names() if is_installed(package, name)]
+    if not names:
+        pytest.skip(f"{package} is not installed")
+    for name in sorted(names):
+        assert_read_as_rclpy_does(definitions, name)
+
+
+def assert_read_as_rclpy_does(definitions: Definitions, name: str) -> None:
+    declared = definitions.interfaces.get(name)
+    assert declared is not None
+
+    @EACH_TYPE
+    @given(values(declared), wanted_paths(declared))
+    def equal(message: object, wanted: list[tuple[str, ...]]) -> None:
+        value = without_nul(field_values(message, declared))
+        assert isinstance(value, dict)
+        data = bytes(serialize_message(to_object(message_class(name), value)))
+        theirs = deserialize_message(data, message_class(name))
+        _, read = reader(declared, [WHOLE, *wanted])
+        for path, ours in zip([WHOLE, *wanted], read(data), strict=True):
+            expected: object = theirs
+            for part in path:
+                expected = getattr(expected, part)
+            assert same(plain(ours, at(declared, path)), plain(expected, at(declared, path)))
 
     equal()

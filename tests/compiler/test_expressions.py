@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
 import struct
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,10 +14,22 @@ import pytest
 from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
-from router.compiler.expressions import ExpressionError
-from router.compiler.expressions.kinds import BoolKind, FloatKind, IntKind, Kind, StringKind
+from router.compiler.cdr import CdrReads
+from router.compiler.expressions import ExpressionError, Scope, Typed, check
+from router.compiler.expressions.functions import FUNCTIONS
+from router.compiler.expressions.kinds import (
+    BoolKind,
+    FloatKind,
+    IntKind,
+    Kind,
+    MessageKind,
+    StringKind,
+    TimeKind,
+    kind_of,
+)
 from router.compiler.mapping import build
-from router.compiler.source import Source
+from router.compiler.namespace import NAMESPACE
+from router.compiler.source import Source, load
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
@@ -32,6 +46,9 @@ from tests.compiler.compiling import (
     written,
 )
 from tests.compiler.generated_types import values
+from tests.compiler.reading import TIMES
+from tests.oracles.reference import Value
+from tests.oracles.reference_cdr import cdr
 from tests.oracles.reference_expressions import evaluate
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300), ("LESS", -7)))
@@ -122,7 +139,7 @@ expressions = st.sampled_from("ifbs").flatmap(lambda letter: texts(letter, 3))
 REFUSED = {Code.OUT_OF_RANGE, Code.WRONG_ARGUMENTS}
 """Findings that depend on what literals come to: a division by zero, bounds the wrong way round."""
 
-MANY = settings(max_examples=300, suppress_health_check=list(HealthCheck))
+MANY = settings(suppress_health_check=list(HealthCheck))
 
 
 @MANY
@@ -286,3 +303,128 @@ def test_a_source_field_named_as_a_keyword_or_as_a_variable_is_read() -> None:
         assert run(message) == index + 1
     target = MessageType("made/msg/Kept", (Field("class", Int(32, True)),))
     assert serializer(field_map(True), target, scope_of(source))(message)[-4:] == bytes(4)
+
+
+NOTHING = MessageType("Nothing")
+EXAMPLES = [(name, text, value) for name, function in FUNCTIONS.items() for text, value in function.examples]
+PYTHON_TYPE: dict[type, tuple[type, ...]] = {
+    IntKind: (int,),
+    FloatKind: (int, float),
+    StringKind: (str,),
+    TimeKind: (int,),
+}
+
+
+@pytest.mark.parametrize(("name", "text", "value"), EXAMPLES, ids=[text for _, text, _ in EXAMPLES])
+def test_example_is_true_compiled_and_by_reference(name: str, text: str, value: object) -> None:
+    typed, run = compiled(text, scope_of(NOTHING))
+    assert run(None) == value
+    assert evaluate(written(text), context_of(None, NOTHING)) == value
+    assert name in text
+    assert isinstance(run(None), PYTHON_TYPE[type(typed.kind)])
+
+
+def test_functions_have_examples_a_summary_and_a_signature() -> None:
+    for name, function in FUNCTIONS.items():
+        assert function.examples, name
+        assert function.summary.endswith("."), name
+        assert function.signature.startswith(f"{name}(")
+
+
+_UINT8 = Int(8, signed=False)
+_, TIME = TIMES
+BOX = MessageType("made/msg/Box", (Field("from", String()), Field("area", Float(64)), Field("seen", TIME)))
+DECLARED = MessageType(
+    "made/msg/Scene",
+    (
+        Field("left", BOX),
+        Field("use_left", Bool()),
+        Field("right", BOX),
+        Field("boxes", List(BOX)),
+        Field("item", _UINT8),
+        Field("names", List(String())),
+        Field("stamp", TIME),
+    ),
+)
+
+
+def box(name: str, area: float, seconds: int) -> dict[str, Value]:
+    return {"from": name, "area": area, "seen": {"sec": seconds, "nanosec": 5}}
+
+
+SCENE: dict[str, Value] = {
+    "left": box("left", 1.0, 1), "use_left": True, "right": box("right", 2.0, 2),
+    "boxes": [box("first", 3.0, 3), box("second", 4.0, -4)], "item": 9, "names": ["a", "b"],
+    "stamp": {"sec": 7, "nanosec": 8},
+}  # fmt: skip
+
+
+def scope_over(declared: MessageType, names: Mapping[str, Typed]) -> Scope:
+    return Scope(declared, (), (), CdrReads(declared), names)
+
+
+def evaluated(text: str, **given: Any) -> Any:
+    """What an expression comes to; `given` are elements of `boxes` by the names that they have beside the fields."""
+    names = {name: Typed.at(SPAN, kind_of(BOX), load(name)) for name in given}
+    scope, out = scope_over(DECLARED, names), Source()
+    typed = check(written(text), scope)
+    with out.block(f"def evaluate(cdr, {', '.join(given)}):", SPAN):
+        scope.reads.write(out, SPAN)
+        out.line(f"return {out.expression(typed.node)}", SPAN)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile("table.yaml"), namespace)  # noqa: S102 - what is tested
+    return namespace["evaluate"](cdr(DECLARED, SCENE), **given)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("left.area + right.area", 3.0),
+        ("stamp", 7_000_000_008),
+        ("left.seen", 1_000_000_005),
+        ("message.item", 9),
+        ("names[1]", "b"),
+        ("len(boxes)", 2),
+        ("boxes[1].area", 4.0),
+        ("boxes[1].seen", -3_999_999_995),
+        ("(left if use_left else right).area", 1.0),
+        ("(right if use_left else left).seen", 2_000_000_005),
+        ("[left, right][1].area", 2.0),
+        ("(message if use_left else message).right.area", 2.0),
+    ],
+)
+def test_expression_over_a_serialized_message(text: str, value: object) -> None:
+    assert evaluated(text) == value
+
+
+def test_name_beside_the_fields_wins_over_a_field() -> None:
+    (first, _) = evaluated("boxes")
+    assert evaluated("item.area", item=first) == 3.0
+    assert evaluated("item.seen", item=first) == 3_000_000_005
+    assert evaluated("message.item", item=first) == 9
+
+
+def test_element_has_fields_that_are_called_as_keywords_are() -> None:
+    (first, _) = evaluated("boxes")
+    item = Typed.at(SPAN, kind_of(BOX), load("item"))
+    name = scope_over(DECLARED, {"item": item}).field_of(item, BOX.fields[0], SPAN)
+    code = compile(ast.Expression(name.node), "table.yaml", "eval")
+    assert eval(code, {"item": first}) == "first"  # noqa: S307 - what is tested
+
+
+def test_misspelt_name_beside_the_fields_is_suggested() -> None:
+    scope = scope_over(DECLARED, {"total_count": Typed.at(SPAN, kind_of(_UINT8), load("total_count"))})
+    with pytest.raises(ExpressionError) as raised:
+        check(written("total_cuont"), scope)
+    assert "total_count" in raised.value.diagnostic.hint
+
+
+@pytest.mark.parametrize("text", ["has(left)", "has(item)", "has(item.area)", "has(left.area)"])
+def test_has_finds_nothing_that_could_be_missing(text: str) -> None:
+    scope = scope_over(DECLARED, {"item": Typed.at(SPAN, MessageKind(BOX), load("item"))})
+    with pytest.raises(ExpressionError):
+        check(written(text), scope)
+
+
+def test_time_is_a_value() -> None:
+    assert check(written("left.seen"), scope_over(DECLARED, {})).kind == TimeKind()

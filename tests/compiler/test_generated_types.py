@@ -17,7 +17,7 @@ from tests.compiler.generated_types import STATE, pairs, values
 from tests.oracles.reference import Value, fill
 from tests.oracles.reference_cdr import cdr
 
-MANY = settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+MANY = settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 
 
 @MANY
@@ -33,7 +33,7 @@ def test_compiled_bytes_equal_the_reference(data: st.DataObject) -> None:
     assert compiled == outcome(lambda: reference_bytes(AUTO, target, context))
 
 
-@settings(max_examples=80, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data())
 def test_reference_bytes_equal_those_of_rosbags(data: st.DataObject) -> None:
     target, source = data.draw(pairs(depth=1))

@@ -7,13 +7,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 
 from router.engine.delivery import MAPPING_FAILURES
 from router.types.model import Field, Int, MessageType, String
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope_of, serializer
-from tests.compiler.generated_types import mirror, values
+from tests.compiler.generated_types import EACH_TYPE, mirror, values
 from tests.compiler.interface_package import MESSAGES, InterfacePackage, built, declared_type, is_buildable
 from tests.compiler.reading import WHOLE, field_values, reader
 from tests.oracles.reference import fill
@@ -39,7 +39,7 @@ def test_message_is_written_and_read_as_rclpy_does(package: InterfacePackage, na
     source = mirror(declared)
     _, read_whole = reader(declared, [WHOLE])
 
-    @settings(max_examples=60, suppress_health_check=list(HealthCheck))
+    @EACH_TYPE
     @given(values(source))
     def equal(message: Any) -> None:
         value = outcome(lambda: fill(AUTO, declared, context_of(message, source)))

@@ -1,6 +1,6 @@
 """The functions of the expression language: each declared once, with documentation, examples and implementation.
 
-The examples are tests (tests/compiler/test_functions.py) and the reference page is generated from them. Each function
+The examples are tests (tests/compiler/test_expressions.py) and the reference page is generated from them. Each function
 has a rule that gives the kind of a call from the kinds of its arguments, in order, once their number and kinds are
 checked; it raises ValueError with a sentence when no call with such arguments works. An implementation raises
 MappingError for a value without a result.
