@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from router.recording.reader_mcap import Recording
+from router.recording.reader import Recording
 from router.table.model import RouteTable
 
 

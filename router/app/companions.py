@@ -36,7 +36,7 @@ class Companions:
         if table.record is not None:
             from router.recording.recorder import Recorder
 
-            self._recorder = Recorder(running, table.record)
+            self._recorder = Recorder(running.mirror, lambda: running.program, table.record)
             opening.callback(self._recorder.close)
             opening.callback(self._saving.shutdown)
         if table.foxglove is not None:
@@ -59,7 +59,7 @@ class Companions:
         """Series that nobody counts in the counters."""
 
         def recorded(metric: str) -> Asked:
-            return lambda: self._recorder.asked()[metric]() if self._recorder else ()
+            return lambda: self._recorder.samples()[metric] if self._recorder else ()
 
         own = {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}
         return {**own, "endpoint_stale_after_seconds": self._patience}

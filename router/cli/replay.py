@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from router.compiler import Checked
     from router.compiler.lookup import Definitions
-    from router.recording.reader_mcap import Recording
+    from router.recording.reader import Recording
     from router.tools.replaying import Resent
 
 DIFFERENT = 1
@@ -55,7 +55,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 @explained
 def run(args: argparse.Namespace) -> int:
-    from router.recording.reader_mcap import Recording
+    from router.recording.reader import Recording
 
     if args.against is not None and (args.rate or args.to or args.origin):
         raise UsageError("--against sends nothing: --rate, --to and --from have no part in it")

@@ -21,8 +21,8 @@ from router.errors import Located, StartError
 from router.log import logger
 from router.net.kernel import port_holder
 from router.observe.running import Running
+from router.recording.channels import descriptor_set
 from router.recording.mirror import Classifier, Mirrored, first_field
-from router.recording.schemas import descriptor_set
 from router.table.addresses import Address
 from router.threads import background_threads
 from router.types.protobuf import PayloadCase

@@ -1,28 +1,28 @@
-"""The channels of recordings: which there are, by number. Those of all files of a router have the same numbers.
+"""Schemas and channels of recordings. The files of one router use the same numbers for them.
 
-A channel is what one sender sends of one payload case to one listener. Its metadata says so, and with the payload that
-is all there is to the datagram (see `Holds`). Knows no file.
+A channel is what one sender sends of one payload case to one listener. Its metadata says so; together with a message's
+data that is the whole datagram (see `Holds`).
 """
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping
 
-from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor import Descriptor, FileDescriptor
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
-from router.recording.schemas import DATAGRAM, descriptor_set
+from router.recording.mirror import Peer
 from router.types.protobuf import PayloadCase
 
 DATAGRAMS = "raw/datagrams"
 """The topic of datagrams as received. No payload case can have a slash in its name."""
 
-MOST = 4096
-"""Channels. Senders beyond that, as of somebody who changes his port each time, are recorded as raw datagrams."""
-
-Peer = tuple[str, int]
+MOST_CHANNELS = 4096
+"""Senders beyond that, as of a client that changes its port each time, are recorded as raw datagrams."""
 
 
 class Holds(enum.Enum):
@@ -32,13 +32,13 @@ class Holds(enum.Enum):
     """Payloads of datagrams with one field, encoded as protobuf encodes it: tag and length follow from number and
     payload."""
     DATAGRAM = "datagram"
-    """All that is no such datagram, byte for byte."""
+    """All other datagrams, byte for byte."""
     VIEW = "view"
-    """Payloads of datagrams that are recorded raw as well: for who looks at them, not to be sent again."""
+    """Payloads of datagrams that are recorded raw as well: to be looked at, not to be sent again."""
 
 
 class Channels:
-    """Gives numbers, the same ones for what is the same. They are never taken back."""
+    """Assigns numbers to schemas and channels, equal ones for equal content. Numbers are never reused."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -47,40 +47,41 @@ class Channels:
         self._channel_ids: dict[tuple[object, ...], int] = {}
 
     def payload(self, case: PayloadCase, listener: str, peer: Peer, endpoint: str) -> int | None:
-        """`endpoint` is what the table calls the sender, empty for a stranger. None where there are too many."""
-        told = _told(case, Holds.PAYLOAD, listener=listener, peer=f"{peer[0]}:{peer[1]}", endpoint=endpoint)
-        if len(self.channels) >= MOST and self._same(case.name, _payload(case), told) not in self._channel_ids:
+        """`endpoint` is the table's name of the sender, empty for a stranger. None where there are too many."""
+        metadata = _metadata(case, Holds.PAYLOAD, listener=listener, peer=f"{peer[0]}:{peer[1]}", endpoint=endpoint)
+        if len(self.channels) >= MOST_CHANNELS and self._key(case.name, _payload(case), metadata) not in (
+            self._channel_ids
+        ):
             return None
-        return self._channel(case.name, _payload(case), told)
+        return self._channel(case.name, _payload(case), metadata)
 
     def view(self, case: PayloadCase) -> int:
-        return self._channel(case.name, _payload(case), _told(case, Holds.VIEW))
+        return self._channel(case.name, _payload(case), _metadata(case, Holds.VIEW))
 
     def datagrams(self) -> int:
         return self._channel(DATAGRAMS, DATAGRAM, {"holds": Holds.DATAGRAM.value})
 
     def _channel(self, topic: str, message: Descriptor, metadata: dict[str, str]) -> int:
-        same = self._same(topic, message, metadata)
-        if same not in self._channel_ids:
-            number = self._channel_ids[same] = len(self.channels) + 1
+        key = self._key(topic, message, metadata)
+        if key not in self._channel_ids:
+            number = self._channel_ids[key] = len(self.channels) + 1
             self.channels[number] = Channel(number, topic, MessageEncoding.Protobuf, metadata, self._schema(message))
-        return self._channel_ids[same]
+        return self._channel_ids[key]
 
-    def _same(self, topic: str, message: Descriptor, metadata: Mapping[str, str]) -> tuple[object, ...]:
-        """What only one channel has."""
+    def _key(self, topic: str, message: Descriptor, metadata: dict[str, str]) -> tuple[object, ...]:
         return topic, self._schema(message), *metadata.values()
 
     def _schema(self, message: Descriptor) -> int:
-        same = (message.full_name, descriptor_set(message))
-        if same not in self._schema_ids:
-            number = self._schema_ids[same] = len(self.schemas) + 1
+        key = (message.full_name, descriptor_set(message))
+        if key not in self._schema_ids:
+            number = self._schema_ids[key] = len(self.schemas) + 1
             self.schemas[number] = Schema(
-                id=number, name=message.full_name, encoding=SchemaEncoding.Protobuf, data=same[1]
+                id=number, name=message.full_name, encoding=SchemaEncoding.Protobuf, data=key[1]
             )
-        return self._schema_ids[same]
+        return self._schema_ids[key]
 
 
-def _told(case: PayloadCase, holds: Holds, **sender: str) -> dict[str, str]:
+def _metadata(case: PayloadCase, holds: Holds, **sender: str) -> dict[str, str]:
     return {"holds": holds.value, "number": str(case.number), **sender}
 
 
@@ -88,10 +89,30 @@ def _payload(case: PayloadCase) -> Descriptor:
     return case.message_class.DESCRIPTOR  # type: ignore[return-value]  # or upb's, which is the same
 
 
-def varint(value: int) -> bytes:
-    """As protobuf encodes tags and lengths."""
-    encoded = bytearray()
-    while value > 0x7F:
-        encoded.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes((*encoded, value))
+def descriptor_set(message: Descriptor) -> bytes:
+    """Return a serialised FileDescriptorSet: the file of a message behind all that it imports."""
+    files: dict[str, bytes] = {}
+    _collect(message.file, files)
+    return FileDescriptorSet(file=[FileDescriptorProto.FromString(data) for data in files.values()]).SerializeToString()
+
+
+def _collect(file: FileDescriptor, into: dict[str, bytes]) -> None:
+    for imported in file.dependencies:
+        _collect(imported, into)
+    into.setdefault(file.name, file.serialized_pb)
+
+
+def _datagram() -> Descriptor:
+    file = FileDescriptorProto(name="rover_router/datagram.proto", package="rover_router", syntax="proto3")
+    message = file.message_type.add(name="Datagram")
+    text, data = FieldDescriptorProto.TYPE_STRING, FieldDescriptorProto.TYPE_BYTES
+    for number, (name, kind) in enumerate([("listener", text), ("peer", text), ("data", data), ("endpoint", text)], 1):
+        message.field.add(name=name, number=number, type=kind, label=FieldDescriptorProto.LABEL_OPTIONAL)
+    pool = DescriptorPool()
+    pool.AddSerializedFile(file.SerializeToString())
+    return pool.FindMessageTypeByName("rover_router.Datagram")
+
+
+DATAGRAM = _datagram()
+Datagram = GetMessageClass(DATAGRAM)
+"""`listener` by its name, `peer` as HOST:PORT, `data` as received, `endpoint` as the table calls the sender."""

@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 from router.clock import wall_ns
 from router.compiler.network import recognisers
 from router.engine import MAX_DATAGRAM
-from router.engine.slow_path import restored
+from router.engine.slow_path import LEN, restored
 from router.table.model import Framing, RouteTable
 from router.types.protobuf import Envelope, PayloadCase
 
@@ -145,6 +145,7 @@ class Classifier:
         self._trimming = frozenset(
             listener.name for listener in table.listeners.values() if listener.framing is Framing.ZERO_TRIMMED
         )
+        self.cases_by_tag = {varint(case.number << 3 | LEN): case for case in envelope.cases.values()}
         self._recognisers = {name: recognisers(table.endpoints, name) for name in table.listeners}
 
     def payload(self, listener: str, data: bytes) -> tuple[PayloadCase, Message] | None:
@@ -160,10 +161,50 @@ class Classifier:
         case = envelope.WhichOneof(self.envelope.oneof)
         return (self.envelope.cases[case], getattr(envelope, case)) if case else None
 
+    def encoded_payload(self, listener: str, data: bytes) -> tuple[PayloadCase, bytes] | None:
+        """As `payload`, but return the payload's bytes; much faster for a frame with zeros removed or added."""
+        if listener in self._trimming and (found := self._single_field(data)) is not None:
+            return found
+        if (decoded := self.payload(listener, data)) is None:
+            return None
+        case, payload = decoded
+        return case, payload.SerializeToString()
+
+    def _single_field(self, data: bytes) -> tuple[PayloadCase, bytes] | None:
+        """Return None where anything but zeros follows the first field, or its length has more than two bytes."""
+        try:
+            tag_size = 1 if data[0] < 0x80 else 2
+            case, size, start = self.cases_by_tag[data[:tag_size]], data[tag_size], tag_size + 1
+            if size >= 0x80:
+                high = data[start]
+                size, start = size & 0x7F | high << 7, start + 1
+                if high >= 0x80:
+                    return None
+        except LookupError:
+            return None
+        end = start + size
+        if end > MAX_DATAGRAM or len(data) > MAX_DATAGRAM or data.count(0, end) < len(data) - end:
+            return None
+        payload = data[start:end].ljust(size, b"\0")
+        try:
+            case.message_class.FromString(payload)
+        except ProtobufError:
+            return None
+        return case, payload
+
     def sender(self, listener: str, peer: Peer) -> str:
         """Return the table's name of who sent to this listener; empty for a stranger."""
         by_host, by_address = self._recognisers.get(listener, _NOBODY)
         return by_address.get(peer) or by_host.get(peer[0]) or ""
+
+
+def varint(value: int) -> bytes:
+    """Encode as protobuf encodes tags and lengths."""
+    encoded = bytearray()
+    while value > 0x7F:
+        encoded.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes((*encoded, value))
 
 
 _NOBODY: tuple[dict[str, str], dict[Peer, str]] = {}, {}

@@ -1,74 +1,149 @@
-"""The recorder: what listeners receive, before routing, to files and to memory. Its thread is `recorder`.
+"""The recorder: mirrored datagrams to disk, and the newest chunks in memory until somebody wants them saved.
 
-Knows when something is to be written; how, is known by the modules that it puts together.
+The mirror's thread puts batches into a queue. The thread `recorder` encodes each datagram once, into chunks for both;
+so saving copies bytes.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from router.clock import monotonic_ns, wall_ns
+from router.compiler.program import Program
+from router.errors import RouterError
 from router.log import logger
-from router.observe.metrics import Asked
-from router.observe.running import Running
 from router.recording.channels import Channels
-from router.recording.continuous import Continuous
-from router.recording.directory import open_directory
-from router.recording.encoding import Encoder
-from router.recording.mirror import Classifier, Mirrored
-from router.recording.packed import Packer
-from router.recording.queue import PERIOD, Intake
-from router.recording.saving import RecordError, Saving
+from router.recording.encoder import LONGEST_CHUNK, Chunk, Encoder
+from router.recording.mirror import Classifier, Mirror, Mirrored
+from router.recording.writer import ContinuousWriter, RecordingDirectory
 from router.table.model import RecordSettings
 from router.threads import WakeEvent
 
-__all__ = ["RecordError", "Recorder"]
+PERIOD = 500_000_000
+"""ns from chunk to chunk: what a kill costs, with what the mirror still has; more only where the disk is slow."""
+
+MOST_QUEUED = 64 << 20
+"""Bytes that may wait for a disk that is slow."""
+
+STOP_SECONDS = 2.5
+"""How long a stop waits for the disk. A service manager kills after 10 s, and there is more to close."""
+
+_BESIDE_DATA = 256
+"""Bytes of memory, about, that a queued datagram takes beside its data."""
 
 _PATIENCE = 30.0
 """Seconds in which saving has to be done."""
 
 
-class Recorder:
-    """Records from its making until it is closed. Raises StartError where nothing can be written."""
+class RecordError(RouterError):
+    """The last datagrams could not be saved; the message says why."""
 
-    def __init__(self, running: Running, settings: RecordSettings) -> None:
-        self._running = running
+
+class _Batch(NamedTuple):
+    """`wall` and `monotonic` are the two clocks when it was received (ns), `size` its bytes of memory, about."""
+
+    datagrams: Sequence[Mirrored]
+    classifier: Classifier
+    wall: int
+    monotonic: int
+    size: int
+
+
+class DatagramQueue:
+    """At most MOST_QUEUED bytes of batches, from one thread to another. `overflow` counts datagrams without room."""
+
+    def __init__(self) -> None:
+        self.overflow = 0
+        self._batches: deque[_Batch] = deque()
+        self._put = self._taken = 0  # bytes, each written by one thread
+
+    def put(self, datagrams: Sequence[Mirrored], classifier: Classifier) -> None:
+        size = sum([len(data) for _, _, _, data in datagrams]) + _BESIDE_DATA * len(datagrams)
+        if self._put - self._taken + size > MOST_QUEUED:
+            self.overflow += len(datagrams)
+            return
+        self._put += size
+        self._batches.append(_Batch(datagrams, classifier, wall_ns(), monotonic_ns(), size))
+
+    def drain(self) -> Iterator[_Batch]:
+        """Yield what is there now."""
+        for _ in range(len(self._batches)):
+            batch = self._batches.popleft()
+            self._taken += batch.size
+            yield batch
+
+
+class Ring:
+    """Chunks of the last `last` ns, of at most `most` bytes together: of a flood it keeps less than `last`."""
+
+    def __init__(self, last: int, most: int) -> None:
+        self._last = last
+        self._most = most
+        self._chunks: deque[Chunk] = deque()
+        self._size = 0
+
+    def add(self, chunk: Chunk) -> None:
+        self._chunks.append(chunk)
+        self._size += chunk.size_in_file
+        oldest = chunk.monotonic - self._last
+        while self._chunks[0].monotonic < oldest or (self._size > self._most and len(self._chunks) > 1):
+            self._size -= self._chunks.popleft().size_in_file
+
+    def chunks(self) -> list[Chunk]:
+        """Return them, the oldest first."""
+        return list(self._chunks)
+
+
+class Recorder:
+    """Records from its making until it is closed. Raises StartError where nothing can be written.
+
+    `program` returns what runs now; a reload puts another one in its place.
+    """
+
+    def __init__(self, mirror: Mirror, program: Callable[[], Program], settings: RecordSettings) -> None:
+        self._running_program = program
+        self._settings = settings
+        self._program = program()
+        self._classifier = Classifier(self._program.envelope, self._program.table)
         self._channels = Channels()
-        self._program = running.program
-        self._known = Classifier(self._program.envelope, self._program.table)
-        directory = open_directory(settings, running.program.table.path.stem)
-        self._continuous = Continuous(settings, directory, self._channels, self._about) if settings.continuous else None
-        self._saving = (
-            Saving(settings.last, settings.max_size, directory, self._channels, self._about)
-            if settings.last is not None
+        self._encoder = Encoder(self._channels)
+        self._directory = RecordingDirectory(settings, self._program.table.path.stem)
+        self._continuous = (
+            ContinuousWriter(settings, self._directory, self._channels, lambda: self._about("continuous"))
+            if settings.continuous
             else None
         )
-        self._intake = Intake(self._continuous, Encoder(self._channels)) if self._continuous is not None else None
-        self._packer = Packer()
+        self._ring = Ring(settings.last, settings.max_size) if settings.last is not None else None
+        self._queue = DatagramQueue()
+        self._lost_by_faults = 0
+        self._is_well = True
+        self._due = monotonic_ns() + PERIOD
         self._trips: deque[str] = deque()
-        self._saves: deque[tuple[str, Future[Path]]] = deque()
-        self._alarm = WakeEvent()
-        self._asking = threading.Lock()
+        self._trips_saved_at: int | None = None
+        self._requests: deque[tuple[str, Future[Path]]] = deque()
+        self._requesting = threading.Lock()
         self._closing = False
-        self._thread = threading.Thread(target=self._run, name="recorder")
+        self._wake_up = WakeEvent()
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)  # a disk may hang
         self._thread.start()
-        self._detach = running.mirror.attach(self._take)
+        self._detach = mirror.attach(self._take)
 
     def save(self, reason: str) -> Path:
-        """Has what is in memory written to a file of its own. Any thread may ask; raises RecordError."""
-        if self._saving is None:
+        """Write what is in memory to a file of its own. Any thread may call it; raises RecordError."""
+        if self._ring is None:
             raise RecordError("nothing is kept in memory: the table's `record` has no `last`")
         done: Future[Path] = Future()
-        with self._asking:
+        with self._requesting:
             if self._closing:
                 raise RecordError("the router is stopping")
-            self._saves.append((reason, done))
+            self._requests.append((reason, done))
         self._wake()
         try:
             return done.result(_PATIENCE)
@@ -76,92 +151,152 @@ class Recorder:
             raise RecordError(f"the disk took longer than {_PATIENCE:.0f} s") from None
 
     def deadman_tripped(self, route: str) -> None:
-        """Has it saved soon; returns at once."""
-        if self._saving is not None:
+        """Have what is in memory saved soon. Returns at once."""
+        if self._ring is not None:
             self._trips.append(route)
             self._wake()
 
-    def asked(self) -> Mapping[str, Asked]:
-        """The metrics that are counted here."""
-        continuous, intake = self._continuous, self._intake
-
-        def dropped() -> list[tuple[tuple[str], float]]:
-            return [
-                (("overflow",), intake.overflow if intake else 0),
-                (("write_error",), continuous.lost if continuous else 0),
-            ]
-
+    def samples(self) -> Mapping[str, Sequence[tuple[tuple[str, ...], float]]]:
+        """Return the metrics that are counted here: for each its series, by label values."""
+        continuous = self._continuous
+        write_errors = self._lost_by_faults + (continuous.lost if continuous else 0)
         return {
-            "recorded_datagrams": lambda: [((), continuous.datagrams if continuous else 0)],
-            "recorded_bytes": lambda: [((), continuous.bytes if continuous else 0)],
-            "record_dropped": dropped,
+            "recorded_datagrams": [((), continuous.datagrams if continuous else 0)],
+            "recorded_bytes": [((), continuous.bytes if continuous else 0)],
+            "record_dropped": [(("overflow",), self._queue.overflow), (("write_error",), write_errors)],
         }
 
     def close(self) -> None:
-        """Writes all that was received, and finishes the file."""
+        """Write all that was received, and finish the file: within STOP_SECONDS, or as far as the disk gets by then."""
         self._detach()
-        with self._asking:  # what was asked for before is done in the last turn
+        with self._requesting:  # what was requested before is done in the last turn
             self._closing = True
         self._wake()
-        self._thread.join()
-        self._alarm.close()
+        self._thread.join(STOP_SECONDS)
+        if self._thread.is_alive():
+            event = "the disk is too slow to finish the recordings; they can be read as far as they were written"
+            logger.error(event, directory=str(self._directory.path))
 
     def _wake(self) -> None:
         with suppress(ValueError):  # it has ended
-            self._alarm.set()
+            self._wake_up.set()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Called by the mirror's thread."""
-        known, wall, monotonic = self._known_now(), wall_ns(), monotonic_ns()
-        if self._intake is not None:
-            self._intake.add(batch, known, wall, monotonic)
-        if self._saving is not None:
-            self._saving.add(self._packer.pack(batch, known, wall, monotonic))
-
-    def _known_now(self) -> Classifier:
-        """A reload may have changed it."""
-        program = self._running.program
+        program = self._running_program()
         if program is not self._program:
-            self._program, self._known = program, Classifier(program.envelope, program.table)
-        return self._known
+            self._program, self._classifier = program, Classifier(program.envelope, program.table)
+        self._queue.put(batch, self._classifier)
 
     def _run(self) -> None:
         while not self._closing:
-            self._alarm.wait(self._intake.due - monotonic_ns() if self._intake is not None else PERIOD)
-            self._turn()
-        self._turn(is_last=True)
+            self._wake_up.wait(self._due - monotonic_ns())
+            self._write()
+            self._save_requested()
+            if self._trips and self._may_save_trips():
+                self._save_trips()
+        self._write()
         if self._continuous is not None:
             self._continuous.close()
+        self._save_requested()
+        if self._trips:
+            self._save_trips()
+        self._wake_up.close()
 
-    def _turn(self, is_last: bool = False) -> None:
-        """Nothing leaves it: a fault is told, and is no reason to stop recording."""
-        if self._intake is not None:
-            self._intake.write()
-        while self._saves:
-            self._save(*self._saves.popleft(), is_last)
-        if self._trips and self._saving is not None and (is_last or self._saving.may_save_trips(monotonic_ns())):
-            routes = sorted({self._trips.popleft() for _ in range(len(self._trips))})
-            self._save(f"deadman-{routes[0]}", Future(), is_last)
-
-    def _save(self, reason: str, done: Future[Path], is_last: bool) -> None:
-        """Whatever comes of it, `done` is told. What is received meanwhile is written as ever."""
-        assert self._saving is not None  # noqa: S101 - who asks, and deadmen, look before
+    def _write(self) -> None:
+        """Encode and write all that is queued. What a fault loses is counted, and the rest goes on."""
+        self._due = monotonic_ns() + PERIOD
+        faults: list[Exception] = []
+        is_idle = True
+        for batch in self._queue.drain():
+            is_idle = False
+            try:
+                self._encoder.add(batch.datagrams, batch.classifier, batch.wall, batch.monotonic)
+                if self._encoder.size > LONGEST_CHUNK:
+                    self._finish_chunk()
+            except Exception as error:  # noqa: BLE001 of the router itself, and no reason to stop recording
+                faults.append(self._fault(error))
         try:
-            done.set_result(self._saving.save(reason, self._writing, None if is_last else self._write_if_due))
-        except RecordError as error:  # it has been logged
-            done.set_exception(error)
-        except Exception as error:  # noqa: BLE001 a fault of the router
+            self._finish_chunk()
+            if self._continuous is not None:
+                self._continuous.close_if_old(monotonic_ns())
+        except Exception as error:  # noqa: BLE001 as above
+            faults.append(self._fault(error))
+        if faults and self._is_well:
+            logger.critical("a fault in the recorder lost datagrams; please report it", exc_info=faults[0])
+        if faults or not is_idle:
+            self._is_well = not faults
+
+    def _finish_chunk(self) -> None:
+        chunk = self._encoder.take()
+        if chunk is None:
+            return
+        if self._ring is not None:
+            self._ring.add(chunk)
+        if self._continuous is not None:
+            self._continuous.write(chunk, monotonic_ns())
+
+    def _fault(self, error: Exception) -> Exception:
+        self._lost_by_faults += self._encoder.drop()
+        return error
+
+    def _save_requested(self) -> None:
+        while self._requests:
+            reason, done = self._requests.popleft()
+            try:
+                done.set_result(self._save(reason))
+            except RecordError as error:
+                done.set_exception(error)
+
+    def _may_save_trips(self) -> bool:
+        """Once in the time that is kept: a deadman that trips again and again fills no disk, and nothing is missed."""
+        assert self._settings.last is not None  # noqa: S101 - or nobody has noted a trip
+        now = monotonic_ns()
+        if self._trips_saved_at is not None and now - self._trips_saved_at < self._settings.last:
+            return False
+        self._trips_saved_at = now
+        return True
+
+    def _save_trips(self) -> None:
+        routes = sorted({self._trips.popleft() for _ in range(len(self._trips))})
+        with suppress(RecordError):  # it has been logged
+            self._save(f"deadman-{routes[0]}")
+
+    def _save(self, reason: str) -> Path:
+        """Raises RecordError, which has been logged."""
+        try:
+            path = self._write_ring(reason)
+        except OSError as error:
+            logger.error("the last datagrams could not be saved", reason=reason, problem=error.strerror)
+            raise RecordError(f"cannot write to {self._directory.path}: {error.strerror}") from error
+        except Exception as error:
             logger.critical("a fault in the recorder kept it from saving; please report it", exc_info=error)
-            done.set_exception(RecordError(f"a fault in the router itself: {error!r}"))
+            raise RecordError(f"a fault in the router itself: {error!r}") from error
+        logger.info("saved the last datagrams", reason=reason, file=str(path))
+        return path
 
-    def _write_if_due(self) -> None:
-        if self._intake is not None:
-            self._intake.write_if_due()
+    def _write_ring(self, reason: str) -> Path:
+        """What is received meanwhile is written as ever."""
+        assert self._ring is not None  # noqa: S101 - `save` and `deadman_tripped` look before
+        chunks = self._ring.chunks()
+        coming = sum(chunk.size_in_file for chunk in chunks)
+        writing = self._continuous.path if self._continuous is not None else None
+        self._directory.make_room(coming + (self._settings.max_size if writing is not None else 0), writing)
+        file = self._directory.new(reason, self._channels, self._about(reason))
+        try:
+            for chunk in chunks:
+                file.write(chunk)
+                if monotonic_ns() >= self._due and not self._closing:
+                    self._write()
+        except OSError:
+            if file.is_empty:
+                file.path.unlink(missing_ok=True)
+            raise
+        finally:
+            file.close()
+        return file.path
 
-    def _writing(self) -> Path | None:
-        return self._continuous.path if self._continuous is not None else None
-
-    def _about(self, reason: str = "continuous") -> dict[str, str]:
-        """What a file says of itself."""
-        program = self._running.program
+    def _about(self, reason: str) -> dict[str, str]:
+        """Return what a file says of itself."""
+        program = self._running_program()
         return {"reason": reason, "table": program.table.path.name, "protos_sha256": program.protos_sha256}

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from hashlib import blake2b
 
 from router.compiler.program import Program
-from router.recording.mirror import Classifier
-from router.recording.reader_mcap import Peer, Recorded
+from router.recording.mirror import Classifier, Peer
+from router.recording.reader import Recorded
 from router.rehearsal.events import Dropped, Event, Filtered, Published, Rejected, Sent
 from router.rehearsal.rehearsal import Rehearsal
 

@@ -12,7 +12,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from router.compiler.program import Program
-from router.recording.directory import kept_bytes
+from router.recording.writer import recording_sizes
 from router.ros.environment import SHM
 from router.tools.doctor_report import Finding, fine, problem, warning
 
@@ -68,7 +68,7 @@ def recordings(program: Program) -> Iterator[Finding]:
             "chown it, or give `record` another directory; for a service, run deploy/install-service.sh again then",
         )
         return
-    kept = kept_bytes(directory, program.table.path.stem)
+    kept = sum(recording_sizes(directory, program.table.path.stem).values())
     free = shutil.disk_usage(there).free
     if settings.continuous and kept + free < settings.keep:
         yield warning(

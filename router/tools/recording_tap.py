@@ -9,10 +9,10 @@ from time import monotonic_ns, time_ns
 from router.errors import UsageError
 from router.observe.tap import Lost
 from router.recording.channels import Channels
-from router.recording.encoding import Encoder
-from router.recording.file import RecordingFile
+from router.recording.encoder import Encoder
 from router.recording.mirror import Classifier, MirroredDatagram
-from router.recording.queue import PERIOD
+from router.recording.recorder import PERIOD
+from router.recording.writer import RecordingFile
 from router.table.model import RouteTable
 from router.types.protobuf import Envelope
 
@@ -25,7 +25,7 @@ class TapRecording:
         self.datagrams = self.missed = 0
         channels = Channels()
         self._encoder = Encoder(channels)
-        self._encoder.know(Classifier(envelope, table))
+        self._classifier = Classifier(envelope, table)
         self._written_at = monotonic_ns()
         try:
             self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})
@@ -61,7 +61,7 @@ class TapRecording:
 
     def _add(self, seen: Sequence[MirroredDatagram]) -> None:
         self.datagrams += len(seen)
-        self._encoder.add(seen, time_ns(), monotonic_ns())
+        self._encoder.add(seen, self._classifier, time_ns(), monotonic_ns())
 
     def _write(self) -> None:
         self._written_at = monotonic_ns()

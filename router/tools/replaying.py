@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from router.errors import TransportError, UsageError, did_you_mean
-from router.recording.reader_mcap import Recorded, Recording
+from router.recording.reader import Recorded, Recording
 from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools import places

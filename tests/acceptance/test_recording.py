@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from time import sleep
 
-from router.recording.reader_mcap import Recorded, Recording
+from router.recording.reader import Recorded, Recording
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS
 from tests.acceptance.site import ROOT, RouterProcess, Site, site, total, wait_until

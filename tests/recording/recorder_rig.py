@@ -10,15 +10,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+from router.compiler.program import Program
 from router.engine.wire import Wire, wire_of_protos
 from router.errors import Located, SourceSpan
-from router.observe.running import Running
 from router.recording.channels import Channels
-from router.recording.chunk import Chunk
-from router.recording.encoding import Encoder
-from router.recording.file import RecordingFile
-from router.recording.mirror import Classifier, MirroredDatagram
-from router.recording.reader_mcap import Recorded, Recording
+from router.recording.encoder import Chunk, Encoder
+from router.recording.mirror import Classifier, Mirror, MirroredDatagram
+from router.recording.reader import Recorded, Recording
+from router.recording.recorder import Recorder
+from router.recording.writer import RecordingFile
 from router.table.addresses import Address
 from router.table.model import Endpoint, EndpointKind, Framing, RecordSettings, RouteTable
 from tests.tables import PROTOS
@@ -54,14 +54,9 @@ def table(**changed: Any) -> RouteTable:
     return cast("RouteTable", SimpleNamespace(**told))
 
 
-def known() -> Classifier:
+@cache
+def classifier() -> Classifier:
     return Classifier(wire().envelope, table())
-
-
-def encoder(channels: Channels) -> Encoder:
-    made = Encoder(channels)
-    made.know(known())
-    return made
 
 
 def seen(*datagrams: bytes, at: int = START, peer: tuple[str, int] = SENSOR_BOARD) -> list[MirroredDatagram]:
@@ -72,12 +67,15 @@ def seen(*datagrams: bytes, at: int = START, peer: tuple[str, int] = SENSOR_BOAR
 def recorded(path: Path, *batches: Sequence[MirroredDatagram], finish: bool = True) -> Path:
     """A file with a chunk of each batch, on a clock that nobody sets."""
     channels = Channels()
-    made = encoder(channels)
-    with_chunks = []
-    for batch in batches:
-        made.add(batch, batch[-1].at, batch[-1].at - START)
-        with_chunks.append(taken(made))
-    return write(path, channels, *with_chunks, finish=finish)
+    encoder = Encoder(channels)
+    chunks = [encoded(encoder, batch) for batch in batches]
+    return write(path, channels, *chunks, finish=finish)
+
+
+def encoded(encoder: Encoder, batch: Sequence[MirroredDatagram]) -> Chunk:
+    """A chunk of one batch, on a clock that nobody sets."""
+    encoder.add(batch, classifier(), batch[-1].at, batch[-1].at - START)
+    return taken(encoder)
 
 
 def taken(made: Encoder) -> Chunk:
@@ -108,19 +106,19 @@ def again(found: Recorded) -> MirroredDatagram:
 
 
 class FakeMirror:
-    """Shows what the test says, at once."""
+    """Shows what the test says, at once: datagrams of a router that runs `program`."""
 
     def __init__(self) -> None:
         self.show: Callable[[Sequence[MirroredDatagram]], None] = print
+        self.program = SimpleNamespace(table=table(), envelope=wire().envelope, protos_sha256="0" * 64)
 
     def attach(self, consumer: Callable[[Sequence[MirroredDatagram]], None]) -> Callable[[], None]:
         self.show = consumer
         return lambda: None
 
 
-def running(mirror: FakeMirror) -> Running:
-    program = SimpleNamespace(table=table(), envelope=wire().envelope, protos_sha256="0" * 64)
-    return cast("Running", SimpleNamespace(mirror=mirror, program=program))
+def recorder(mirror: FakeMirror, settings: RecordSettings) -> Recorder:
+    return Recorder(cast("Mirror", mirror), lambda: cast("Program", mirror.program), settings)
 
 
 def settings(directory: Path, **changed: Any) -> RecordSettings:

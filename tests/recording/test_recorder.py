@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from time import monotonic, sleep, time_ns
 from types import SimpleNamespace
 from typing import Any
@@ -16,17 +16,28 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.errors import StartError
-from router.recording import continuous as recorder_continuous
-from router.recording import queue as recorder_intake
 from router.recording import recorder as recorder_module
-from router.recording import saving as recorder_saving
-from router.recording.encoding import Encoder
-from router.recording.file import RecordingFile
+from router.recording import writer as writer_module
+from router.recording.channels import Channels
+from router.recording.encoder import Chunk, Encoder
 from router.recording.mirror import MirroredDatagram
-from router.recording.reader_mcap import Recording
-from router.recording.recorder import Recorder, RecordError
-from router.recording.saving import Saving
-from tests.recording.recorder_rig import FakeMirror, again, imu, read, running, seen, settings, table, wire
+from router.recording.reader import Recording
+from router.recording.recorder import Recorder, RecordError, Ring
+from router.recording.writer import RecordingFile
+from tests.recording.recorder_rig import (
+    START,
+    FakeMirror,
+    again,
+    classifier,
+    imu,
+    read,
+    recorder,
+    seen,
+    settings,
+    table,
+    taken,
+    wire,
+)
 
 PATIENCE = 20.0
 
@@ -34,18 +45,17 @@ PATIENCE = 20.0
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "PERIOD", 10_000_000)
-    monkeypatch.setattr(recorder_intake, "PERIOD", 10_000_000)
 
 
 @contextmanager
-def recorder(directory: Path, **changed: Any) -> Iterator[tuple[Recorder, FakeMirror]]:
+def running_recorder(directory: Path, **changed: Any) -> Iterator[tuple[Recorder, FakeMirror]]:
     mirror = FakeMirror()
-    with closing(Recorder(running(mirror), settings(directory, **changed))) as made:
+    with closing(recorder(mirror, settings(directory, **changed))) as made:
         yield made, mirror
 
 
 def counted(made: Recorder) -> dict[str, float]:
-    return {" ".join((name, *labels)): value for name, asked in made.asked().items() for labels, value in asked()}
+    return {" ".join((name, *labels)): value for name, series in made.samples().items() for labels, value in series}
 
 
 def show(made: Recorder, mirror: FakeMirror, batch: list[MirroredDatagram]) -> None:
@@ -68,7 +78,7 @@ def now(*datagrams: bytes) -> list[MirroredDatagram]:
 
 def test_all_that_was_seen_is_in_the_file_when_it_is_closed(tmp_path: Path) -> None:
     batches = [now(imu(1), b"bad"), now(imu(2), imu(3))]
-    with recorder(tmp_path / "new" / "recordings") as (made, mirror):
+    with running_recorder(tmp_path / "new" / "recordings") as (made, mirror):
         for batch in batches:
             mirror.show(batch)
     [path] = files(tmp_path / "new" / "recordings")
@@ -85,20 +95,20 @@ def test_all_that_was_seen_is_in_the_file_when_it_is_closed(tmp_path: Path) -> N
 
 
 def test_what_was_seen_is_on_disk_soon_and_can_be_read_while_it_goes_on(tmp_path: Path) -> None:
-    with recorder(tmp_path) as (made, mirror):
+    with running_recorder(tmp_path) as (made, mirror):
         show(made, mirror, batch := now(imu()))
         assert [again(each) for each in read(files(tmp_path)[0])] == batch
 
 
 def test_nothing_seen_makes_no_file(tmp_path: Path) -> None:
-    with recorder(tmp_path):
+    with running_recorder(tmp_path):
         pass
     assert files(tmp_path) == []
 
 
 def test_a_file_that_would_become_too_large_is_followed_by_another(tmp_path: Path) -> None:
     noise = [now(os.urandom(10_000)) for _ in range(5)]
-    with recorder(tmp_path, max_size=25_000) as (made, mirror):
+    with running_recorder(tmp_path, max_size=25_000) as (made, mirror):
         for batch in noise:
             show(made, mirror, batch)
     assert [len(read(path)) for path in files(tmp_path)] == [2, 2, 1]
@@ -106,7 +116,7 @@ def test_a_file_that_would_become_too_large_is_followed_by_another(tmp_path: Pat
 
 
 def test_a_file_is_closed_when_it_is_old_enough_though_nothing_comes(tmp_path: Path) -> None:
-    with recorder(tmp_path, max_age=1) as (made, mirror):
+    with running_recorder(tmp_path, max_age=1) as (made, mirror):
         show(made, mirror, now(imu()))
         deadline = monotonic() + PATIENCE
         while not _is_whole(files(tmp_path)[0]):
@@ -128,7 +138,7 @@ def test_the_oldest_recordings_go_and_files_of_others_stay(tmp_path: Path) -> No
     (tmp_path / "other_20200101T000000.000000Z.mcap").write_bytes(bytes(100_000))
     old = tmp_path / "rover_20200101T000000.000000Z_deadman-drive_motor.mcap"
     old.write_bytes(bytes(10_000))
-    with recorder(tmp_path, max_size=25_000, keep=60_000) as (made, mirror):
+    with running_recorder(tmp_path, max_size=25_000, keep=60_000) as (made, mirror):
         for _ in range(8):
             show(made, mirror, now(os.urandom(10_000)))
     ours = [path for path in files(tmp_path) if path.stat().st_size < 100_000]
@@ -139,7 +149,7 @@ def test_the_oldest_recordings_go_and_files_of_others_stay(tmp_path: Path) -> No
 
 
 def test_the_last_datagrams_are_saved_when_somebody_asks(tmp_path: Path) -> None:
-    with recorder(tmp_path, continuous=False, last=60 * 10**9) as (made, mirror):
+    with running_recorder(tmp_path, continuous=False, last=60 * 10**9) as (made, mirror):
         mirror.show(first := now(imu(1), b"bad"))
         path = made.save("http")
         assert path.name.endswith("_http.mcap")
@@ -153,7 +163,7 @@ def test_the_last_datagrams_are_saved_when_somebody_asks(tmp_path: Path) -> None
 
 
 def test_what_is_older_than_last_is_not_saved(tmp_path: Path) -> None:
-    with recorder(tmp_path, continuous=False, last=1) as (made, mirror):
+    with running_recorder(tmp_path, continuous=False, last=1) as (made, mirror):
         mirror.show(now(imu(1)))
         made.save("first")  # has it written before the next comes
         mirror.show(second := now(imu(2)))
@@ -161,7 +171,7 @@ def test_what_is_older_than_last_is_not_saved(tmp_path: Path) -> None:
 
 
 def test_of_a_flood_the_memory_keeps_less(tmp_path: Path) -> None:
-    with recorder(tmp_path, continuous=False, last=60 * 10**9, max_size=25_000) as (made, mirror):
+    with running_recorder(tmp_path, continuous=False, last=60 * 10**9, max_size=25_000) as (made, mirror):
         for _ in range(5):
             mirror.show(last := now(os.urandom(10_000)))
             path = made.save("it")
@@ -170,7 +180,7 @@ def test_of_a_flood_the_memory_keeps_less(tmp_path: Path) -> None:
 
 
 def test_a_deadman_that_trips_has_it_saved_once_in_the_time_that_is_kept(tmp_path: Path) -> None:
-    with recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
+    with running_recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
         mirror.show(now(imu(1)))
         made.deadman_tripped("drive_motor")
         deadline = monotonic() + PATIENCE
@@ -188,7 +198,7 @@ def test_a_deadman_that_trips_has_it_saved_once_in_the_time_that_is_kept(tmp_pat
 
 
 def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:
-    with recorder(tmp_path) as (made, _):
+    with running_recorder(tmp_path) as (made, _):
         made.deadman_tripped("drive_motor")
         with pytest.raises(RecordError, match="no `last`"):
             made.save("http")
@@ -198,13 +208,13 @@ def test_without_last_there_is_nothing_to_save(tmp_path: Path) -> None:
 def test_a_directory_that_cannot_be_is_an_error_of_the_start(last: int | None, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(StartError, match=r"table.yaml:3:1: cannot record to .*: (Not a directory|File exists)"):
-        Recorder(running(FakeMirror()), settings(tmp_path / "file", last=last))
+        recorder(FakeMirror(), settings(tmp_path / "file", last=last))
 
 
 def test_a_disk_that_is_full_loses_counts_and_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_continuous, "_RETRY", 1)
+    monkeypatch.setattr(writer_module, "_RETRY", 1)
     real = os.write
-    with recorder(tmp_path) as (made, mirror):
+    with running_recorder(tmp_path) as (made, mirror):
         show(made, mirror, first := now(imu(1)))
         monkeypatch.setattr(os, "write", _full)
         show(made, mirror, now(imu(2), imu(3)))
@@ -217,8 +227,8 @@ def test_a_disk_that_is_full_loses_counts_and_is_tried_again(tmp_path: Path, mon
 def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder_continuous, "_RETRY", 1)
-    with recorder(tmp_path) as (made, mirror):
+    monkeypatch.setattr(writer_module, "_RETRY", 1)
+    with running_recorder(tmp_path) as (made, mirror):
         monkeypatch.setattr(os, "write", _full)
         show(made, mirror, now(imu(1)))
         show(made, mirror, now(imu(2)))
@@ -234,7 +244,7 @@ def test_what_cannot_be_saved_leaves_no_empty_file_and_can_be_saved_later(
     def full_after_the_head(descriptor: int, data: bytes) -> int:
         return real(descriptor, data) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
 
-    with recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
+    with running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
         mirror.show(batch := now(imu(1), imu(2)))
         monkeypatch.setattr(os, "write", full_after_the_head)
         with pytest.raises(RecordError, match="No space left"):
@@ -246,7 +256,7 @@ def test_what_cannot_be_saved_leaves_no_empty_file_and_can_be_saved_later(
 
 def test_where_the_directory_is_removed_it_is_made_again(tmp_path: Path) -> None:
     directory = tmp_path / "recordings"
-    with recorder(directory, last=10**11) as (made, mirror):
+    with running_recorder(directory, last=10**11) as (made, mirror):
         show(made, mirror, now(imu(1)))
         shutil.rmtree(directory)
         show(made, mirror, batch := now(imu(2)))
@@ -256,19 +266,16 @@ def test_where_the_directory_is_removed_it_is_made_again(tmp_path: Path) -> None
 
 
 def test_what_came_before_a_reload_is_saved_as_it_was_known_then(tmp_path: Path) -> None:
-    mirror = FakeMirror()
-    router = running(mirror)
-    with closing(Recorder(router, settings(tmp_path, continuous=False, last=10**11))) as made:
+    with running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
         mirror.show(now(imu(1)))
-        changed = SimpleNamespace(table=table(endpoints={}), envelope=wire().envelope, protos_sha256="1" * 64)
-        router.program = changed  # type: ignore[misc, assignment]
+        mirror.program = SimpleNamespace(table=table(endpoints={}), envelope=wire().envelope, protos_sha256="1" * 64)
         mirror.show(now(imu(2)))
         saved = made.save("http")
     assert [each.endpoint for each in read(saved)] == ["sensor_board", ""]
 
 
 def test_what_comes_after_the_end_is_refused(tmp_path: Path) -> None:
-    with recorder(tmp_path, last=10**9) as (made, _):
+    with running_recorder(tmp_path, last=10**9) as (made, _):
         pass
     made.deadman_tripped("drive_motor")
     with pytest.raises(RecordError, match="stopping"):
@@ -280,8 +287,8 @@ def _full(descriptor: int, data: bytes) -> int:
 
 
 def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with recorder(tmp_path) as (made, mirror):
-        monkeypatch.setattr(recorder_intake, "MOST_WAITING", 0)
+    with running_recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(recorder_module, "MOST_QUEUED", 0)
         mirror.show(now(imu(1), imu(2)))
         assert counted(made)["record_dropped overflow"] == 2
         monkeypatch.undo()
@@ -290,13 +297,13 @@ def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("owner", "name"), [(Encoder, "_shapes_of"), (Encoder, "take"), (RecordingFile, "write")], ids=str
+    ("owner", "name"), [(Encoder, "_append"), (Encoder, "take"), (RecordingFile, "write")], ids=str
 )
 def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
     owner: type, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As where memory is short. Nothing of it waits for ever, as if the disk were slow."""
-    with capture_logs() as logs, recorder(tmp_path) as (made, mirror):
+    with capture_logs() as logs, running_recorder(tmp_path) as (made, mirror):
         show(made, mirror, first := now(imu(1)))
         with monkeypatch.context() as faulty:
             faulty.setattr(owner, name, _fault)
@@ -304,8 +311,7 @@ def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
                 show(made, mirror, now(imu(2), imu(3)))
         assert counted(made)["record_dropped write_error"] == 6
         show(made, mirror, last := now(imu(4)))
-        assert made._intake is not None
-        assert made._intake._taken_in == made._intake._taken_out
+        assert made._queue._put == made._queue._taken
     assert [each["log_level"] for each in logs if "please report it" in each["event"]] == ["critical"]
     assert [again(each) for path in files(tmp_path) for each in read(path)] == first + last
 
@@ -313,10 +319,10 @@ def test_a_fault_costs_what_it_met_which_is_counted_and_told_once(
 def test_a_fault_in_saving_is_told_to_who_asked_and_the_next_is_served(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with recorder(tmp_path, last=10**11) as (made, mirror):
+    with running_recorder(tmp_path, last=10**11) as (made, mirror):
         mirror.show(batch := now(imu(1)))
         with monkeypatch.context() as faulty:
-            faulty.setattr(Saving, "_write", _fault)
+            faulty.setattr(Recorder, "_write_ring", _fault)
             with pytest.raises(RecordError, match="fault in the router itself: MemoryError"):
                 made.save("http")
             made.deadman_tripped("drive_motor")
@@ -330,35 +336,68 @@ def _fault(*_: object) -> None:
 def test_what_comes_while_saving_takes_its_time_is_written_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with recorder(tmp_path, last=10**11) as (made, mirror):
+    with running_recorder(tmp_path, last=10**11) as (made, mirror):
         show(made, mirror, now(imu(1)))
         show(made, mirror, now(imu(2)))
         written: list[float] = []
+        real = RecordingFile.write
 
-        def rest(_: float) -> None:
-            """Called by the recorder's thread, once for each batch that it saves."""
-            written.append(counted(made)["recorded_datagrams"])
-            mirror.show(now(imu(3)))
-            sleep(0.02)
+        def slowly(file: RecordingFile, chunk: Chunk) -> None:
+            """Called by the recorder's thread."""
+            real(file, chunk)
+            if file.path.stem.endswith("_http"):
+                written.append(counted(made)["recorded_datagrams"])
+                mirror.show(now(imu(3)))
+                sleep(0.02)
 
-        monkeypatch.setattr(recorder_saving, "sleep", rest)
+        monkeypatch.setattr(RecordingFile, "write", slowly)
         made.save("http")
     assert written == [2, 3]
 
 
-def test_what_is_saved_at_the_end_is_saved_without_rests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    rests: list[float] = []
-    monkeypatch.setattr(recorder_saving, "sleep", rests.append)
-    with recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
+def test_trips_that_came_too_soon_are_saved_at_the_end(tmp_path: Path) -> None:
+    with running_recorder(tmp_path, continuous=False, last=3600 * 10**9) as (made, mirror):
         mirror.show(now(imu(1)))
         made.deadman_tripped("drive_motor")
         while not files(tmp_path):  # the trip's, perhaps unfinished
             sleep(0.01)
         made.save("first")  # one thread saves: it has finished that one before
-        rests.clear()
         made.deadman_tripped("drive_motor")  # too soon: kept for the end
-    assert rests == []
     assert len(files(tmp_path)) == 3
+
+
+def test_a_disk_that_hangs_holds_up_a_stop_for_a_moment_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hanging, go_on = Event(), Event()
+
+    def hang(_: int) -> None:
+        hanging.set()
+        go_on.wait(PATIENCE)
+
+    monkeypatch.setattr(recorder_module, "STOP_SECONDS", 0.1)
+    with capture_logs() as logs, running_recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(os, "fdatasync", hang)
+        mirror.show(batch := now(imu(1), imu(2)))
+        assert hanging.wait(PATIENCE)
+    assert [each["log_level"] for each in logs] == ["error"]
+    assert [again(each) for each in read(files(tmp_path)[0])] == batch
+    go_on.set()
+    made._thread.join(PATIENCE)
+
+
+def test_a_file_that_is_no_longer_at_its_path_is_followed_by_another(tmp_path: Path) -> None:
+    """As where its file system was unmounted lazily: it has all its names, and can be written to."""
+    directory = tmp_path / "recordings"
+    with capture_logs() as logs, running_recorder(directory) as (made, mirror):
+        show(made, mirror, first := now(imu(1)))
+        directory.rename(tmp_path / "elsewhere")
+        directory.mkdir()
+        show(made, mirror, second := now(imu(2)))
+    for folder, batch in ((tmp_path / "elsewhere", first), (directory, second)):
+        [path] = files(folder)
+        assert _is_whole(path)
+        assert [again(each) for each in read(path)] == batch
+    assert [each["log_level"] for each in logs] == ["warning"]
+    assert counted(made)["record_dropped write_error"] == 0
 
 
 def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
@@ -371,7 +410,7 @@ def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
         except RecordError as error:
             answers.append(str(error))
 
-    with recorder(tmp_path, continuous=False, last=10**9) as (made, mirror):
+    with running_recorder(tmp_path, continuous=False, last=10**9) as (made, mirror):
         mirror.show(now(imu(1)))
         asking = [Thread(target=ask, args=(made,)) for _ in range(4)]
         for thread in asking:
@@ -381,3 +420,23 @@ def test_who_asks_while_it_ends_is_answered_at_once(tmp_path: Path) -> None:
     for thread in asking:
         thread.join(PATIENCE)
     assert [answer for answer in answers if not isinstance(answer, Path)] == ["the router is stopping"] * 4
+
+
+def test_a_ring_has_what_came_in_its_time() -> None:
+    ring, encoder = Ring(10, 1 << 20), Encoder(Channels())
+    for time in range(0, 30, 3):
+        encoder.add(seen(b"x"), classifier(), START, time)
+        ring.add(taken(encoder))
+    assert [each.monotonic for each in ring.chunks()] == [18, 21, 24, 27]
+
+
+def test_a_ring_never_takes_more_than_it_may_but_for_the_last_chunk() -> None:
+    ring, encoder = Ring(10**9, 10_000), Encoder(Channels())
+    for time in range(100):
+        encoder.add(seen(os.urandom(1000)), classifier(), START, time)
+        ring.add(taken(encoder))
+        assert sum(each.size_in_file for each in ring.chunks()) <= 10_000
+    assert len(ring.chunks()) > 5
+    encoder.add(seen(*[os.urandom(16_000) for _ in range(4)]), classifier(), START, 100)
+    ring.add(taken(encoder))
+    assert len(ring.chunks()) == 1

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from router.cli import main
 from router.recording.mirror import MirroredDatagram
-from router.recording.reader_mcap import Recording
+from router.recording.reader import Recording
 from router.rehearsal.replaying_against import Against
 from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, program
 from tests.recording.recorder_rig import MILLISECOND, START, imu, recorded, seen, wire

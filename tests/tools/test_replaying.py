@@ -11,7 +11,7 @@ import pytest
 
 from router.cli import main
 from router.errors import UsageError
-from router.recording.reader_mcap import Recorded, Recording
+from router.recording.reader import Recorded, Recording
 from router.tools.replaying import on_time, parse_rate
 from tests.ports import free_port
 from tests.recording.recorder_rig import MILLISECOND, START, imu, recorded, seen

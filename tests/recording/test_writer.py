@@ -14,19 +14,19 @@ from mcap.records import Channel, Message, Schema
 
 from router.errors import UsageError
 from router.recording.channels import DATAGRAMS, Channels
-from router.recording.file import RecordingFile
-from router.recording.reader_mcap import Recording
+from router.recording.encoder import Encoder
+from router.recording.reader import Recording
+from router.recording.writer import RecordingFile
 from tests.recording.recorder_rig import (
     MILLISECOND,
     START,
     STRANGER,
     again,
-    encoder,
+    encoded,
     imu,
     read,
     recorded,
     seen,
-    taken,
     wire,
     write,
 )
@@ -112,13 +112,12 @@ def test_a_kill_at_any_byte_leaves_all_chunks_that_were_written_whole(finish: bo
     """At each byte around the ends of records, and at every eleventh of all others."""
     path = recorded(tmp_path / "it.mcap", *BATCHES, finish=finish)
     whole = path.read_bytes()
-    batches, ends = Channels(), [0]
-    made = encoder(batches)
-    file = RecordingFile(tmp_path / "other.mcap", batches, {"reason": "test"})
+    channels, ends = Channels(), [0]
+    encoder = Encoder(channels)
+    file = RecordingFile(tmp_path / "other.mcap", channels, {"reason": "test"})
     begun = file.size
     for batch in BATCHES:
-        made.add(batch, batch[-1].at, batch[-1].at - START)
-        chunk = taken(made)
+        chunk = encoded(encoder, batch)
         file.write(chunk)
         ends.append(file.size - sum(map(len, chunk.indexes.values())))  # a chunk counts without its index
     cut = tmp_path / "cut.mcap"
@@ -177,9 +176,8 @@ def test_mcap_of_somebody_else_is_refused(tmp_path: Path) -> None:
 def test_what_the_disk_took_in_part_is_cut_off_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     channels = Channels()
     file = RecordingFile(tmp_path / "it.mcap", channels, {})
-    made = encoder(channels)
-    made.add(BATCHES[0], START, 0)
-    first = taken(made)
+    encoder = Encoder(channels)
+    first = encoded(encoder, BATCHES[0])
     file.write(first)
     size, real = file.size, os.write
 
@@ -193,19 +191,16 @@ def test_what_the_disk_took_in_part_is_cut_off_again(tmp_path: Path, monkeypatch
         file.write(first)
     assert file.size == size == (tmp_path / "it.mcap").stat().st_size
     monkeypatch.undo()
-    made.add(BATCHES[2], BATCHES[2][-1].at, 2 * SECOND)
-    file.write(taken(made))
+    file.write(encoded(encoder, BATCHES[2]))
     file.close()
     assert [again(each) for each in read(tmp_path / "it.mcap")] == [*BATCHES[0], *BATCHES[2]]
 
 
 def test_channels_are_written_only_into_files_that_use_them(tmp_path: Path) -> None:
     channels = Channels()
-    made = encoder(channels)
-    made.add(BATCHES[0], START, 0)
-    write(tmp_path / "first.mcap", channels, taken(made))
-    made.add(BATCHES[2], START + 2 * SECOND, 2 * SECOND)
-    write(tmp_path / "second.mcap", channels, taken(made))
+    encoder = Encoder(channels)
+    for name, batch in (("first.mcap", BATCHES[0]), ("second.mcap", BATCHES[2])):
+        write(tmp_path / name, channels, encoded(encoder, batch))
     with (tmp_path / "second.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None

@@ -11,15 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.engine import MAX_DATAGRAM
-from router.recording.channels import MOST, Channels, varint
-from router.recording.mirror import MirroredDatagram
+from router.recording.channels import MOST_CHANNELS, Channels
+from router.recording.encoder import Encoder
+from router.recording.mirror import MirroredDatagram, varint
 from tests.recording.recorder_rig import (
     MILLISECOND,
     SENSOR_BOARD,
     START,
     STRANGER,
     again,
-    encoder,
+    classifier,
+    encoded,
     imu,
     read,
     recorded,
@@ -81,29 +83,25 @@ def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: 
         MirroredDatagram(START, "exact", SENSOR_BOARD, padded),
     ]
     channels = Channels()
-    made = encoder(channels)
-    made.add(batch, START, 0)
-    chunk = taken(made)
+    chunk = encoded(Encoder(channels), batch)
     by_topic = {channels.channels[number].topic: count for number, count in chunk.messages.items()}
     assert by_topic == {"raw/datagrams": 2, "imu_info": 1}
 
 
 def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
     channels = Channels()
-    made = encoder(channels)
     many = [
         MirroredDatagram(START + n, "rover", (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1), imu())
-        for n in range(MOST + 10)
+        for n in range(MOST_CHANNELS + 10)
     ]
-    made.add(many, START, 0)
-    assert taken(made).datagrams == len(many)
-    assert len(channels.channels) == MOST + 2  # the raw datagrams, and their payloads to look at
+    assert encoded(Encoder(channels), many).datagrams == len(many)
+    assert len(channels.channels) == MOST_CHANNELS + 2  # the raw datagrams, and their payloads to look at
 
 
 def test_known_senders_keep_their_channels_over_a_reload_when_there_are_too_many() -> None:
     channels = Channels()
     case = wire().case("imu_info")
-    numbers = [channels.payload(case, "rover", ("10.0.0.3", port), "sensor_board") for port in range(MOST + 1)]
+    numbers = [channels.payload(case, "rover", ("10.0.0.3", port), "sensor_board") for port in range(MOST_CHANNELS + 1)]
     assert numbers[-1] is None
     assert channels.payload(case, "rover", ("10.0.0.3", 7), "sensor_board") == numbers[7]
     assert channels.payload(case, "rover", ("10.0.0.3", 7), "renamed") is None
@@ -112,11 +110,11 @@ def test_known_senders_keep_their_channels_over_a_reload_when_there_are_too_many
 def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tmp_path: Path) -> None:
     """A rover without a battery for its clock: GPS comes up, then somebody sets it back."""
     channels = Channels()
-    made = encoder(channels)
+    encoder = Encoder(channels)
     walls = [0, START, START + 20 * MILLISECOND, START // 2, START // 2]
     for number, wall in enumerate(walls):
-        made.add(seen(imu(), at=wall), wall, number * 20 * MILLISECOND)
-    found = read(write(tmp_path / "it.mcap", channels, taken(made)))
+        encoder.add(seen(imu(), at=wall), classifier(), wall, number * 20 * MILLISECOND)
+    found = read(write(tmp_path / "it.mcap", channels, taken(encoder)))
     assert [each.at for each in found] == walls
     assert [each.steady for each in found] == [number * 20 * MILLISECOND for number in range(5)]
 
@@ -124,12 +122,12 @@ def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tm
 @given(st.lists(st.tuples(st.integers(0, 10**18), st.integers(0, 10**10)), min_size=2, max_size=20))
 def test_steady_times_never_go_back_and_never_run_ahead(clocks: list[tuple[int, int]]) -> None:
     channels = Channels()
-    made = encoder(channels)
+    encoder = Encoder(channels)
     now = 0
     for wall, passed in clocks:
         now += passed
-        made.add(seen(imu(), at=wall), wall, now)
+        encoder.add(seen(imu(), at=wall), classifier(), wall, now)
     with tempfile.TemporaryDirectory() as folder:
-        found = read(write(Path(folder) / "it.mcap", channels, taken(made)))
+        found = read(write(Path(folder) / "it.mcap", channels, taken(encoder)))
     assert all(first.steady <= second.steady for first, second in pairwise(found))
     assert found[-1].steady - found[0].steady <= now - clocks[0][1] + 2 * MILLISECOND

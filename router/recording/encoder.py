@@ -1,0 +1,316 @@
+"""Mirrored datagrams, encoded as MCAP messages into compressed chunks.
+
+The messages of a batch are built together, by C functions that map over it: 0.9 us each, against 2.8 us for a call of
+`mcap.writer.Writer`. The writer of foxglove-sdk sets neither the publish time nor the sequence of a message.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, chain, repeat
+from operator import getitem, itemgetter, le
+from typing import NamedTuple
+
+import zstandard
+from google.protobuf.message import DecodeError as ProtobufError
+from google.protobuf.message import Message
+from mcap.opcode import Opcode
+from mcap.records import Chunk as ChunkRecord
+
+from router.engine import MAX_DATAGRAM
+from router.engine.slow_path import LEN
+from router.recording.channels import Channels, Datagram
+from router.recording.mirror import Classifier, Mirrored, Peer, varint
+from router.types.protobuf import PayloadCase
+
+LONGEST_CHUNK = 4 << 20
+"""Bytes, not compressed."""
+
+_HEAD = struct.Struct("<BQHIQQ")
+"""A message record up to its data: opcode, length of what follows, channel, sequence, log time, publish time."""
+_OPCODE_AND_LENGTH = 9
+_BEHIND_LENGTH = _HEAD.size - _OPCODE_AND_LENGTH
+_INDEX_HEAD = struct.Struct("<BQHI")
+_SEQUENCE = 0xFFFFFFFF
+_TAG = itemgetter(slice(2))
+_MOST_SHAPES = 8192
+_CLOCK_WAS_SET = 1_000_000
+"""ns. A larger step of the wall clock against the monotonic one is a clock that was set; a smaller one is slewing."""
+_DATA_TAG = varint(Datagram.DESCRIPTOR.fields_by_name["data"].number << 3 | LEN)
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Messages as they go into a file. `indexes` has the message index records by channel.
+
+    `messages` counts them by channel; `datagrams` and `size` (bytes) are those that were received. `monotonic` is when
+    the last batch was received (ns).
+    """
+
+    record: ChunkRecord
+    indexes: Mapping[int, bytes]
+    messages: Mapping[int, int]
+    datagrams: int
+    size: int
+    monotonic: int
+
+    @property
+    def size_in_file(self) -> int:
+        """Bytes, about, with what a file says of the chunk in its summary."""
+        return len(self.record.data) + sum(map(len, self.indexes.values())) + 200 + 10 * len(self.indexes)
+
+
+class _Shape(NamedTuple):
+    """What datagrams of one sender, length and payload case have in common.
+
+    `header` is the envelope's tag and length. `length` is that of the message record behind its length field,
+    `message_index` the index of its channel.
+    """
+
+    header: bytes
+    payload: slice
+    length: int
+    channel: int
+    message_index: list[int]
+    parse: Callable[[bytes], Message]
+
+
+class _Row(NamedTuple):
+    """One message record; see `_HEAD` and `_Shape`."""
+
+    length: int
+    channel: int
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+    message_index: list[int]
+
+
+class Encoder:
+    """`add` takes datagrams in the order of their arrival, `take` returns them as a chunk.
+
+    A message's log time is the wall clock. Its publish time is the same until somebody sets that clock, and never goes
+    back. The sequence counts datagrams.
+    """
+
+    def __init__(self, channels: Channels) -> None:
+        self._channels = channels
+        self._compressor = zstandard.ZstdCompressor(level=1)
+        self._pieces: list[bytes] = []
+        self._offset = 0
+        self._indexes: dict[int, list[int]] = {}  # by channel: log time and offset of each message
+        self._datagrams = self._bytes = self._sequence = self._monotonic = 0
+        self._first_ahead: int | None = None
+        self._shift = self._steady = 0
+        self._classifier: Classifier | None = None
+        self._cases: dict[bytes, PayloadCase] = {}  # by tag
+        self._shapes: dict[tuple[str, Peer, int, bytes], _Shape] = {}
+        self._payload_channels: dict[tuple[str, str, Peer], int | None] = {}
+        self._other_channels: dict[str, int] = {}
+        self._raw: dict[tuple[str, Peer], tuple[bytes, bytes]] = {}
+
+    @property
+    def size(self) -> int:
+        """Bytes that the next chunk has so far, not compressed."""
+        return self._offset
+
+    def add(self, batch: Sequence[Mirrored], classifier: Classifier, wall: int, monotonic: int) -> None:
+        """`wall` and `monotonic` are the two clocks when the batch was received (ns)."""
+        if not batch:
+            return
+        if classifier is not self._classifier:
+            self._use(classifier)
+        self._datagrams += len(batch)
+        self._monotonic = monotonic
+        times, listeners, peers, data = zip(*batch, strict=True)
+        self._bytes += sum(map(len, data))
+        steady = self._steady_times(times, wall, monotonic)
+        first = self._sequence + 1
+        self._sequence += len(batch)
+        sequences = map(_SEQUENCE.__and__, range(first, first + len(batch)))
+        shapes = self._shapes_of(listeners, peers, data)
+        found = [shape for shape in shapes if shape is not None]
+        if len(found) == len(batch) and _parses(self._parse_envelope, b"".join(data)):
+            _, payloads, lengths, channels, indexes, _ = zip(*found, strict=True)
+            self._append(lengths, channels, sequences, times, steady, map(getitem, data, payloads), indexes)
+            return
+        rows: list[_Row] = []
+        for each, shape, sequence, publish_time in zip(batch, shapes, sequences, steady, strict=True):
+            rows += self._rows(classifier, each, shape, sequence, publish_time)
+        self._append(*zip(*rows, strict=True))
+
+    def take(self) -> Chunk | None:
+        """Return what was added since the last time, None for nothing."""
+        if not self._pieces:
+            return None
+        data = b"".join(self._pieces)
+        filled = {channel: index for channel, index in self._indexes.items() if index}
+        record = ChunkRecord(
+            compression="zstd",
+            data=self._compressor.compress(data),
+            message_start_time=min(min(index[::2]) for index in filled.values()),
+            message_end_time=max(max(index[::2]) for index in filled.values()),
+            uncompressed_crc=zlib.crc32(data),
+            uncompressed_size=len(data),
+        )
+        indexes = {channel: _index_record(channel, index) for channel, index in filled.items()}
+        messages = {channel: len(index) // 2 for channel, index in filled.items()}
+        chunk = Chunk(record, indexes, messages, self._datagrams, self._bytes, self._monotonic)
+        self.drop()
+        return chunk
+
+    def drop(self) -> int:
+        """Forget what was added since the last time, which a fault may have left half done. Return how many it was."""
+        dropped, self._datagrams, self._bytes = self._datagrams, 0, 0
+        self._pieces.clear()
+        self._offset = 0
+        for index in self._indexes.values():
+            index.clear()
+        return dropped
+
+    def _use(self, classifier: Classifier) -> None:
+        self._classifier = classifier
+        self._parse_envelope = classifier.envelope.message_class.FromString
+        self._cases = classifier.cases_by_tag
+        self._shapes.clear()
+        self._payload_channels.clear()
+        self._other_channels.clear()
+        self._raw.clear()
+
+    def _steady_times(self, times: Sequence[int], wall: int, monotonic: int) -> Sequence[int]:
+        """Return the publish times: `times`, without the steps of a wall clock that was set."""
+        if self._first_ahead is None:
+            self._first_ahead = wall - monotonic
+        now = monotonic + self._first_ahead
+        if abs(now - wall - self._shift) > _CLOCK_WAS_SET:
+            self._shift = now - wall
+        latest, shift, steady = now + _CLOCK_WAS_SET, self._shift, self._steady
+        if not shift and steady <= times[0] and times[-1] <= latest and all(map(le, times, times[1:])):
+            self._steady = times[-1]
+            return times
+        found = [steady := max(steady, min(at + shift, latest)) for at in times]
+        self._steady = steady
+        return found
+
+    def _append(
+        self,
+        lengths: Iterable[int],
+        channels: Iterable[int],
+        sequences: Iterable[int],
+        log_times: Iterable[int],
+        publish_times: Iterable[int],
+        data: Iterable[bytes],
+        indexes: Iterable[list[int]],
+    ) -> None:
+        """Add message records, one of each column. A loop here would double the cost of recording."""
+        lengths, log_times = tuple(lengths), tuple(log_times)
+        heads = map(_HEAD.pack, repeat(Opcode.MESSAGE.value), lengths, channels, sequences, log_times, publish_times)
+        self._pieces += chain.from_iterable(zip(heads, data, strict=True))
+        *offsets, self._offset = accumulate(map(_OPCODE_AND_LENGTH.__add__, lengths), initial=self._offset)
+        deque(map(list.extend, indexes, zip(log_times, offsets, strict=True)), maxlen=0)
+
+    def _shapes_of(
+        self, listeners: Sequence[str], peers: Sequence[Peer], data: Sequence[bytes]
+    ) -> Sequence[_Shape | None]:
+        """Return the shape of each, None for one that has to be recorded raw."""
+        shapes = list(map(self._shapes.get, zip(listeners, peers, map(len, data), map(_TAG, data), strict=True)))
+        if None in shapes:
+            shapes = list(map(self._shape, listeners, peers, data))
+        return [
+            shape if shape is not None and each.startswith(shape.header) else None
+            for shape, each in zip(shapes, data, strict=True)
+        ]
+
+    def _shape(self, listener: str, peer: Peer, data: bytes) -> _Shape | None:
+        """Return None for a datagram that is not one field of a payload case, encoded as protobuf encodes it."""
+        if (known := self._shapes.get((listener, peer, len(data), data[:2]))) is not None:
+            return known
+        tag = data[: 1 if data[:1] < b"\x80" else 2 if data[1:2] < b"\x80" else 3]
+        if tag not in self._cases or len(data) > MAX_DATAGRAM or (header := _header(tag, data)) is None:
+            return None
+        case = self._cases[tag]
+        channel = self._payload_channel(case, listener, peer)
+        if channel is None:
+            return None
+        length = _BEHIND_LENGTH + len(data) - len(header)
+        parse = case.message_class.FromString
+        shape = _Shape(header, slice(len(header), None), length, channel, self._index(channel), parse)
+        if len(self._shapes) >= _MOST_SHAPES:
+            self._shapes.clear()
+        self._shapes[listener, peer, len(data), data[:2]] = shape
+        return shape
+
+    def _payload_channel(self, case: PayloadCase, listener: str, peer: Peer) -> int | None:
+        key = (case.name, listener, peer)
+        if key not in self._payload_channels:
+            assert self._classifier is not None  # noqa: S101 - `add` has set it
+            if len(self._payload_channels) >= _MOST_SHAPES:
+                self._payload_channels.clear()
+            endpoint = self._classifier.sender(listener, peer)
+            self._payload_channels[key] = self._channels.payload(case, listener, peer, endpoint)
+        return self._payload_channels[key]
+
+    def _other_channel(self, case: PayloadCase | None) -> int:
+        """Return the channel of a case's views, or that of raw datagrams."""
+        name = case.name if case is not None else ""
+        if name not in self._other_channels:
+            channels = self._channels
+            self._other_channels[name] = channels.view(case) if case is not None else channels.datagrams()
+        return self._other_channels[name]
+
+    def _index(self, channel: int) -> list[int]:
+        return self._indexes.setdefault(channel, [])
+
+    def _rows(
+        self, classifier: Classifier, datagram: Mirrored, shape: _Shape | None, sequence: int, publish_time: int
+    ) -> Iterator[_Row]:
+        """Yield the payload where that is the whole datagram; else the datagram, and its payload if there is one."""
+        at, listener, peer, data = datagram
+        if shape is not None and _parses(shape.parse, data[shape.payload]):
+            row = (sequence, at, publish_time, data[shape.payload], shape.message_index)
+            yield _Row(shape.length, shape.channel, *row)
+            return
+        messages = [(self._other_channel(None), self._datagram(classifier, listener, peer, data))]
+        if (found := classifier.encoded_payload(listener, data)) is not None:
+            case, payload = found
+            messages.append((self._other_channel(case), payload))
+        for channel, message in messages:
+            length = _BEHIND_LENGTH + len(message)
+            yield _Row(length, channel, sequence, at, publish_time, message, self._index(channel))
+
+    def _datagram(self, classifier: Classifier, listener: str, peer: Peer, data: bytes) -> bytes:
+        """Encode a `Datagram`; fields before and behind `data` are encoded once for a sender."""
+        if (listener, peer) not in self._raw:
+            if len(self._raw) >= _MOST_SHAPES:
+                self._raw.clear()
+            before = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}").SerializeToString()
+            behind = Datagram(endpoint=classifier.sender(listener, peer)).SerializeToString()
+            self._raw[listener, peer] = before, behind
+        before, behind = self._raw[listener, peer]
+        return b"".join((before, _DATA_TAG, varint(len(data)), data, behind))
+
+
+def _parses(parse: Callable[[bytes], Message], data: bytes) -> bool:
+    try:
+        parse(data)
+    except ProtobufError:
+        return False
+    return True
+
+
+def _header(tag: bytes, data: bytes) -> bytes | None:
+    """Return tag and length, where the length is encoded as short as it can be and that of all that follows."""
+    behind = len(data) - len(tag)
+    size = 1 if behind <= 0x80 else 2 if behind <= 0x4001 else 3
+    header = tag + varint(max(0, behind - size))
+    return header if len(header) == len(tag) + size and data.startswith(header) else None
+
+
+def _index_record(channel: int, index: Sequence[int]) -> bytes:
+    size = 8 * len(index)
+    return _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + size, channel, size) + struct.pack(f"<{len(index)}Q", *index)

@@ -1,0 +1,122 @@
+"""Reads a recording: the datagrams, byte for byte, in the order in which the router took them.
+
+Of a file whose writer was killed it reads all chunks that were written whole.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import zstandard
+from google.protobuf.message import DecodeError as ProtobufError
+from mcap.exceptions import McapError
+from mcap.records import Channel, Footer, Header, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader
+
+from router.engine.slow_path import LEN
+from router.errors import UsageError
+from router.recording.channels import Datagram, Holds
+from router.recording.mirror import Peer, varint
+from router.recording.writer import LIBRARY, METADATA
+
+_DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
+"""What reading raises for what no recorder wrote; lz4, which `mcap recover` may have used, a RuntimeError."""
+
+
+class Recorded(NamedTuple):
+    """A datagram: when the router took it by the wall clock and by one that nobody set (ns), where, from whom.
+
+    `endpoint` is what the table of that time called the sender, empty for a stranger.
+    """
+
+    at: int
+    steady: int
+    listener: str
+    peer: Peer
+    endpoint: str
+    data: bytes
+
+
+class Recording:
+    """`about` says what was recorded and why. Raises UsageError for a file that is no recording of a router."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.about: dict[str, str] = {}
+        self.is_whole = self.ends_early = False
+        """Once all was read: the writer finished the file; it was killed, or the file is damaged."""
+        self._decoders: dict[int, Callable[[bytes], tuple[str, Peer, str, bytes] | None]] = {}
+        try:
+            self._file: BinaryIO = path.open("rb")
+        except OSError as error:
+            raise UsageError(f"{path}: {error.strerror}") from error
+        self.size = path.stat().st_size
+        self._records = StreamReader(self._file, validate_crcs=True, record_size_limit=self.size).records
+        try:
+            self._begin()
+        except UsageError:
+            self.close()
+            raise
+
+    @property
+    def position(self) -> int:
+        """Bytes of `size` that have been read."""
+        return self._file.tell()
+
+    def close(self) -> None:
+        self._file.close()
+
+    def datagrams(self) -> Iterator[Recorded]:
+        """Yield each datagram, once, until the file ends or is damaged."""
+        try:
+            for record in self._records:
+                if isinstance(record, Message):
+                    if (found := self._decoders[record.channel_id](record.data)) is not None:
+                        listener, peer, endpoint, data = found
+                        yield Recorded(record.log_time, record.publish_time, listener, peer, endpoint, data)
+                else:
+                    self._take(record)
+        except _DAMAGED:
+            pass
+        self.ends_early = not self.is_whole
+
+    def _take(self, record: McapRecord) -> None:
+        if isinstance(record, Channel):
+            self._decoders[record.id] = _decoder(record.metadata)
+        elif isinstance(record, Metadata) and record.name == METADATA:
+            self.about = record.metadata
+        elif isinstance(record, Footer):
+            self.is_whole = True
+
+    def _begin(self) -> None:
+        try:
+            header = next(self._records)
+        except _DAMAGED:
+            raise UsageError(f"{self.path} is no MCAP file") from None
+        if not isinstance(header, Header) or not header.library.startswith(LIBRARY):
+            raise UsageError(f"{self.path} was not recorded by a router")
+
+
+def _decoder(metadata: dict[str, str]) -> Callable[[bytes], tuple[str, Peer, str, bytes] | None]:
+    """Return what makes listener, sender, endpoint and datagram of a message of the channel with this metadata."""
+    holds = metadata.get("holds")
+    if holds == Holds.DATAGRAM.value:
+        return _raw
+    if holds != Holds.PAYLOAD.value:
+        return lambda _: None  # the datagram is elsewhere in the recording
+    tag, peer = varint(int(metadata["number"]) << 3 | LEN), _peer(metadata["peer"])
+    listener, endpoint = metadata["listener"], metadata["endpoint"]
+    return lambda payload: (listener, peer, endpoint, b"".join((tag, varint(len(payload)), payload)))
+
+
+def _raw(message: bytes) -> tuple[str, Peer, str, bytes]:
+    datagram: Any = Datagram.FromString(message)
+    return datagram.listener, _peer(datagram.peer), datagram.endpoint, datagram.data
+
+
+def _peer(text: str) -> Peer:
+    host, _, port = text.rpartition(":")
+    return host, int(port)

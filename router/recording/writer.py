@@ -1,0 +1,327 @@
+"""Writes recordings: one MCAP file of chunks, the directory of such files, and files that follow one another.
+
+What was written of a file can be read whenever writing ends, for whatever reason.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from router.clock import wall_ns
+from router.errors import StartError
+from router.log import logger
+from router.recording.channels import Channels
+from router.recording.encoder import Chunk
+from router.table.model import RecordSettings
+
+LIBRARY = "rover_router"
+"""The name of the library that wrote a recording; its version follows."""
+METADATA = "router"
+SUFFIX = ".mcap"
+
+_TIME = "%Y%m%dT%H%M%S.%fZ"
+_RETRY = 10_000_000_000
+"""ns until a disk that failed is tried again."""
+
+
+class RecordingFile:
+    """A file that was not there before. Everything raises OSError.
+
+    `about` says what is recorded, and why; it is the file's metadata.
+    """
+
+    def __init__(self, path: Path, channels: Channels, about: Mapping[str, str]) -> None:
+        self.path = path
+        self.size = 0
+        self._channels = channels
+        self._written_schemas: set[int] = set()
+        self._indexes: list[ChunkIndex] = []
+        self._messages: Counter[int] = Counter()
+        head = MCAP0_MAGIC + _encoded([Header("", f"{LIBRARY} {version('rover-router')}")])
+        metadata = _encoded([Metadata(name=METADATA, metadata=dict(about))])
+        self._metadata = MetadataIndex(offset=len(head), length=len(metadata), name=METADATA)
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        try:
+            self._append(head + metadata)
+        except OSError:
+            os.close(self._descriptor)
+            path.unlink()
+            raise
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether its path leads elsewhere: it was removed or moved, or its file system was unmounted."""
+        try:
+            return not os.path.samestat(self.path.stat(), os.fstat(self._descriptor))
+        except OSError:
+            return True
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no chunk in it."""
+        return not self._indexes
+
+    def write(self, chunk: Chunk) -> None:
+        """Append a chunk. What could not be written whole is cut off again."""
+        new = sorted(chunk.messages.keys() - self._messages.keys())
+        channels = [self._channels.channels[number] for number in new]
+        schemas = sorted({channel.schema_id for channel in channels} - self._written_schemas)
+        introduced = _encoded([*(self._channels.schemas[number] for number in schemas), *channels])
+        record = _encoded([chunk.record])
+        start = self.size + len(introduced)
+        offsets, position = {}, start + len(record)
+        for channel, index in chunk.indexes.items():
+            offsets[channel] = position
+            position += len(index)
+        self._append(b"".join((introduced, record, *chunk.indexes.values())))
+        self._written_schemas.update(schemas)
+        self._messages.update(chunk.messages)
+        self._indexes.append(
+            ChunkIndex(
+                chunk_length=len(record),
+                chunk_start_offset=start,
+                compression=chunk.record.compression,
+                compressed_size=len(chunk.record.data),
+                message_end_time=chunk.record.message_end_time,
+                message_index_length=sum(map(len, chunk.indexes.values())),
+                message_index_offsets=offsets,
+                message_start_time=chunk.record.message_start_time,
+                uncompressed_size=chunk.record.uncompressed_size,
+            )
+        )
+
+    def sync(self) -> None:
+        """Return when what was written outlasts a loss of power."""
+        os.fdatasync(self._descriptor)
+
+    def close(self) -> None:
+        """Write what readers seek by. A file without it can be read from the start."""
+        try:
+            self._append(self._end())
+            self.sync()
+        finally:
+            os.close(self._descriptor)
+
+    def _end(self) -> bytes:
+        """Return data end, summary and footer."""
+        end = _encoded([DataEnd(0)])
+        start = position = self.size + len(end)
+        groups, offsets = [], []
+        for opcode, records in self._summary().items():
+            group = _encoded(records)
+            if group:
+                offsets.append(SummaryOffset(opcode, position, len(group)))
+            groups.append(group)
+            position += len(group)
+        summary = b"".join((*groups, _encoded(offsets)))
+        footer = _encoded([Footer(start, position, 0)])[:-4]
+        crc = zlib.crc32(summary + footer)
+        return b"".join((end, summary, footer, crc.to_bytes(4, "little"), MCAP0_MAGIC))
+
+    def _summary(self) -> dict[Opcode, list[McapRecord]]:
+        return {
+            Opcode.SCHEMA: [self._channels.schemas[number] for number in sorted(self._written_schemas)],
+            Opcode.CHANNEL: [self._channels.channels[number] for number in sorted(self._messages)],
+            Opcode.STATISTICS: [
+                Statistics(
+                    attachment_count=0,
+                    channel_count=len(self._messages),
+                    channel_message_counts=dict(self._messages),
+                    chunk_count=len(self._indexes),
+                    message_count=self._messages.total(),
+                    message_end_time=max((index.message_end_time for index in self._indexes), default=0),
+                    message_start_time=min((index.message_start_time for index in self._indexes), default=0),
+                    metadata_count=1,
+                    schema_count=len(self._written_schemas),
+                )
+            ],
+            Opcode.CHUNK_INDEX: list(self._indexes),
+            Opcode.METADATA_INDEX: [self._metadata],
+        }
+
+    def _append(self, data: bytes) -> None:
+        try:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+        except OSError:
+            os.ftruncate(self._descriptor, self.size)
+            os.lseek(self._descriptor, self.size, os.SEEK_SET)
+            raise
+        self.size += len(data)
+
+
+def _encoded(records: Iterable[McapRecord]) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    encoded: bytes = builder.end()  # type: ignore[no-untyped-call]  # of mcap
+    return encoded
+
+
+class RecordingDirectory:
+    """The files `STEM_TIME[_REASON].mcap` below a table's `record.directory`; others are left alone.
+
+    They have at most `keep` bytes. Creates the directory; raises StartError.
+    """
+
+    def __init__(self, settings: RecordSettings, stem: str) -> None:
+        try:
+            settings.directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StartError(f"{settings.span}: cannot record to {settings.directory}: {error.strerror}") from error
+        if not os.access(settings.directory, os.W_OK | os.X_OK):
+            raise StartError(f"{settings.span}: may not write to {settings.directory}; give `record` another directory")
+        self.path = settings.directory.resolve()
+        self._stem = stem
+        self._keep = settings.keep
+
+    def new(self, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
+        """Create a file. Equal names, as where the clock begins anew at each start, get numbers. Raises OSError."""
+        time = datetime.fromtimestamp(wall_ns() / 1e9, timezone.utc).strftime(_TIME)
+        words = [self._stem, time, *([re.sub(r"[^a-z0-9_.-]+", "-", reason.lower())] if reason else [])]
+        for number in range(1, 1000):
+            name = "_".join([*words, *([str(number)] if number > 1 else [])]) + SUFFIX
+            try:
+                return RecordingFile(self.path / name, channels, about)
+            except FileExistsError:
+                continue
+        raise FileExistsError(errno.EEXIST, f"there are a thousand recordings of {time}", str(self.path))
+
+    def make_room(self, coming: int, writing: Path | None = None) -> None:
+        """Remove the oldest, by name, until there is room for `coming` bytes beside the file `writing`. Raises OSError.
+
+        The directory is created anew where somebody has removed it.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        sizes = {path: size for path, size in recording_sizes(self.path, self._stem).items() if path != writing}
+        total = sum(sizes.values())
+        for path, size in sizes.items():
+            if total + coming <= self._keep:
+                return
+            path.unlink(missing_ok=True)
+            total -= size
+            logger.info("removed the oldest recording, to keep within 'keep'", file=str(path), bytes=size)
+
+
+def recording_sizes(path: Path, stem: str) -> dict[Path, int]:
+    """Return the bytes of each recording of a table below `path`, the oldest first."""
+    name = re.compile(re.escape(stem) + r"_\d{8}T\d{6}\.\d{6}Z(_[a-z0-9_.-]+)?" + re.escape(SUFFIX))
+    sizes: dict[Path, int] = {}
+    for file in sorted(path.iterdir()) if path.is_dir() else ():
+        if name.fullmatch(file.name):
+            try:
+                sizes[file] = file.stat().st_size
+            except FileNotFoundError:  # somebody has removed it meanwhile
+                continue
+    return sizes
+
+
+class ContinuousWriter:
+    """Writes all chunks to files that follow one another; what the disk does not take is counted in `lost`.
+
+    A file is begun when there is something to write and the last one is full or old enough. `about` is called for each.
+    Times are monotonic, in ns.
+    """
+
+    def __init__(
+        self,
+        settings: RecordSettings,
+        directory: RecordingDirectory,
+        channels: Channels,
+        about: Callable[[], Mapping[str, str]],
+    ) -> None:
+        self.datagrams = self.bytes = self.lost = 0
+        self._max_size = min(settings.max_size, settings.keep)
+        self._max_age = settings.max_age
+        self._directory = directory
+        self._channels = channels
+        self._about = about
+        self._file: RecordingFile | None = None
+        self._opened = 0
+        self._retry_at: int | None = None
+
+    @property
+    def path(self) -> Path | None:
+        """Of the file that is being written."""
+        return self._file.path if self._file is not None else None
+
+    def write(self, chunk: Chunk, now: int) -> None:
+        """Write and sync. Raises nothing that the disk is to blame for."""
+        if self._retry_at is not None and now < self._retry_at:
+            self.lost += chunk.datagrams
+            return
+        try:
+            file = self._file_for(chunk, now)
+            file.write(chunk)
+            file.sync()
+        except OSError as error:
+            self._failed(error, chunk, now)
+            return
+        except Exception:
+            self.lost += chunk.datagrams
+            raise
+        if self._retry_at is not None:
+            self._retry_at = None
+            logger.info("recording again", file=str(file.path), lost=self.lost)
+        self.datagrams += chunk.datagrams
+        self.bytes += chunk.size
+
+    def close_if_old(self, now: int) -> None:
+        if self._file is not None and now - self._opened >= self._max_age:
+            self.close()
+
+    def close(self) -> None:
+        file, self._file = self._file, None
+        if file is None:
+            return
+        try:
+            file.close()
+        except OSError as error:
+            event = "a recording could not be finished; it can be read all the same"
+            logger.error(event, file=str(file.path), problem=error.strerror)
+
+    def _file_for(self, chunk: Chunk, now: int) -> RecordingFile:
+        file = self._file
+        if file is not None and file.is_gone:
+            logger.warning("the recording is gone from its path; beginning another", file=str(file.path))
+            self.close()
+        elif file is not None and file.size + chunk.size_in_file > self._max_size:
+            self.close()
+        if self._file is None:
+            self._directory.make_room(self._max_size)
+            self._file = self._directory.new("", self._channels, self._about())
+            self._opened = now
+        return self._file
+
+    def _failed(self, error: OSError, chunk: Chunk, now: int) -> None:
+        self.lost += chunk.datagrams
+        if self._retry_at is None:
+            where = str(self._file.path if self._file is not None else self._directory.path)
+            remedy = "make room, or give `record` a smaller `keep`"
+            logger.error("cannot record; trying again every 10 s", where=where, problem=error.strerror, remedy=remedy)
+        self._retry_at = now + _RETRY
+        self.close()
