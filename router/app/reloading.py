@@ -1,65 +1,65 @@
-"""A reload: the table is read and compiled again beside the running program, which ends when all is ready for another.
-
-Knows what came of it; how a program takes over, `edges` knows.
-"""
+"""Reloads: the table is read and compiled again beside the running program, and replaces it when all is ready."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from router.app.accounts import Accounts
-from router.app.changes import all_moved, changes, unchangeable
-from router.app.edges import Edges
-from router.app.interpreter import beside_traffic
+from router.app.process import beside_traffic, reloading
+from router.app.runtime import Runtime
 from router.app.sockets import is_replaceable
-from router.app.supervision import reloading
-from router.app.watching import PATIENCE, wait_for_rest, watched_files
+from router.app.watching import UNCHANGED_TIMEOUT, wait_until_unchanged, watched_files
+from router.app.wiring import ThreadCounts
 from router.clock import monotonic_ns, wall_ns
 from router.compiler import check_table
 from router.compiler.check import Checked
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
-from router.errors import Diagnostic, Severity, StartError
+from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError
 from router.log import logger
 from router.observe.running import ReloadResult
+from router.table.keys import are_same
+from router.table.model import NodeSettings, RouteTable
 from router.threads import StuckError, background_threads
+
+_MOST_NAMED = 12
+"""Changes that the summary of a reload names."""
 
 
 class Reloader:
-    """One reload at a time. `environ` has the values of the table's variables; None means the process environment.
+    """Reloads the table, one at a time. `environ` has the values of the table's variables (None: process environment).
 
-    `settled` is called when another program runs, and nothing is left of the one before.
+    `replaced` is called when another program runs, and everything of the one before is closed.
     """
 
     def __init__(
-        self, edges: Edges, accounts: Accounts, environ: Mapping[str, str] | None, settled: Callable[[], None]
+        self, runtime: Runtime, counts: ThreadCounts, environ: Mapping[str, str] | None, replaced: Callable[[], None]
     ) -> None:
-        self._edges = edges
-        self._accounts = accounts
+        self._runtime = runtime
+        self._counts = counts
         self._environ = environ
-        self._settled = settled
+        self._replaced = replaced
         self._is_open = False
         self._one_at_a_time = threading.Lock()
 
     def open(self) -> None:
-        """The router runs. What it has now counts as loaded."""
+        """Allow reloads, once the router runs, and count the start as a successful load."""
         self._is_open = True
         self._remember(is_good=True)
 
     def close(self) -> None:
-        """Waits for a reload that is going on; none begins any more."""
+        """Wait for a reload that is running; refuse any other."""
         with self._one_at_a_time:
             self._is_open = False
 
     def reload(self) -> ReloadResult:
-        """Raises nothing for a bad table, nor for what cannot be opened: then nothing changes."""
+        """Reload the table. If it is invalid or something cannot be opened, nothing changes; the result says why."""
         with self._one_at_a_time:
-            if not self._is_open or self._edges.wiring is None:
+            if not self._is_open or self._runtime.wiring is None:
                 return ReloadResult(False, (), "the router is not running")
             began = monotonic_ns()
             with background_threads(), beside_traffic(), reloading():
-                kind, result = self._attempt(self._edges.wiring.program)
+                kind, result = self._attempt(self._runtime.wiring.program)
             self._count(kind)
             self._remember(is_good=result.ok)
             seconds = round((monotonic_ns() - began) / 1e9, 3)
@@ -69,21 +69,21 @@ class Reloader:
         return result
 
     def reopen(self) -> None:
-        """Opens listeners of the running program anew whose network interface was replaced, if there are any."""
+        """Reopen the listeners whose network interface was replaced, if there are any."""
         with self._one_at_a_time:
-            wiring = self._edges.wiring
-            replaceable = [each for each in self._edges.sockets.listeners.values() if is_replaceable(each)]
+            wiring = self._runtime.wiring
+            replaceable = [each for each in self._runtime.sockets.listeners.values() if is_replaceable(each)]
             if not self._is_open or wiring is None or not replaceable:
                 return
             try:
-                self._edges.take_over(self._edges.prepare(wiring.program))
-            except (StartError, StuckError, OSError) as error:  # tried again
+                self._runtime.take_over(self._runtime.prepare(wiring.program))
+            except (StartError, StuckError, OSError) as error:  # the watcher calls again
                 logger.warning("a listener cannot be opened on its network interface", why=str(error))
             else:
                 logger.info("network interfaces are back", listeners=[each.name for each in replaceable])
 
     def _attempt(self, now: Program) -> tuple[str, ReloadResult]:
-        """As what it is counted, and what came of it."""
+        """Return the label under which the reload is counted, and its result."""
         findings: Sequence[Diagnostic] = ()
         try:
             checked = self._check(now)
@@ -91,44 +91,44 @@ class Reloader:
             then = checked.program_in(now.counters.continued())
             if then is None:
                 return "invalid", _refused(findings)
-            if refused := unchangeable(now.table, then.table):
+            if refused := _unchangeable(now.table, then.table):
                 return "invalid", _refused([*findings, *refused])
-            text = changes(now, then)
-            self._edges.take_over(self._edges.prepare(then))
-            if moved := all_moved(now.table, then.table):
+            text = _changes(now, then)
+            self._runtime.take_over(self._runtime.prepare(then))
+            if moved := _all_moved(now.table, then.table):
                 logger.warning("the reload has moved every endpoint to another address", endpoints=moved)
         except (StartError, StuckError) as error:
             why = str(error)
         except OSError as error:  # files come and go while they are read, and descriptors may be short
             why = f"the table cannot be read or opened now: {error}"
-        except Exception as error:  # noqa: BLE001 a fault of the router, told loudly, must not end who asked
+        except Exception as error:  # noqa: BLE001 a bug of the router, which is logged, must not end the caller
             logger.critical("a fault in the router itself kept it from reloading; please report it", exc_info=error)
             why = f"a fault in the router itself: {error!r}"
         else:
-            self._settle()
+            self._notify_replaced()
             return "ok", ReloadResult(True, tuple(findings), text)
         return "failed", ReloadResult(False, tuple(findings), why)
 
     def _check(self, now: Program) -> Checked:
-        """The table, once no file of it is being written. Raises StartError if that takes too long, or OSError."""
-        until = monotonic_ns() + round(PATIENCE * 1e9)
-        wait_for_rest(watched_files(now.table), until)
+        """Check the table once none of its files is being written. Raises StartError after a timeout, or OSError."""
+        until = monotonic_ns() + round(UNCHANGED_TIMEOUT * 1e9)
+        wait_until_unchanged(watched_files(now.table), until)
         while True:
             checked = check_table(now.table.path, self._environ, Definitions(now.protos))
-            if checked.table is None or not wait_for_rest(watched_files(checked.table), until):
-                return checked  # else it was read while it was written, or names other files than before
+            if checked.table is None or not wait_until_unchanged(watched_files(checked.table), until):
+                return checked  # else it was read while it was written
 
-    def _settle(self) -> None:
+    def _notify_replaced(self) -> None:
         try:
-            self._settled()
-        except Exception as error:  # noqa: BLE001 as above; the table runs already
+            self._replaced()
+        except Exception as error:  # noqa: BLE001 as above; the new table runs already
             logger.critical("a fault in the router itself after a reload; please report it", exc_info=error)
 
     def _count(self, kind: str) -> None:
-        self._accounts.own[self._accounts.counters.index("config_reloads", kind)] += 1
+        self._counts.own[self._counts.counters.index("config_reloads", kind)] += 1
 
     def _remember(self, *, is_good: bool) -> None:
-        counters, own = self._accounts.counters, self._accounts.own
+        counters, own = self._counts.counters, self._counts.own
         own[counters.index("config_last_reload_successful")] = int(is_good)
         if is_good:
             own[counters.index("config_last_reload_timestamp_seconds")] = wall_ns()
@@ -137,3 +137,67 @@ class Reloader:
 def _refused(findings: Sequence[Diagnostic]) -> ReloadResult:
     errors = sum(finding.severity is Severity.ERROR for finding in findings)
     return ReloadResult(False, tuple(findings), f"the table has {errors} error{'s' * (errors != 1)}")
+
+
+def _unchangeable(now: RouteTable, then: RouteTable) -> list[Diagnostic]:
+    """Return a finding for each changed setting that needs a restart."""
+    top = SourceSpan(str(then.path))
+    settings = {
+        "node": (_node(now.node), _node(then.node), then.node.span),
+        "metrics": (now.metrics, then.metrics, then.metrics and then.metrics.span),
+        "record": (now.record, then.record, then.record and then.record.span),
+        "foxglove": (now.foxglove, then.foxglove, then.foxglove and then.foxglove.span),
+    }
+    return [
+        Diagnostic(
+            span or top, Code.BAD_VALUE, f"'{key}' cannot change while the router runs", "restart it, or change it back"
+        )
+        for key, (before, after, span) in settings.items()
+        if not are_same(before, after)
+    ]
+
+
+def _node(node: NodeSettings) -> object:
+    return node.name, node.namespace, node.diagnostics is not None
+
+
+def _changes(before: Program, after: Program) -> str:
+    """Describe a reload in one line, such as `route imu_info changed, endpoint arm_board added`."""
+    now, then = before.table, after.table
+    found = [
+        *_differing("listener", now.listeners, then.listeners),
+        *_differing("endpoint", now.endpoints, then.endpoints),
+        *_differing("route", _routes(now), _routes(then)),
+        *_differing("gateway", now.gateways, then.gateways),
+        *(["protos changed"] if before.protos_sha256 != after.protos_sha256 else []),
+    ]
+    if not found:
+        return "nothing changed"
+    named, others = found[:_MOST_NAMED], len(found) - _MOST_NAMED
+    return ", ".join([*named, *([f"and {others} more"] if others > 0 else [])])
+
+
+def _all_moved(now: RouteTable, then: RouteTable) -> list[str]:
+    """Return `sensor_board 127.0.0.30:8 -> 192.168.0.30:8` for each common endpoint, if all of them have moved."""
+    both = [
+        (name, endpoint.address.value, then.endpoints[name].address.value)
+        for name, endpoint in now.endpoints.items()
+        if name in then.endpoints
+    ]
+    if any(before == after for _, before, after in both):
+        return []
+    return [f"{name} {before} -> {after}" for name, before, after in both]
+
+
+def _routes(table: RouteTable) -> Mapping[str, object]:
+    return {route.name: route for route in table.routes}
+
+
+def _differing(kind: str, now: Mapping[str, object], then: Mapping[str, object]) -> Iterator[str]:
+    for name in [*now, *(then.keys() - now.keys())]:
+        if name not in now:
+            yield f"{kind} {name} added"
+        elif name not in then:
+            yield f"{kind} {name} removed"
+        elif not are_same(now[name], then[name]):
+            yield f"{kind} {name} changed"

@@ -1,11 +1,11 @@
-"""The UDP sockets of a program: opened, kept where the next program wants the same, closed when nobody does."""
+"""The UDP sockets of the running program; those that the next program uses as well stay open."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
-from router.app.accounts import KernelDrops
 from router.compiler.program import Program
 from router.net.kernel import interface_is_up
 from router.net.udp import Listener, Sender
@@ -14,9 +14,9 @@ from router.table.addresses import Address
 
 @dataclass(slots=True)
 class SocketChange:
-    """All sockets of the program that comes: listeners by name, senders by endpoint.
+    """All sockets of the next program: listeners by name, senders by endpoint.
 
-    `opened` closes what was opened for it, `left` what it has no use for, once it is applied.
+    `opened` closes the sockets opened for it; `left`, once it is applied, those that it does not use.
     """
 
     program: Program
@@ -27,21 +27,46 @@ class SocketChange:
 
 
 def is_replaceable(listener: Listener) -> bool:
-    """Whether its network interface has gone, and another one of the same name is there."""
+    """Whether the network interface of a listener was replaced by another one of the same name."""
     return listener.has_lost_interface() and interface_is_up(listener.interface or "") is not None
 
 
+class KernelDrops:
+    """Datagrams that the kernel dropped, by listener and by receiving gateway, including closed sockets."""
+
+    def __init__(self) -> None:
+        self._now: dict[str, tuple[Callable[[], int], int]] = {}
+        self._before: dict[str, int] = {}
+
+    def follow(self, name: str, dropped: Callable[[], int], *, since: int = 0) -> None:
+        """Count for `name` what `dropped` returns for its socket beyond `since`."""
+        self.leave(name)
+        self._now[name] = dropped, since
+
+    def leave(self, name: str) -> None:
+        """Stop counting for `name`, before its socket is closed or gets another name."""
+        if name in self._now:
+            dropped, since = self._now.pop(name)
+            self._before[name] = self._before.get(name, 0) + dropped() - since
+
+    def totals(self) -> Iterator[tuple[str, int]]:
+        for name in [*self._now, *(self._before.keys() - self._now.keys())]:
+            dropped, since = self._now.get(name, (int, 0))
+            if (total := self._before.get(name, 0) + dropped() - since) or name in self._now:
+                yield name, total
+
+
 class Sockets:
-    """Listeners by name, and senders by endpoint. Nothing is open before the first change."""
+    """Open listeners by name, and senders by endpoint; none before the first change is applied."""
 
     def __init__(self, drops: KernelDrops) -> None:
         self.listeners: dict[str, Listener] = {}
-        self._bound: dict[str, Listener] = {}  # by what tables bind them to
+        self._bound: dict[str, Listener] = {}  # by the address and interface in the table
         self._senders: dict[str, tuple[Address, Sender]] = {}
         self._drops = drops
 
     def prepare(self, program: Program) -> SocketChange:
-        """Opens what `program` wants and what is not open; nothing else changes. Raises StartError."""
+        """Open the sockets of `program` that are not open yet. Raises StartError, with nothing changed."""
         table = program.table
         with ExitStack() as opening:
             listeners = {}
@@ -61,17 +86,17 @@ class Sockets:
             return SocketChange(program, listeners, senders, opening.pop_all())
 
     def left(self, change: SocketChange) -> list[Listener]:
-        """The listeners that nobody listens to after the change."""
+        """The listeners that the change does not use."""
         return [each for each in self._bound.values() if each not in change.listeners.values()]
 
     def apply(self, change: SocketChange) -> None:
-        """From now on these are used."""
+        """Replace the sockets by those of the change."""
         for listener in self.left(change):
             change.left.callback(listener.close)
         for endpoint, (_, sender) in self._senders.items():
             if change.senders.get(endpoint) is not sender:
                 change.left.callback(sender.close)
-        self._follow(change)
+        self._follow_drops(change)
         plans = {plan.name: plan for plan in change.program.listeners}
         for name, listener in change.listeners.items():
             listener.follow(plans[name])
@@ -87,8 +112,7 @@ class Sockets:
         for _, sender in self._senders.values():
             sender.close()
 
-    def _follow(self, change: SocketChange) -> None:
-        """Who has which socket now."""
+    def _follow_drops(self, change: SocketChange) -> None:
         moved = {name for name, each in self.listeners.items() if change.listeners.get(name) is not each}
         for name in moved:
             self._drops.leave(name)

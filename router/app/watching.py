@@ -1,7 +1,4 @@
-"""Looks whether files have changed, and when they have come to rest. Knows nothing of what is in them.
-
-And whether network interfaces of listeners have gone, and are back.
-"""
+"""Watches the files of the table for changes, and the network interfaces of listeners."""
 
 from __future__ import annotations
 
@@ -18,28 +15,28 @@ from router.table.model import RouteTable
 from router.types.proto_folder import walk
 
 PERIOD = 0.5
-"""Seconds between two looks. A change is told when the second look finds it the same: editors write in pieces."""
+"""Seconds between two checks. A change is acted on once the next check finds the same: editors write in pieces."""
 
-PATIENCE = 5.0
-"""Seconds for which a reload that was asked for waits for files that do not come to rest."""
+UNCHANGED_TIMEOUT = 5.0
+"""Seconds for which a reload waits for files that are being written."""
 
 INTERFACE_PERIOD = 1.0
-"""Seconds between two looks at network interfaces."""
+"""Seconds between two checks of network interfaces."""
 
-_Look = dict[Path, tuple[int, int, int]]
+_Snapshot = dict[Path, tuple[int, int, int]]
 
 
 class Watcher:
-    """Calls `changed` in a thread of its own when `files` are not what they were.
+    """Calls `changed` in a thread of its own when `files` have changed.
 
-    Closing it waits for nothing, for who closes it may be who `changed` waits for: it may be called once more.
-    `files` may raise OSError, as folders do that go while they are listed: then it looks again.
+    `close` does not wait, because `changed` may wait for its caller; `changed` may be called once more. `files` may
+    raise OSError, for example if a folder is removed while it is listed; then the check is repeated.
     """
 
     def __init__(self, files: Callable[[], Iterable[Path]], changed: Callable[[], object]) -> None:
         self._files = files
         self._changed = changed
-        self._seen = self._look()
+        self._handled = self._snapshot()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
         self._thread.start()
@@ -48,33 +45,33 @@ class Watcher:
         self._stopped.set()
 
     def _run(self) -> None:
-        before = self._seen
+        before = self._handled
         while not self._stopped.wait(PERIOD):
-            now = self._look()
-            if now is not None and now == before and now != self._seen:
+            now = self._snapshot()
+            if now is not None and now == before and now != self._handled:
                 logger.info("files of the table have changed: it is read again")
                 self._changed()
-                self._seen = now
-                after = self._look() or now  # perhaps of other files: those are new, and have not changed
+                self._handled = now
+                after = self._snapshot() or now  # of other files, if the table names others now
                 if now.items() & after.items() == {each for each in after.items() if each[0] in now}:
-                    self._seen = after
+                    self._handled = after
                 before = after
             else:
                 before = now
 
-    def _look(self) -> _Look | None:
-        """None where it cannot be seen now."""
+    def _snapshot(self) -> _Snapshot | None:
+        """The state of the files, or None on an error."""
         try:
-            return _look(self._files())
+            return _snapshot(self._files())
         except OSError:
             return None
 
 
 class InterfaceWatcher:
-    """Looks once a second whether `listeners` still have their network interfaces.
+    """Checks once a second whether `listeners` still have their network interfaces.
 
-    A socket stays bound to the interface that there was: when a tunnel is set up again, or an adapter plugged in again,
-    it hears nothing. Then `reopen` is called, in the watcher's thread, until it hears again. Closing waits for nothing.
+    A socket stays bound to the old interface when a tunnel is set up again or an adapter plugged in again, and receives
+    nothing. Then `reopen` is called in the watcher's thread until it does. `close` does not wait.
     """
 
     def __init__(self, listeners: Callable[[], Iterable[Listener]], reopen: Callable[[], object]) -> None:
@@ -87,19 +84,19 @@ class InterfaceWatcher:
         self._stopped.set()
 
     def _run(self) -> None:
-        told: list[Listener] = []
+        reported: list[Listener] = []
         while not self._stopped.wait(INTERFACE_PERIOD):
             lost = [each for each in self._listeners() if each.has_lost_interface()]
             for each in lost:
-                if each not in told:
+                if each not in reported:
                     logger.error("a network interface has gone: nothing comes in by it", listener=each.name)
             if lost:
                 self._reopen()
-            told = lost
+            reported = lost
 
 
 def watched_files(table: RouteTable) -> list[Path]:
-    """The table, what it extends, files for Zenoh, the lock, and everything beside its protos, new files among them."""
+    """The table, what it extends, configurations of Zenoh, the lock, and all files beside its protos."""
     configs = [each.zenoh.config for each in table.gateways.values() if each.zenoh and each.zenoh.config]
     paths = [config.path for config in configs if config.path is not None]
     protos: Iterable[Path] = ()
@@ -110,34 +107,34 @@ def watched_files(table: RouteTable) -> list[Path]:
     return [*table.files, *paths, *protos]
 
 
-def wait_for_rest(files: Iterable[Path], until: int) -> bool:
-    """Waits for files that were written less than PERIOD ago, and returns whether there are any.
+def wait_until_unchanged(files: Iterable[Path], until: int) -> bool:
+    """Wait until no file was written within the last PERIOD. Return whether one was when called.
 
-    `until` is in ns of the monotonic clock. Raises StartError if they are still written then.
+    `until` is in ns of the monotonic clock; raises StartError if files are still written then.
     """
     files = list(files)
-    seen = _look(files)
-    ages = [(wall_ns() - written) / 1e9 for written, _, _ in seen.values()]
-    young = [age for age in ages if 0 <= age < PERIOD]  # a time stamp of tomorrow says nothing
+    before = _snapshot(files)
+    ages = [(wall_ns() - written) / 1e9 for written, _, _ in before.values()]
+    young = [age for age in ages if 0 <= age < PERIOD]  # a time in the future is ignored
     if not young:
         return False
     sleep(PERIOD - min(young))
-    while seen != (now := _look(files)):
+    while before != (now := _snapshot(files)):
         if monotonic_ns() > until:
-            changing = ", ".join(sorted({str(path) for path, _ in seen.items() ^ now.items()}))
+            changing = ", ".join(sorted({str(path) for path, _ in before.items() ^ now.items()}))
             raise StartError(f"these files are still being written: {changing}")
-        seen = now
+        before = now
         sleep(PERIOD)
     return True
 
 
-def _look(files: Iterable[Path]) -> _Look:
-    """What can be seen of them without reading; what is not there is not in it."""
+def _snapshot(files: Iterable[Path]) -> _Snapshot:
+    """Time, size and inode of the files that exist."""
     found = {}
     for path in files:
         try:
-            seen = path.stat()
+            status = path.stat()
         except OSError:
             continue
-        found[path] = seen.st_mtime_ns, seen.st_size, seen.st_ino
+        found[path] = status.st_mtime_ns, status.st_size, status.st_ino
     return found

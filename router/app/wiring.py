@@ -1,4 +1,10 @@
-"""Binds a program to what is open: the functions that the threads call, and what these remember."""
+"""Binds a program to the open sockets, topics and timer threads.
+
+`wire` is the seam between the compiled program and the outside world: it passes plain callables into the engines
+(`send` by endpoint, `publish` by topic, clocks, counts) and gets back plain callables for the threads (`receive` by
+listener, `take` by topic, `feed`). Neither side refers to the other in any other way, so that either may be replaced,
+for example by a compiled carrier that receives, forwards, publishes and brakes.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +13,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from router.app.accounts import Accounts
 from router.app.sockets import SocketChange
-from router.app.timers import TimerThread
+from router.app.timers import Timers, TimerThread
 from router.clock import monotonic_ns, wall_ns
+from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan, Program
 from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import EngineContext, State, TimerGroup
@@ -27,42 +33,54 @@ if TYPE_CHECKING:
 Send = Callable[[bytes], int]
 
 
-class Keepers:
-    """One for deadmen, which never wait for other machines; those of what gateways let in publish, which may block in
-    the middleware, so they have one of their own. One for what waits to be sent, one for open frames.
+class ThreadCounts:
+    """What was counted since the start, whatever tables the router has had: a list of counts for each thread or lock.
+
+    `counters` are those of the running program and say what is counted at which index.
     """
 
-    def __init__(self, failed: Callable[[Exception], None]) -> None:
-        self.deadman, self.inbound_deadman, self.pacing, self.collecting = (
-            TimerThread(name, monotonic_ns, failed) for name in ("deadman", "inbound deadman", "pacing", "collect")
-        )
+    def __init__(self, counters: Counters) -> None:
+        self.counters = counters
+        self.lists = [counters.fresh_counts() for _ in range(8)]
+        self.receive, self.ros, self.deadman, self.pacing, self.collecting = self.lists[:5]
+        self.gateways, self.events, self.own = self.lists[5:]
 
-    def start(self) -> None:
-        for keeper in (self.deadman, self.inbound_deadman, self.pacing, self.collecting):
-            keeper.start()
+    def total(self, metric: str) -> int:
+        """The sum of a counter over all its labels."""
+        indexes = [index for series, index in self.counters.series() if series.metric == metric]
+        return sum(counts[index] for counts in self.lists for index in indexes)
 
-    def release(self, machines: Sequence[object]) -> None:
-        """Ends those that are machines: frames first, then what waits to be sent; a deadman has the last word."""
-        for keeper in (self.collecting, self.pacing, self.inbound_deadman, self.deadman):
-            keeper.release(machines)
+    def make_room(self, counters: Counters) -> None:
+        """Add the counts of `counters`, which continue the present ones."""
+        present = dict(self.counters.series())
+        new = [index for series, index in counters.series() if series not in present]
+        for counts in self.lists:
+            counters.grow(counts)
+            for index in new:  # a program that was abandoned may have counted there
+                counts[index] = 0
+
+    def replace(self, counters: Counters) -> None:
+        """Adopt `counters`, once no thread counts by the earlier ones."""
+        counters.settle(self.lists)
+        self.counters = counters  # from here on read by other threads, and no longer changed
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What wiring needs of the router, whatever its program is. `deadman_changed` hears a route and whether it acts."""
+class RouterContext:
+    """What wiring uses of the router, whatever its program.
 
-    accounts: Accounts
-    keepers: Keepers
+    `deadman_changed` is called with a route and whether its deadman is tripped.
+    """
+
+    counts: ThreadCounts
+    timers: Timers
     reporter: Reporter
     deadman_changed: Callable[[str, bool], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """A program's functions: `receive` by listener, `take` by topic.
-
-    `feed` makes what tells deadmen of what clients send.
-    """
+    """A program's functions: `receive` by listener, `take` by topic, `feed` for commands of gateway clients."""
 
     program: Program
     receive: Mapping[str, Receive]
@@ -71,142 +89,143 @@ class Wiring:
     state: State
     deadmen: Mapping[str, Deadman]
     pacers: Mapping[str, Pacer]
-    cuts: Sequence[Callable[[], None]]
+    close: Sequence[Callable[[], None]]
 
-    def begin(self, keepers: Keepers) -> None:
-        """The router starts: has deadmen that publish do so as soon as a subscriber is met."""
+    def start(self, timers: Timers) -> None:
+        """Have deadmen behind gateways publish to each subscriber that is discovered shortly after the start."""
         for plan in _inbound_deadmen(self.program):
             deadman = self.deadmen[plan.route]
-            keepers.inbound_deadman.locked(deadman, deadman.await_subscribers)(monotonic_ns())
+            timers.inbound_deadman.locked(deadman, deadman.await_subscribers)(monotonic_ns())
 
-    def meet(self, topic: str, keepers: Keepers) -> None:
-        """Somebody new subscribes to `topic`."""
+    def subscriber_joined(self, topic: str, timers: Timers) -> None:
         for plan in _inbound_deadmen(self.program):
             if topic in dict(plan.datagrams):
                 deadman = self.deadmen[plan.route]
-                _tell_start(plan.route, keepers.inbound_deadman.locked(deadman, deadman.greet)(monotonic_ns()))
+                _log_start(plan.route, timers.inbound_deadman.locked(deadman, deadman.greet)(monotonic_ns()))
 
-    def forget(self) -> None:
-        """Nobody calls the functions any more. Each is in a ring with its globals; cut, they are gone at once."""
-        for cut in self.cuts:
-            cut()
+    def free(self) -> None:
+        """Free the functions, which are in reference cycles. None may be called afterwards."""
+        for close in self.close:
+            close()
 
-    def succeed(self, earlier: Wiring | None, keepers: Keepers) -> None:
-        """Ends what only `earlier` had, while nothing is received: what waited is sent before anything that comes.
+    def succeed(self, earlier: Wiring | None, timers: Timers) -> None:
+        """Take over from `earlier`, while nothing is received: deadmen with other settings inherit their state.
 
-        Each deadman with other settings than before takes its predecessor's place first.
+        Timers that only `earlier` had end, so that messages that waited are sent before any that comes.
         """
         inbound = {plan.route for plan in _inbound_deadmen(self.program)}
         for route, deadman in self.deadmen.items():
             before = earlier.deadmen.get(route) if earlier else None
             if before is not None and before is not deadman:
-                keeper = keepers.inbound_deadman if route in inbound else keepers.deadman
-                keeper.locked(deadman, deadman.replace)(before)
-        keepers.release(list(self.state.left()))
+                thread = timers.inbound_deadman if route in inbound else timers.deadman
+                thread.locked(deadman, deadman.replace)(before)
+        timers.release(list(self.state.left()))
         places = {(each.route, target.target) for each in self.program.handlers for target in each.targets}
         for pacer in self.pacers.values():
-            keepers.pacing.locked(pacer, pacer.keep_only)(monotonic_ns(), places)
+            timers.pacing.locked(pacer, pacer.keep_only)(monotonic_ns(), places)
 
 
-def begin(program: Program, around: Surroundings, sockets: SocketChange, state: State) -> None:
-    """The router starts: has the deadmen of routes send. That needs the sockets only; ROS takes seconds to open."""
+def start_deadmen(program: Program, context: RouterContext, sockets: SocketChange, state: State) -> None:
+    """Have the deadmen of routes send at the start. Needs the sockets only, because ROS takes seconds to open."""
     for plan in program.deadmen:
-        deadman = _deadman(plan, program, around, _looking(sockets), state)
-        _tell_start(plan.route, around.keepers.deadman.locked(deadman, deadman.start)())
+        deadman = _deadman(plan, program, context, _checked_senders(sockets), state)
+        _log_start(plan.route, context.timers.deadman.locked(deadman, deadman.start)())
 
 
 def wire(
     program: Program,
-    around: Surroundings,
+    context: RouterContext,
     sockets: SocketChange,
     ros: RosEdge | None,
     topics: RosChange | None,
     state: State,
 ) -> Wiring:
-    """For the sockets and topics that `program` is to have."""
-    accounts, keepers = around.accounts, around.keepers
+    """Bind `program` to the sockets and topics that it is to have."""
+    counts, timers = context.counts, context.timers
     send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
-    deadmen = _deadmen(program, around, _looking(sockets), ros, state)
-    pacers = _pacers(program, keepers.pacing, send, state)
-    context = EngineContext(
-        counts=accounts.receive,
+    deadmen = _deadmen(program, context, _checked_senders(sockets), ros, state)
+    pacers = _pacers(program, timers.pacing, send, state)
+    engine_context = EngineContext(
+        counts=counts.receive,
         send=send,
         publish={topic: each.publish for topic, each in topics.publications.items()} if topics else {},
         wanted={topic: each.wanted for topic, each in topics.publications.items()} if topics else {},
-        report=around.reporter.report,
+        report=context.reporter.report,
         clock_ns=monotonic_ns,
         wall_ns=wall_ns,
-        pacing=TimerGroup(accounts.pacing, keepers.pacing.locked),
-        collecting=TimerGroup(accounts.collecting, keepers.collecting.locked),
-        feed=feeder(deadmen, keepers.deadman.locked),
+        pacing=TimerGroup(counts.pacing, timers.pacing.locked),
+        collecting=TimerGroup(counts.collecting, timers.collecting.locked),
+        feed=feeder(deadmen, timers.deadman.locked),
         publish_errors=ros.publish_errors if ros else (),
         pacers=pacers,
         state=state,
     )
-    inbound = InboundEngine(program, context, {name: each.arrived_at for name, each in sockets.listeners.items()})
-    outbound = OutboundEngine(program, replace(context, counts=accounts.ros))
+    inbound = InboundEngine(
+        program, engine_context, {name: each.arrived_at for name, each in sockets.listeners.items()}
+    )
+    outbound = OutboundEngine(program, replace(engine_context, counts=counts.ros))
     return Wiring(
         program=program,
         receive={name: inbound.receiver(name) for name in sockets.listeners},
         take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},
-        feed=feeder(deadmen, keepers.inbound_deadman.locked),
+        feed=feeder(deadmen, timers.inbound_deadman.locked),
         state=state,
         deadmen=deadmen,
         pacers=pacers,
-        cuts=(inbound.close, outbound.close),
+        close=(inbound.close, outbound.close),
     )
 
 
 def _deadmen(
-    program: Program, around: Surroundings, send: Mapping[str, Send], ros: RosEdge | None, state: State
+    program: Program, context: RouterContext, send: Mapping[str, Send], ros: RosEdge | None, state: State
 ) -> dict[str, Deadman]:
-    """By route; those of what gateways let in send to topics."""
+    """The deadmen by route; those behind gateways send to topics."""
     inbound = _inbound_deadmen(program)
-    outlets = dict(send)
+    destinations = dict(send)
     if ros is not None:
         for topic in {topic for plan in inbound for topic, _ in plan.datagrams}:
-            outlets[topic] = state.keep(("sender to topic", topic), partial(_sender_to, ros, topic))
-    return {plan.route: _deadman(plan, program, around, outlets, state) for plan in (*program.deadmen, *inbound)}
+            destinations[topic] = state.keep(("sender to topic", topic), partial(_sender_to, ros, topic))
+    return {plan.route: _deadman(plan, program, context, destinations, state) for plan in (*program.deadmen, *inbound)}
 
 
 def _deadman(
-    plan: DeadmanPlan, program: Program, around: Surroundings, outlets: Mapping[str, Send], state: State
+    plan: DeadmanPlan, program: Program, context: RouterContext, destinations: Mapping[str, Send], state: State
 ) -> Deadman:
     def deadman() -> Deadman:
-        counts = around.accounts.deadman
-        return Deadman(plan, program.counters, counts, outlets, around.reporter.report, around.deadman_changed)
+        counts = context.counts.deadman
+        return Deadman(plan, program.counters, counts, destinations, context.reporter.report, context.deadman_changed)
 
-    return state.keep(("deadman", plan, tuple(outlets[name] for name, _ in plan.datagrams)), deadman)
+    return state.keep(("deadman", plan, tuple(destinations[name] for name, _ in plan.datagrams)), deadman)
 
 
-def _looking(sockets: SocketChange) -> dict[str, Send]:
-    """How deadmen send, by endpoint."""
-    return {endpoint: sender.send_and_look for endpoint, sender in sockets.senders.items()}
+def _checked_senders(sockets: SocketChange) -> dict[str, Send]:
+    """What deadmen send by, by endpoint: errors of a datagram are raised with it."""
+    return {endpoint: sender.send_checked for endpoint, sender in sockets.senders.items()}
 
 
 def _inbound_deadmen(program: Program) -> list[DeadmanPlan]:
-    """Of what gateways let in."""
+    """The deadmen of what gateways let in."""
     return [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
 
 
-def _tell_start(route: str, sent_to: Sequence[str]) -> None:
+def _log_start(route: str, sent_to: Sequence[str]) -> None:
     if sent_to:
         logger.info("the deadman has sent its payload, since the router starts", route=route, to=list(sent_to))
 
 
-def _pacers(program: Program, keeper: TimerThread, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
+def _pacers(program: Program, pacing: TimerThread, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
     pacers = {}
     for plan in program.senders:
         if plan.budget:
             sending, budget = send[plan.endpoint], plan.budget
             pacer = state.keep(("pacer", plan.endpoint, budget, sending), partial(Pacer, budget, sending))
-            keeper.add(pacer)  # before what hands on to it, so that it is ended after that
+            pacing.add(pacer)  # before the timers that pass on to it, as they have to end first
             pacers[plan.endpoint] = pacer
     return pacers
 
 
 def _sender_to(ros: RosEdge, topic: str) -> Send:
-    """Publishes as a socket sends: a deadman knows no topics."""
+    """Return a function that publishes with the interface of a socket's `send`."""
 
     def send(message: bytes) -> int:
         try:

@@ -16,7 +16,7 @@ from pathlib import Path
 import yaml
 
 from router.app import Router, tune_interpreter
-from router.app.supervision import supervised
+from router.app.process import supervised
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table

@@ -216,7 +216,7 @@ class Sender:
             logger.warning("no network leads to this endpoint yet", endpoint=plan.endpoint, address=str(plan.address))
         self.send = _sending(self.socket, plan.address)
 
-    def send_and_look(self, data: bytes) -> int:
+    def send_checked(self, data: bytes) -> int:
         """As `send`, but raise errors of this datagram that are known at once: no process listens on a local port.
 
         With `send`, the next datagram would raise that error, and it may be another user's of this socket.

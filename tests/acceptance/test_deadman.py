@@ -194,6 +194,7 @@ def test_a_source_that_is_stopped_or_killed_is_replaced(driver: Driver) -> None:
 
 def test_what_was_driven_is_halted_when_the_router_ends(driver: Driver) -> None:
     """Last of a driver's tests."""
+    driver.place.waiting()  # what was sent at the start, if no other test ran before this one
     driver.drive()
     assert driver.router.stop(signal.SIGTERM) == 0
     arrived = driver.place.waiting()

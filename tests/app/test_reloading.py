@@ -22,9 +22,9 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.app import Router, reloading, watching
-from router.app.accounts import Accounts
-from router.app.edges import Edges
+from router.app.runtime import Runtime
 from router.app.watching import watched_files
+from router.app.wiring import ThreadCounts
 from router.compiler import check_table
 from router.compiler.metrics import Counters
 from router.net.receiver import ReceiveThread
@@ -389,7 +389,7 @@ def test_a_reload_waits_for_files_that_only_the_new_table_names(site: Site) -> N
 
 
 def test_a_reload_refuses_files_that_do_not_come_to_rest(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reloading, "PATIENCE", 1.0)
+    monkeypatch.setattr(reloading, "UNCHANGED_TIMEOUT", 1.0)
     with site.router(PH) as router:
         path, ended = site.write(PH + turns("1s")), threading.Event()
 
@@ -492,14 +492,14 @@ def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, mo
     with site.router(held.format(0.001)) as router:
         site.send(*map(numbered, range(2)))
         wait_until(lambda: router.total("datagrams_received") >= 2)
-        finish = Edges._finish
+        finish = Runtime._finish
 
-        def finish_late(edges: Edges, *args: object) -> None:
+        def finish_late(edges: Runtime, *args: object) -> None:
             site.send(numbered(2))
             wait_until(lambda: router.total("datagrams_received") >= 3)
             finish(edges, *args)  # type: ignore[arg-type]
 
-        monkeypatch.setattr(Edges, "_finish", finish_late)
+        monkeypatch.setattr(Runtime, "_finish", finish_late)
         site.write(held.format(1000))
         assert router.reload().ok
         assert [site.basestation.recv(1000) for _ in range(3)] == [numbered(number) for number in range(3)]
@@ -548,8 +548,8 @@ def test_a_deadman_brakes_while_the_middleware_blocks_that_of_a_gateway(
 
         client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
         wait_until(lambda: router.total("messages_published") == 1)
-        assert router._edges._ros is not None
-        monkeypatch.setitem(router._edges._ros.publish, "/word", blocked)
+        assert router._runtime._ros is not None
+        monkeypatch.setitem(router._runtime._ros.publish, "/word", blocked)
         assert is_in.wait(20)
         site.send(DRIVE)
         site.basestation.settimeout(20)
@@ -588,7 +588,7 @@ def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
         assert [site.basestation.recv(1000) for _ in range(2)] == [numbered(2), DRIVE]
 
 
-@pytest.mark.parametrize("late", ["router.app.accounts.Counters.settle", "router.app.CountersCollector"])
+@pytest.mark.parametrize("late", ["router.app.wiring.Counters.settle", "router.app.router.CountersCollector"])
 def test_what_fails_when_the_table_runs_already_is_not_told_as_if_nothing_had_changed(
     site: Site, monkeypatch: pytest.MonkeyPatch, late: str
 ) -> None:
@@ -633,16 +633,16 @@ def test_a_service_manager_hears_of_no_reload_before_the_start_or_after_the_end(
 
 
 def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:
-    accounts = Accounts(Counters())
-    abandoned = accounts.counters.continued()
+    counts = ThreadCounts(Counters())
+    abandoned = counts.counters.continued()
     index = abandoned.index("datagrams_padded", "another")
-    accounts.make_room(abandoned)
-    accounts.gateways[index] += 1
-    then = accounts.counters.continued()
+    counts.make_room(abandoned)
+    counts.gateways[index] += 1
+    then = counts.counters.continued()
     assert then.index("datagrams_received", "rover") == index
-    accounts.make_room(then)
-    accounts.settle(then)
-    assert accounts.total("datagrams_received") == 0
+    counts.make_room(then)
+    counts.replace(then)
+    assert counts.total("datagrams_received") == 0
 
 
 def test_a_gateway_in_a_zenoh_network_goes_on_unless_its_config_changes(site: Site) -> None:

@@ -1,4 +1,4 @@
-"""A timer served as by a timekeeper that is always in time, or by one that is late; no clock, no thread."""
+"""A timer served as by a timer thread that is always in time, or by one that is late; no clock, no thread."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ class Watched:
         self.deadman.due(now)
 
     def run(self, until: int) -> None:
-        """What a timekeeper does that is never late."""
+        """What a timer thread does that is never late."""
         while self.deadman.next_due is not None and self.deadman.next_due <= until:
             self.due(self.deadman.next_due)
 

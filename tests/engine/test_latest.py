@@ -105,7 +105,7 @@ arrivals = st.lists(st.floats(0, 3), min_size=1, max_size=100)
 
 @given(st.integers(1, 1000), arrivals, st.floats(0, 0.4))
 def test_whatever_comes_the_newest_gets_there_soon_and_in_order(hertz: int, gaps: list[float], late: float) -> None:
-    """Within half a period of its arrival, and later only by what the timekeeper is."""
+    """Within half a period of its arrival, and later only by what the timer thread is."""
     held, period = Held(hertz), -(-NS // hertz)
     times = list(itertools.accumulate(round(gap * period) for gap in gaps))
     held.play(times, late=int(late * period))

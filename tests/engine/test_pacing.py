@@ -98,7 +98,7 @@ def test_over_ten_seconds_the_budget_is_kept_and_used_up(
     assert sent >= min(load, 0.99) * 10 * budget - size
 
 
-def test_a_timekeeper_that_is_late_by_half_a_burst_costs_nothing() -> None:
+def test_a_timer_thread_that_is_late_by_half_a_burst_costs_nothing() -> None:
     assert measured(500_000, 100, 10_000, BULK, late=BURST // 2) >= 0.99 * 10 * 500_000
 
 

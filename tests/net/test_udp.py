@@ -442,12 +442,12 @@ def test_who_looks_hears_of_his_own_loss_and_the_next_datagram_of_none(stack: Ex
         address = Address(*closed.getsockname())
     sender = stack.enter_context(closing(Sender(SenderPlan("board", address), SPAN)))
     with pytest.raises(ConnectionRefusedError):
-        sender.send_and_look(b"brake")
+        sender.send_checked(b"brake")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
         board.bind(address)
         board.settimeout(10)
         assert sender.send(b"drive") == 5
-        assert sender.send_and_look(b"brake") == 5
+        assert sender.send_checked(b"brake") == 5
         assert [board.recv(100) for _ in range(2)] == [b"drive", b"brake"]
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from structlog.testing import capture_logs
 
-from router.app.supervision import Watchdog, reloading, supervised, tell
+from router.app.process import Watchdog, notify, reloading, supervised
 from router.clock import wall_ns
 from router.compiler.program import ListenerPlan
 from router.errors import SourceSpan
@@ -64,7 +64,7 @@ def test_an_abstract_socket_is_one_too(stack: ExitStack, monkeypatch: pytest.Mon
     ear.bind(f"\0rover-router-test-{os.getpid()}")
     ear.settimeout(5)
     monkeypatch.setenv("NOTIFY_SOCKET", f"@rover-router-test-{os.getpid()}")
-    tell("READY=1")
+    notify("READY=1")
     assert said(ear) == ["READY=1"]
 
 
@@ -78,20 +78,20 @@ def test_without_a_service_manager_nothing_is_said(monkeypatch: pytest.MonkeyPat
 def test_a_service_manager_that_is_gone_is_told_of_in_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
     with capture_logs() as log:
-        tell("READY=1")
-    assert [line["event"] for line in log] == ["the service manager cannot be told"]
+        notify("READY=1")
+    assert [line["event"] for line in log] == ["the service manager cannot be notified"]
 
 
 def test_a_service_manager_that_does_not_listen_holds_nobody_up(
     manager: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("router.app.supervision.PATIENCE", 0.05)
+    monkeypatch.setattr("router.app.process.NOTIFY_TIMEOUT", 0.05)
     with capture_logs() as logged:
         for _ in range(1000):
             if logged:
                 break
-            tell("READY=1")
-    assert [entry["event"] for entry in logged] == ["the service manager cannot be told"]
+            notify("READY=1")
+    assert [entry["event"] for entry in logged] == ["the service manager cannot be notified"]
 
 
 def test_the_watchdog_is_fed_only_while_there_is_progress(manager: socket.socket) -> None:

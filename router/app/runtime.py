@@ -1,26 +1,28 @@
-"""What is open for the running program, and how another program takes over: prepare, swap, finish, or abandon.
+"""Everything that is open for the running program, and how another program takes over.
 
-Knows the order in which things belong, and no table that is not compiled.
+A takeover has three steps: prepare (open what the program needs in addition; may fail), swap (between two datagrams,
+while all receiving threads are paused), finish (close what is no longer used). The first program starts the same way.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from router.app.sockets import SocketChange, Sockets
-from router.app.topics import open_ros, places, wants_ros, who_names
-from router.app.wiring import Surroundings, Wiring, begin, wire
+from router.app.sockets import KernelDrops, SocketChange, Sockets
+from router.app.wiring import RouterContext, Wiring, start_deadmen, wire
 from router.compiler.program import Program
+from router.compiler.topics import DIAGNOSTICS, resolved
 from router.engine import MAX_DATAGRAM
 from router.engine.binding import State
 from router.engine.dispatch import Receive
+from router.errors import SourceSpan, StartError
 from router.log import logger
 from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, ReceiveThread
-from router.ros.environment import check_environment
+from router.ros.environment import check_environment, ros_remedy
 from router.threads import background_threads
 
 if TYPE_CHECKING:
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A program with all that was opened for it, beside what is open. `undo` closes that."""
+    """A prepared program. `undo` closes what was opened for it."""
 
     sockets: SocketChange
     topics: RosChange | None
@@ -40,88 +42,86 @@ class Change:
     undo: ExitStack
 
 
-class Edges:
-    """`tee` may put something between a listener and what its datagrams are given to."""
+class Runtime:
+    """The sockets, ROS node, gateways and threads of the running program.
 
-    def __init__(self, around: Surroundings, ros_args: Sequence[str], tee: Callable[[str, Receive], Receive]) -> None:
+    `tee` may wrap the function that takes a listener's datagrams.
+    """
+
+    def __init__(self, context: RouterContext, ros_args: Sequence[str], tee: Callable[[str, Receive], Receive]) -> None:
         self.wiring: Wiring | None = None
-        self.sockets = Sockets(around.accounts.drops)
+        self.drops = KernelDrops()
+        self.sockets = Sockets(self.drops)
         self.gateways: GatewayThread | None = None
-        self._around = around
+        self._context = context
         self._ros_args = ros_args
         self._tee = tee
         self._ros: RosEdge | None = None
-        self._receiving = ReceiveThread([], {}, MAX_DATAGRAM, self._enough, around.reporter.failed)
+        self._receiving = ReceiveThread([], {}, MAX_DATAGRAM, self._coalescing_target, context.reporter.failed)
 
     @property
     def turns(self) -> int:
-        """Grows while the receive thread is not stuck, even if nothing comes."""
+        """A number that grows unless the receive thread is stuck, even if nothing comes."""
         return self._receiving.turns
 
     @property
     def node_name(self) -> str:
-        """As ROS knows it, with its namespace; empty where no table needed a node."""
+        """The fully qualified name of the ROS node, or "" without one."""
         return self._ros.name if self._ros else ""
 
-    # -- from the start to the end -------------------------------------------------------------------------------
-
     def start(self, change: Change, closing: ExitStack) -> None:
-        """Serves what was prepared. `closing` ends it: what receives first, and a deadman has the last word."""
-        keepers = self._around.keepers
-        keepers.start()
+        """Run the prepared program. `closing` stops receiving."""
+        timers = self._context.timers
+        timers.start()
         closing.callback(self._stop_ros)
         self._swap(change)
         with background_threads():
             self._finish(change, None)
-        self._receiving.start(self._give)  # somebody may have begun to watch during the swap
+        self._receiving.start(self._replace_receivers)  # an observer may have attached during the swap
         closing.callback(self._receiving.stop)
 
     def close_with(self, closing: ExitStack) -> None:
-        """Has `closing` close what is open then: what the router's surroundings need is closed after them."""
+        """Have `closing` close sockets and ROS, after the services that use them."""
         closing.callback(self.sockets.close_listeners)
         closing.callback(self.sockets.close_senders)
         closing.callback(self._close_ros)
 
     def end_with(self, closing: ExitStack) -> None:
-        """Has `closing` end what sends by itself: gateways, open frames, what waits, and deadmen last."""
-        keepers = self._around.keepers
-        for keeper in (keepers.deadman, keepers.inbound_deadman, keepers.pacing, keepers.collecting):
-            closing.callback(keeper.stop)
+        """Have `closing` stop gateways, then open frames, waiting messages and last deadmen, which send once more."""
+        closing.callback(self._context.timers.stop)
         closing.callback(self._stop_gateways)
 
     def rewire(self) -> None:
-        """Asks `tee` again."""
-        self._receiving.call_between(self._give)
-
-    # -- another program -----------------------------------------------------------------------------------------
+        """Apply `tee` again."""
+        self._receiving.call_between(self._replace_receivers)
 
     def prepare(self, program: Program) -> Change:
-        """Opens what `program` wants and is not open, and changes nothing. Raises StartError.
+        """Open what `program` needs and is not open yet. Raises StartError, with nothing changed.
 
-        For the first program, deadmen send here what they send at the start: nothing is received yet, but gateways hear
+        For the first program, deadmen send their payload of the start here: nothing is received yet, but gateways serve
         clients as soon as they are open.
         """
         with ExitStack() as undo:
-            if self._ros is None and wants_ros(program):
-                check_environment(os.environ)  # before a deadman sends for a start that comes to nothing
+            if self._ros is None and _needs_ros(program):
+                check_environment(os.environ)  # before deadmen send, as the start may fail here
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
-            self._around.accounts.make_room(program.counters)
+            self._context.counts.make_room(program.counters)
             state = State(self.wiring.state if self.wiring else None)
             if self.wiring is None:
-                begin(program, self._around, sockets, state)
+                start_deadmen(program, self._context, sockets, state)
             topics = self._prepare_topics(program, undo)
-            undo.callback(lambda: self._around.keepers.release(list(state.added())))
-            wiring = wire(program, self._around, sockets, self._ros, topics, state)
+            undo.callback(lambda: self._context.timers.release(list(state.added())))
+            wiring = wire(program, self._context, sockets, self._ros, topics, state)
             if self.wiring is None:
-                wiring.begin(self._around.keepers)
+                wiring.start(self._context.timers)
             gateways = self._prepare_gateways(program, wiring, undo)
             return Change(sockets, topics, wiring, gateways, undo.pop_all())
 
     def take_over(self, change: Change) -> None:
-        """Has the prepared program run, from one message to the next.
+        """Replace the running program by the prepared one, between two messages.
 
-        Raises StuckError or StartError, and then nothing changed. What fails after that is a fault of ours, and logged.
+        Raises StuckError or StartError, with nothing changed. A failure after the swap is a bug, and logged.
         """
         earlier = self.wiring
         try:
@@ -133,31 +133,31 @@ class Edges:
             raise
         try:
             self._finish(change, earlier)
-        except Exception as error:  # noqa: BLE001 told loudly: the program runs all the same
+        except Exception as error:  # noqa: BLE001 a bug, which is logged: the program runs all the same
             logger.critical(
                 "a fault in the router itself kept it from closing what it does not use; please report it",
                 exc_info=error,
             )
 
     def _swap(self, change: Change) -> None:
-        """While nothing is received: on the receive thread, and with that of ROS standing still."""
+        """Replace the program: called by the receive thread, while that of ROS is paused."""
         with self._ros.paused() if self._ros else nullcontext():
             if self._ros is not None and change.topics is not None:
                 self._ros.apply(change.topics, change.wiring.take)  # first: it may still fail
             for listener in self.sockets.left(change.sockets):
                 self._receiving.finish(listener)
-            change.wiring.succeed(self.wiring, self._around.keepers)
+            change.wiring.succeed(self.wiring, self._context.timers)
             self.wiring = change.wiring
             self.sockets.apply(change.sockets)
             self._receiving.serve(list(self.sockets.listeners.values()), self._teed())
 
     def _finish(self, change: Change, earlier: Wiring | None) -> None:
-        """Closes what only the earlier program used: all that, whatever one step raises."""
-        change.undo.pop_all()  # and not done
+        """Close what only the earlier program used, all of it even if one step raises."""
+        change.undo.pop_all()  # discarded
         with ExitStack() as last_first:
             if earlier is not None:
-                last_first.callback(earlier.forget)
-            last_first.callback(self._around.accounts.settle, change.wiring.program.counters)
+                last_first.callback(earlier.free)
+            last_first.callback(self._context.counts.replace, change.wiring.program.counters)
             last_first.callback(change.sockets.left.close)
             if self._ros is not None and change.topics is not None:
                 last_first.callback(self._ros.finish, change.topics)
@@ -166,35 +166,32 @@ class Edges:
                 last_first.callback(self.gateways.finish, change.gateways)
                 last_first.callback(self._follow_drops, self.gateways, change.gateways)
 
-    # -- parts ---------------------------------------------------------------------------------------------------
-
     def _prepare_topics(self, program: Program, undo: ExitStack) -> RosChange | None:
-        if self._ros is None and not wants_ros(program):
+        if self._ros is None and not _needs_ros(program):
             return None
         if self._ros is None:
-            self._ros = open_ros(program, self._ros_args, self._incompatible, self._met)
+            self._ros = _open_ros(program, self._ros_args, self._incompatible, self._subscriber_joined)
             undo.callback(self._close_ros)
-            self._ros.start({}, self._around.reporter.failed)
-        change = self._ros.prepare(program.publishers, program.subscriptions, places(program))
+            self._ros.start({}, self._context.reporter.failed)
+        change = self._ros.prepare(program.publishers, program.subscriptions, _topic_spans(program))
         undo.callback(self._ros.abandon, change)
         return change
 
     def _prepare_gateways(self, program: Program, wiring: Wiring, undo: ExitStack) -> GatewayChange | None:
-        """A new thread of theirs serves nobody before it is started."""
         if self._ros is None or not (program.gateways or self.gateways):
             return None
         if self.gateways is None:
             from router.gateway.thread import GatewayThread  # asyncio and websockets take 0.1 s to import
 
-            reporter = self._around.reporter
-            self.gateways = GatewayThread(self._ros, self._around.accounts.gateways, reporter.report, reporter.failed)
+            reporter = self._context.reporter
+            self.gateways = GatewayThread(self._ros, self._context.counts.gateways, reporter.report, reporter.failed)
             undo.callback(self._stop_gateways)
         change = self.gateways.prepare(program, wiring.feed)
         undo.callback(self.gateways.abandon, change)
         return change
 
     def _follow_drops(self, gateways: GatewayThread, change: GatewayChange) -> None:
-        drops = self._around.accounts.drops
+        drops = self.drops
         for service in change.left:
             drops.leave(service.name)
         for service in change.opened:
@@ -202,22 +199,21 @@ class Edges:
                 drops.follow(service.name, gateways.kernel_drops[service.name])
 
     def _incompatible(self, topic: str, policy: str, peers: int) -> None:
-        """So many peers on a topic were kept away by one policy: counted for each route that names the topic."""
+        """Count peers with an incompatible QoS policy, for each route and gateway that names the topic."""
         if self.wiring is None:
             return
         program = self.wiring.program
-        for name in who_names(program).get(topic, ()):
-            self._around.accounts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
+        for name in _users_of_topics(program).get(topic, ()):
+            self._context.counts.events[program.counters.index("qos_incompatible", name, topic, policy)] = peers
 
-    def _met(self, topic: str) -> None:
-        """Somebody new subscribes to a topic of ours."""
+    def _subscriber_joined(self, topic: str) -> None:
         if self.wiring is not None:
-            self.wiring.meet(topic, self._around.keepers)
+            self.wiring.subscriber_joined(topic, self._context.timers)
 
-    def _enough(self) -> int:
+    def _coalescing_target(self) -> int:
         return FOR_SUBSCRIBERS if self._ros is not None and self._ros.subscribed else FOR_SOCKETS
 
-    def _give(self) -> None:
+    def _replace_receivers(self) -> None:
         self._receiving.replace_receivers(self._teed())
 
     def _teed(self) -> dict[str, Receive]:
@@ -237,3 +233,46 @@ class Edges:
         if self._ros is not None:
             self._ros.close()
             self._ros = None
+
+
+def _needs_ros(program: Program) -> bool:
+    return bool(program.publishers or program.subscriptions or program.gateways)
+
+
+def _open_ros(
+    program: Program,
+    ros_args: Sequence[str],
+    incompatible: Callable[[str, str, int], None],
+    subscriber_joined: Callable[[str], None],
+) -> RosEdge:
+    """Open a node without any topic. Raises StartError."""
+    try:
+        from router.ros.node_and_publishers import RosEdge
+    except ImportError as error:
+        what = f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}"
+        raise StartError(f"{what}; {ros_remedy()}") from error
+    return RosEdge(program.table.node, (), (), {}, ros_args, incompatible, subscriber_joined)
+
+
+def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:
+    """The position in the table of each topic, by ROS name."""
+    table = program.table
+    spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
+    for gateway in table.gateways.values():
+        for inbound in gateway.inbound:
+            spans[resolved(inbound.topic.topic.value, table.node)] = inbound.topic.topic.span
+    if table.node.diagnostics is not None:
+        spans[DIAGNOSTICS] = table.node.diagnostics
+    return spans
+
+
+def _users_of_topics(program: Program) -> Mapping[str, Sequence[str]]:
+    """The routes and gateways that name each topic, by ROS name."""
+    names: dict[str, list[str]] = {}
+    for route in program.table.routes:
+        for topic in route.topics:
+            names.setdefault(topic.topic.value, []).append(route.name)
+    for gateway in program.gateways:
+        for name in gateway.inbound:
+            names.setdefault(name, []).append(gateway.settings.name)
+    return names

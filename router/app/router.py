@@ -1,0 +1,292 @@
+"""The router as a whole: what routes (`runtime`), the services beside it, reloads, and the order of start and stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import ExitStack
+from importlib.metadata import PackageNotFoundError, version
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from prometheus_client.metrics_core import Metric as Family
+
+from router.app.reloading import Reloader
+from router.app.runtime import Change, Runtime
+from router.app.timers import Timers
+from router.app.watching import InterfaceWatcher, Watcher, watched_files
+from router.app.wiring import RouterContext, ThreadCounts
+from router.clock import monotonic_ns
+from router.compiler.program import Program
+from router.compiler.topics import DIAGNOSTICS
+from router.engine import MAX_DATAGRAM
+from router.log import logger
+from router.net.udp import Listener
+from router.observe.metrics import Asked, CountersCollector
+from router.observe.reports import Reporter
+from router.observe.running import ReloadResult, Running
+from router.recording.mirror import Mirror
+from router.table.addresses import Address
+from router.threads import DaemonThread, background_threads
+
+if TYPE_CHECKING:
+    from router.gateway.clients import ClientQueue
+    from router.recording.recorder import Recorder
+
+_TOTALS = (
+    "datagrams_received",
+    "datagrams_rejected",
+    "messages_received",
+    "datagrams_sent",
+    "messages_published",
+    "messages_dropped",
+)
+
+
+class Router:
+    """A running program: `with Router(program): ...`, which may be entered once.
+
+    Entering raises StartError, with nothing left open. `ros_args` are passed to rclpy, such as `["--ros-args", "-r",
+    "imu_data:=imu"]`. `environ` has the values of the table's variables for reloads (None: process environment).
+    """
+
+    def __init__(
+        self, program: Program, ros_args: Sequence[str] = (), environ: Mapping[str, str] | None = None
+    ) -> None:
+        self.is_ready = False
+        self._first = program
+        self._reporter = Reporter()
+        self._counts = ThreadCounts(program.counters)
+        self.mirror = Mirror(MAX_DATAGRAM, self._observers_changed, self._reporter.failed)
+        context = RouterContext(self._counts, Timers(self._reporter.failed), self._reporter, self._deadman_changed)
+        self._runtime = Runtime(context, ros_args, self.mirror.tee)
+        self._services = Services(self)
+        self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
+        self._watcher: Watcher | None = None
+        self._interfaces: InterfaceWatcher | None = None
+        self._collector = self._new_collector()
+        self._open = ExitStack()
+
+    def __enter__(self) -> Router:
+        with ExitStack() as opening:
+            opening.callback(self._reporter.close)
+            self._runtime.close_with(opening)
+            services = opening.enter_context(ExitStack())  # closed after deadmen have sent a last time
+            self._runtime.end_with(opening)
+            with background_threads():
+                change = self._runtime.prepare(self._first)
+                opening.callback(change.undo.close)
+                self._open_services(change, services)
+            self._runtime.start(change, opening)
+            self._reloader.open()
+            opening.callback(self._unwatch_all)
+            self._watch()
+            opening.callback(self._reloader.close)
+            self._open = opening.pop_all()
+        self.is_ready = True
+        program = self.program
+        logger.info(
+            "router started",
+            table=str(program.table.path),
+            listening={name: listener.bound_to for name, listener in self.listeners.items()},
+            routes=sum(not route.ignore for route in program.table.routes),
+            gateways=len(program.gateways),
+            destinations=len(program.senders),
+            published=len(program.publishers),
+            subscribed=len(program.subscriptions),
+            metrics=str(self.metrics_address) if self.metrics_address else None,
+        )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.is_ready = False
+        logger.info("router stopping")
+        self._open.close()
+        logger.info("router stopped", **self.totals())
+
+    @property
+    def program(self) -> Program:
+        """The running program; a reload replaces it."""
+        wiring = self._runtime.wiring
+        return wiring.program if wiring is not None else self._first
+
+    @property
+    def listeners(self) -> Mapping[str, Listener]:
+        return self._runtime.sockets.listeners
+
+    @property
+    def metrics_address(self) -> Address | None:
+        """The address of the HTTP server, with the port that the kernel chose for port 0."""
+        return self._services.http_address
+
+    def total(self, metric: str) -> int:
+        """The sum of a counter since the start over all its labels."""
+        return self._counts.total(metric)
+
+    def totals(self) -> dict[str, int]:
+        """The main counters since the start, over all listeners, routes and targets."""
+        totals = {metric: self.total(metric) for metric in _TOTALS}
+        return totals | {"kernel_drops": sum(dropped for _, dropped in self._runtime.drops.totals())}
+
+    def progress(self) -> int:
+        return self._runtime.turns + self.total("datagrams_received")
+
+    def collect(self) -> Iterator[Family]:
+        return self._collector.collect()
+
+    def reload(self) -> ReloadResult:
+        """Read the table again and adopt it between two datagrams; an invalid one changes nothing."""
+        return self._reloader.reload()
+
+    def save_recording(self, reason: str) -> None:
+        """Start to save the last datagrams, if the table keeps them; the result is logged."""
+        self._services.save_recording(reason)
+
+    def _open_services(self, change: Change, opening: ExitStack) -> None:
+        diagnostics = change.topics.publications.get(DIAGNOSTICS) if change.topics else None
+        self._services.open(opening, (self._runtime.node_name, diagnostics.publish) if diagnostics else None)
+        opening.callback(self.mirror.close)
+
+    def _observers_changed(self) -> None:
+        """Called when the first observer of received datagrams attaches or the last one detaches."""
+        self._runtime.rewire()
+
+    def _deadman_changed(self, route: str, active: bool) -> None:
+        self._reporter.deadman_changed(route, active)
+        if active:
+            self._services.deadman_tripped(route)
+
+    def _program_replaced(self) -> None:
+        self._collector = self._new_collector()
+        self._watch()
+
+    def _watch(self) -> None:
+        """Watch the table's files if it says so, and the network interfaces that it names."""
+        if self._interfaces is None and any(plan.interface for plan in self.program.listeners):
+            self._interfaces = InterfaceWatcher(lambda: list(self.listeners.values()), self._reloader.reopen)
+        if self.program.table.reload_on_change and self._watcher is None:
+            self._watcher = Watcher(lambda: watched_files(self.program.table), self.reload)
+        elif not self.program.table.reload_on_change:
+            self._unwatch()
+
+    def _unwatch(self) -> None:
+        if self._watcher is not None:
+            self._watcher.close()
+            self._watcher = None
+
+    def _unwatch_all(self) -> None:
+        self._unwatch()
+        if self._interfaces is not None:
+            self._interfaces.close()
+
+    def _asked(self) -> dict[str, Asked]:
+        """Series without a counter: their values are read when they are asked for."""
+
+        def of_clients(value: Callable[[ClientQueue], float]) -> Asked:
+            return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
+
+        return {
+            "mirror_dropped": lambda: [((), self.mirror.lost)],
+            **self._services.asked(),
+            "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
+            "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),
+            "gateway_client_sent": of_clients(lambda client: client.sent),
+            "gateway_client_dropped": of_clients(lambda client: client.dropped),
+        }
+
+    def _new_collector(self) -> CountersCollector:
+        program = self.program
+        build = {
+            "version": _version(),
+            "table_sha256": program.table.sha256,
+            "protos_sha256": program.protos_sha256,
+        }
+        return CountersCollector(program.counters, self._counts.lists, self._asked(), build)
+
+
+def _version() -> str:
+    try:
+        return version("rover-router")
+    except PackageNotFoundError:  # run from a checkout that is not installed
+        return "unknown"
+
+
+class Services:
+    """The services beside routing that the table asks for: recorder, Foxglove, diagnostics, HTTP."""
+
+    def __init__(self, running: Running) -> None:
+        self.http_address: Address | None = None
+        self._running = running
+        self._recorder: Recorder | None = None
+        self._saving = DaemonThread("saving")
+        self._last_request: Future[None] | None = None
+
+    def open(self, opening: ExitStack, diagnostics: tuple[str, Callable[[bytes], None]] | None) -> None:
+        """Open the services, and have `opening` close them. Raises StartError.
+
+        `diagnostics`: the node's name and a function that publishes CDR bytes; None if the table asks for none.
+        """
+        running, table = self._running, self._running.program.table
+        if table.record is not None:
+            from router.recording.recorder import Recorder
+
+            self._recorder = Recorder(running.mirror, lambda: running.program, table.record)
+            opening.callback(self._recorder.close)
+            opening.callback(self._saving.shutdown)
+        if table.foxglove is not None:
+            from router.observe.foxglove import FoxgloveServer
+
+            opening.callback(FoxgloveServer(table.foxglove, running).close)
+        if diagnostics is not None:
+            from router.observe.diagnostics import Diagnostics
+
+            opening.callback(Diagnostics(running, *diagnostics).close)
+        if table.metrics is not None:
+            from router.observe.http import HttpServer
+
+            save = self._recorder.save if self._recorder and table.record and table.record.last else None
+            server = HttpServer(table.metrics.value, table.metrics.span, running, save)
+            opening.callback(server.close)
+            self.http_address = server.address
+
+    def asked(self) -> Mapping[str, Asked]:
+        """Series of the services, and of the table."""
+
+        def recorded(metric: str) -> Asked:
+            return lambda: self._recorder.samples()[metric] if self._recorder else ()
+
+        own = {metric: recorded(metric) for metric in ("recorded_datagrams", "recorded_bytes", "record_dropped")}
+        return {**own, "endpoint_stale_after_seconds": self._stale_after}
+
+    def _stale_after(self) -> Iterator[tuple[tuple[str], float]]:
+        for endpoint in self._running.program.table.endpoints.values():
+            if endpoint.stale_after is not None:
+                yield (endpoint.name,), endpoint.stale_after / 1e9
+
+    def deadman_tripped(self, route: str) -> None:
+        """Called by the deadman's thread: returns at once."""
+        if self._recorder is not None:
+            self._recorder.deadman_tripped(route)
+
+    def save_recording(self, reason: str) -> None:
+        """Start to save, and return at once; the result is logged. To be called by one thread.
+
+        A second request before the first one has begun is the same one.
+        """
+        if self._recorder is None:
+            logger.warning("nothing to save: the table has no 'record: {last: ...}'")
+            return
+        last = self._last_request
+        if last is None or last.running() or last.done():
+            self._last_request = self._saving.submit(_save, self._recorder, reason)
+
+
+def _save(recorder: Recorder, reason: str) -> None:
+    from router.recording.recorder import RecordError
+
+    try:
+        recorder.save(reason)
+    except RecordError as error:
+        logger.error("the last datagrams could not be saved", problem=str(error))
