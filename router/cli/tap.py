@@ -17,7 +17,7 @@ from router.ros.environment import check_environment, ros_remedy
 if TYPE_CHECKING:
     from router.engine.wire import Wire
     from router.table.model import RouteTable
-    from router.tools.tap import Heard, HeardMessage
+    from router.tools.tap import TappedDatagram, TappedMessage
 
 _DESCRIPTION = """\
 Print what a running router receives, before it routes it, one line for each datagram: the fields that are not default.
@@ -78,8 +78,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"either --topic {args.topic} or '{args.words[0]}'")
     try:
         if args.topic:
-            with _topic(args) as hearing:
-                _print(([heard] for heard in hearing), args)
+            with _topic(args) as messages:
+                _print(([message] for message in messages), args)
         else:
             _tap_datagrams(args)
     except KeyboardInterrupt:
@@ -97,17 +97,17 @@ def _tap_datagrams(args: argparse.Namespace) -> None:
         wire.case(word)  # which says which one was meant
     if args.sources or args.where or args.url:
         raise UsageError("--from, --where and --url belong to a running router")
-    with _port(args, wire, table) as hearing:
-        _print(([heard] for heard in hearing), args)
+    with _port(args, wire, table) as datagrams:
+        _print(([datagram] for datagram in datagrams), args)
 
 
-def _print(batches: Iterable[Sequence[Heard | HeardMessage]], args: argparse.Namespace) -> None:
+def _print(batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace) -> None:
     """A batch is written at once: a system call for each line would cost more than the line."""
     left = args.count
     for batch in batches:
         shown = batch[:left]
         if shown:
-            lines = (heard.json(args.hex) if args.json else heard.line(args.hex) for heard in shown)
+            lines = (each.json(args.hex) if args.json else each.line(args.hex) for each in shown)
             print("\n".join(lines), flush=True)
         if left is not None and (left := left - len(shown)) == 0:
             return
@@ -140,7 +140,7 @@ def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> 
 
 
 @contextmanager
-def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Iterator[Iterator[Heard]]:
+def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Iterator[Iterator[TappedDatagram]]:
     from router.tools import places
     from router.tools.tap import listen
 
@@ -152,7 +152,7 @@ def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Ite
 
 
 @contextmanager
-def _topic(args: argparse.Namespace) -> Iterator[Iterator[HeardMessage]]:
+def _topic(args: argparse.Namespace) -> Iterator[Iterator[TappedMessage]]:
     try:
         check_environment(os.environ)
         from router.ros.listen import TopicListener

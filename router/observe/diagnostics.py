@@ -214,8 +214,8 @@ class Report:
             ("sent", self._of_endpoint("datagrams_sent", name)),
             *((f"dropped: {reason}", n) for (_, reason), n in dropped),
         ]
-        was_heard = self.now.total(LAST_SEEN, name)
-        well = "sends" if was_heard else "nothing came yet" if speaks else "is not expected to send"
+        has_sent = self.now.total(LAST_SEEN, name)
+        well = "sends" if has_sent else "nothing came yet" if speaks else "is not expected to send"
         return _status(f"endpoint/{name}", str(endpoint.address.value), problems, well, values)
 
     def _route(self, route: Route) -> Status:

@@ -1,6 +1,7 @@
-"""A drawing of a route table: sources on the left, payload cases in the middle, targets on the right.
+"""The map of a route table, for the status page and `router graph`: what sends what to whom, and its layout.
 
-For the status page and `router graph`. Links carry the labels under which the metrics count what they stand for.
+Sources are on the left, payload cases in the middle, targets on the right. Edges carry the labels under which the
+metrics count what goes over them.
 """
 
 from __future__ import annotations
@@ -21,9 +22,155 @@ _MARGIN = 1
 """For the borders of boxes."""
 
 
+class NodeKind(enum.Enum):
+    ENDPOINT = "endpoint"
+    ANYONE = "anyone"
+    TOPIC = "topic"
+    CASE = "case"
+    IGNORED = "ignored"
+    GATEWAY = "gateway"
+    CLIENTS = "clients"
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """An endpoint, a topic, a payload case, a gateway or its clients, in a column of the map.
+
+    `key` is unique in a map. `about` says in a few words what the name does not: an address, a type, a ttl.
+    """
+
+    key: str
+    column: int
+    kind: NodeKind
+    name: str
+    about: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """Messages go from one node to another, named by their keys.
+
+    `route` and `label` are those of the metrics. An edge to a case is counted as
+    `messages_received{route, source=label}`, for ANY the sum over all sources; one from a case as `datagrams_sent`
+    or `messages_published`; a gateway's to its clients as `messages_sent`. `about` says under which conditions.
+    """
+
+    start: str
+    end: str
+    route: str
+    label: str
+    about: str = ""
+
+
+def nodes_and_edges(table: RouteTable) -> tuple[list[Node], list[Edge]]:
+    """Everything that the table names in a route or a gateway, each once in a column, in the order of the table."""
+    nodes: dict[str, Node] = {}
+    edges: list[Edge] = []
+    for route in table.routes:
+        for node in (_case(route), *_sources(route, table), *_targets(route, table)):
+            nodes.setdefault(node.key, node)
+        edges += _edges_of(route)
+    for gateway in table.gateways.values():
+        for node in _gateway_nodes(gateway, table):
+            nodes.setdefault(node.key, node)
+        edges += _gateway_edges(gateway, table)
+    return list(nodes.values()), edges
+
+
+def _case(route: Route) -> Node:
+    case = route.case.value
+    if route.ignore is not None:
+        return Node(f"case:{case}", 1, NodeKind.IGNORED, case, f"ignored: {route.ignore}")
+    words = []
+    if route.ttl is not None:
+        words.append(f"dropped when older than {duration(route.ttl.value)}")
+    if route.deadman is not None:
+        words.append(f"deadman after {duration(route.deadman.timeout.value)}")
+    if route.collect is not None:
+        words.append("collected to frames")
+    return Node(f"case:{case}", 1, NodeKind.CASE, case, ", ".join(words))
+
+
+def _sources(route: Route, table: RouteTable) -> Iterator[Node]:
+    if route.ignore is not None:
+        return
+    if route.is_outbound:
+        for topic in route.topics:
+            yield Node(f"from:{topic.topic.value}", 0, NodeKind.TOPIC, topic.topic.value, topic.type.value)
+        return
+    for source in route.sources:
+        if source.value == ANY:
+            yield Node(f"from:@{ANY}", 0, NodeKind.ANYONE, "any sender")
+        else:
+            yield _endpoint(table.endpoints[source.value], "from", 0)
+
+
+def _targets(route: Route, table: RouteTable) -> Iterator[Node]:
+    for destination in route.destinations:
+        yield _endpoint(table.endpoints[destination.endpoint.value], "to", 2)
+    for topic in () if route.is_outbound else route.topics:
+        yield Node(f"to:{topic.topic.value}", 2, NodeKind.TOPIC, topic.topic.value, topic.type.value)
+
+
+def _endpoint(endpoint: Endpoint, side: str, column: int) -> Node:
+    about = f"{endpoint.kind.value}, {endpoint.address.value}"
+    return Node(f"{side}:@{endpoint.name}", column, NodeKind.ENDPOINT, endpoint.name, about)
+
+
+def _edges_of(route: Route) -> Iterator[Edge]:
+    case = f"case:{route.case.value}"
+    if route.ignore is not None:
+        return
+    if route.is_outbound:
+        for topic in route.topics:
+            yield Edge(f"from:{topic.topic.value}", case, route.name, topic.topic.value, _condition(topic))
+    else:
+        for source in (source.value for source in route.sources):
+            yield Edge(f"from:@{source}", case, route.name, source)
+    for destination in route.destinations:
+        name = destination.endpoint.value
+        yield Edge(case, f"to:@{name}", route.name, name, _condition(destination))
+    for topic in () if route.is_outbound else route.topics:
+        name = topic.topic.value
+        yield Edge(case, f"to:{name}", route.name, name, _condition(topic))
+
+
+def _condition(target: Destination | Topic) -> str:
+    return ", ".join(" ".join(words.split()) for key, words in phrases(target).items() if key != "keep")
+
+
+def _gateway_nodes(gateway: Gateway, table: RouteTable) -> Iterator[Node]:
+    yield Node(_key(gateway), 1, NodeKind.GATEWAY, gateway.name, f"gateway, {gateway.transport.value.value}")
+    included = ", ".join(pattern.text for pattern in gateway.include) or "all"
+    excluded = ", ".join(pattern.text for pattern in gateway.exclude)
+    about = f"{included} but {excluded}" if excluded else included
+    yield Node(f"from:{_key(gateway)}", 0, NodeKind.TOPIC, "ROS topics", about)
+    place = gateway.address.value if gateway.address is not None else gateway.transport.value.value
+    yield Node(f"to:{_key(gateway)}", 2, NodeKind.CLIENTS, f"clients of {gateway.name}", str(place))
+    for inbound in gateway.inbound:
+        yield Node(f"clients:{_key(gateway)}", 0, NodeKind.CLIENTS, f"clients of {gateway.name}", str(place))
+        name = resolved(inbound.topic.topic.value, table.node)
+        yield Node(f"to:{name}", 2, NodeKind.TOPIC, name, inbound.topic.type.value)
+
+
+def _gateway_edges(gateway: Gateway, table: RouteTable) -> Iterator[Edge]:
+    key = _key(gateway)
+    yield Edge(f"from:{key}", key, gateway.name, ROS)
+    yield Edge(key, f"to:{key}", gateway.name, CLIENTS)
+    if gateway.inbound:
+        yield Edge(f"clients:{key}", key, gateway.name, CLIENTS)
+    for inbound in gateway.inbound:
+        name = resolved(inbound.topic.topic.value, table.node)
+        yield Edge(key, f"to:{name}", gateway.name, name, _condition(inbound.topic))
+
+
+def _key(gateway: Gateway) -> str:
+    return f"gateway:{gateway.name}"
+
+
 class Measures(NamedTuple):
-    """Sizes of a drawing. `letter` is how wide one is on average, `letters` how many of a name are shown at most,
-    `gap` the least room between two columns, `port` how thick a link may become."""
+    """Sizes of a drawing. `letter` is how wide a letter is on average, `letters` how many of a name are shown at most,
+    `gap` the least room between two columns, `port` how thick a line may become."""
 
     width: float = 0
     font: float = 12
@@ -43,10 +190,10 @@ NARROW = Measures(width=390, font=10, letter=5.8, letters=18, pad=4, row=20, bet
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
-    """A box. `part` says what it stands for, `label` what of its name has room. `x`, `y` are its top left corner."""
+class Box:
+    """A node's place in the drawing. `label`: what of its name has room. `x`, `y`: the top left corner."""
 
-    part: Part
+    node: Node
     label: str
     x: float
     y: float
@@ -55,10 +202,10 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
-    """A line from the right side of a box to the left side of another, `x0, y0` to `x1, y1`."""
+class Curve:
+    """An edge's line, from the right side of a box at `x0, y0` to the left side of another at `x1, y1`."""
 
-    tie: Tie
+    edge: Edge
     x0: float
     y0: float
     x1: float
@@ -66,17 +213,17 @@ class Link:
 
     @property
     def path(self) -> str:
-        """A level beginning and end with a bend between, as an SVG path."""
+        """The SVG path, level at both ends."""
         middle = (self.x0 + self.x1) / 2
         return f"M{self.x0:g},{self.y0:g}C{middle:g},{self.y0:g} {middle:g},{self.y1:g} {self.x1:g},{self.y1:g}"
 
 
 @dataclass(frozen=True, slots=True)
 class RouteMap:
-    """The drawing. `columns` are the left edges of the three columns, `measures` what it was made with."""
+    """The drawing. `columns`: the left edges of the three columns."""
 
-    nodes: tuple[Node, ...]
-    links: tuple[Link, ...]
+    boxes: tuple[Box, ...]
+    curves: tuple[Curve, ...]
     width: float
     height: float
     columns: tuple[float, ...]
@@ -84,36 +231,36 @@ class RouteMap:
 
 
 class _Side(enum.IntEnum):
-    """Which end of a tie a part is."""
+    """The ends of an edge."""
 
     START = 0
     END = 1
 
 
 def route_map(table: RouteTable, measures: Measures = WIDE) -> RouteMap:
-    """Lay a table out. Cases keep the order of the table; the rest stands beside what it is tied to."""
-    parts, ties = map_parts(table)
-    columns = [[part for part in parts if part.column == column] for column in range(len(COLUMNS))]
-    places = {part.key: float(index) for index, part in enumerate(columns[1])}
+    """Lay a table out. Cases keep the order of the table; sources and targets are placed beside their cases."""
+    nodes, edges = nodes_and_edges(table)
+    columns = [[node for node in nodes if node.column == column] for column in range(len(COLUMNS))]
+    places = {node.key: float(index) for index, node in enumerate(columns[1])}
     for column in (0, 2):
-        columns[column].sort(key=lambda part: _mean(_others(part.key, ties, places)))
-    heights = {part.key: _height(part, ties, measures) for part in parts}
-    tops = _tops(columns, ties, heights, measures)
-    edges = _edges(columns, measures)
-    nodes = {
-        part.key: Node(
-            part, shortened(part.name, measures.letters), x, measures.head + tops[part.key], width, heights[part.key]
+        columns[column].sort(key=lambda node: _mean(_others(node.key, edges, places)))
+    heights = {node.key: _height(node, edges, measures) for node in nodes}
+    tops = _tops(columns, edges, heights, measures)
+    spans = _spans(columns, measures)
+    boxes = {
+        node.key: Box(
+            node, shortened(node.name, measures.letters), x, measures.head + tops[node.key], width, heights[node.key]
         )
-        for column, (x, width) in zip(columns, edges, strict=True)
-        for part in column
+        for column, (x, width) in zip(columns, spans, strict=True)
+        for node in column
     }
-    bottom = max((node.y + node.height for node in nodes.values()), default=measures.head)
+    bottom = max((box.y + box.height for box in boxes.values()), default=measures.head)
     return RouteMap(
-        nodes=tuple(nodes.values()),
-        links=tuple(_links(ties, nodes, measures)),
-        width=edges[-1][0] + edges[-1][1] + _MARGIN,
+        boxes=tuple(boxes.values()),
+        curves=tuple(_curves(edges, boxes, measures)),
+        width=spans[-1][0] + spans[-1][1] + _MARGIN,
         height=bottom + measures.between,
-        columns=tuple(x for x, _ in edges),
+        columns=tuple(x for x, _ in spans),
         measures=measures,
     )
 
@@ -126,16 +273,16 @@ def shortened(name: str, letters: int) -> str:
     return f"{name[: kept - kept // 2]}…{name[len(name) - kept // 2 :]}"
 
 
-def _height(part: Part, ties: Sequence[Tie], measures: Measures) -> float:
-    """A row, or more where so many links meet on one side that they need it."""
-    busiest = max(sum(tie.start == part.key for tie in ties), sum(tie.end == part.key for tie in ties))
+def _height(node: Node, edges: Sequence[Edge], measures: Measures) -> float:
+    """Return a row, or more where so many edges meet on one side that they need it."""
+    busiest = max(sum(edge.start == node.key for edge in edges), sum(edge.end == node.key for edge in edges))
     return max(measures.row, busiest * measures.port)
 
 
-def _edges(columns: Sequence[Sequence[Part]], measures: Measures) -> list[tuple[float, float]]:
+def _spans(columns: Sequence[Sequence[Node]], measures: Measures) -> list[tuple[float, float]]:
     """Left edge and width of each column; what is left of `measures.width` goes between them."""
     widths = [
-        max((len(shortened(part.name, measures.letters)) for part in column), default=0) * measures.letter
+        max((len(shortened(node.name, measures.letters)) for node in column), default=0) * measures.letter
         + 2 * measures.pad
         for column in columns
     ]
@@ -144,17 +291,17 @@ def _edges(columns: Sequence[Sequence[Part]], measures: Measures) -> list[tuple[
 
 
 def _tops(
-    columns: Sequence[Sequence[Part]], ties: Sequence[Tie], heights: Mapping[str, float], measures: Measures
+    columns: Sequence[Sequence[Node]], edges: Sequence[Edge], heights: Mapping[str, float], measures: Measures
 ) -> dict[str, float]:
-    """How far each part is below the head: the cases at even distances, the others beside what they are tied to."""
-    sizes = [[heights[part.key] + measures.between for part in column] for column in columns]
+    """Return how far each node is below the head: cases at even distances, the others beside their neighbours."""
+    sizes = [[heights[node.key] + measures.between for node in column] for column in columns]
     room = max(map(sum, sizes))
     spare = (room - sum(sizes[1])) / max(len(sizes[1]) - 1, 1)
-    tops = {part.key: sum(sizes[1][:index]) + spare * index for index, part in enumerate(columns[1])}
+    tops = {node.key: sum(sizes[1][:index]) + spare * index for index, node in enumerate(columns[1])}
     centres = {key: top + heights[key] / 2 for key, top in tops.items()}
     for column in (0, 2):
-        keys = [part.key for part in columns[column]]
-        wanted = [_mean(_others(key, ties, centres)) - heights[key] / 2 for key in keys]
+        keys = [node.key for node in columns[column]]
+        wanted = [_mean(_others(key, edges, centres)) - heights[key] / 2 for key in keys]
         tops.update(zip(keys, spread(wanted, sizes[column], room), strict=True))
     return {key: round(top, 1) for key, top in tops.items()}
 
@@ -176,9 +323,9 @@ def spread(wanted: Sequence[float], sizes: Sequence[float], room: float) -> list
     return [offset + shift for offset, shift in zip(before, shifts, strict=True)]
 
 
-def _others(key: str, ties: Iterable[Tie], places: Mapping[str, float]) -> list[float]:
-    """Where that is to which `key` is tied, as far as it has a place already."""
-    ends = [tie.end if tie.start == key else tie.start for tie in ties if key in (tie.start, tie.end)]
+def _others(key: str, edges: Iterable[Edge], places: Mapping[str, float]) -> list[float]:
+    """Return the places of the neighbours of `key` that have one already."""
+    ends = [edge.end if edge.start == key else edge.start for edge in edges if key in (edge.start, edge.end)]
     return [places[end] for end in ends if end in places]
 
 
@@ -186,161 +333,15 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-def _links(ties: Sequence[Tie], nodes: Mapping[str, Node], measures: Measures) -> Iterator[Link]:
+def _curves(edges: Sequence[Edge], boxes: Mapping[str, Box], measures: Measures) -> Iterator[Curve]:
     """Those that meet at a box stand beside each other there, in the order of their other ends, and cross less."""
     heights = {}
     for side in _Side:
-        for key, node in nodes.items():
-            met = [index for index, tie in enumerate(ties) if (tie.start, tie.end)[side] == key]
-            met.sort(key=lambda index: nodes[(ties[index].end, ties[index].start)[side]].y)
-            first = node.y + node.height / 2 - measures.port * (len(met) - 1) / 2
+        for key, box in boxes.items():
+            met = [index for index, edge in enumerate(edges) if (edge.start, edge.end)[side] == key]
+            met.sort(key=lambda index: boxes[(edges[index].end, edges[index].start)[side]].y)
+            first = box.y + box.height / 2 - measures.port * (len(met) - 1) / 2
             heights.update({(side, index): first + measures.port * place for place, index in enumerate(met)})
-    for index, tie in enumerate(ties):
-        start, end = nodes[tie.start], nodes[tie.end]
-        yield Link(tie, start.x + start.width, heights[_Side.START, index], end.x, heights[_Side.END, index])
-
-
-class PartKind(enum.Enum):
-    ENDPOINT = "endpoint"
-    ANYONE = "anyone"
-    TOPIC = "topic"
-    CASE = "case"
-    IGNORED = "ignored"
-    GATEWAY = "gateway"
-    CLIENTS = "clients"
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """An endpoint, a topic, a payload case, a gateway or its clients, in a column of the map.
-
-    `key` is unique in a map. `about` says in a few words what the name does not: an address, a type, a ttl.
-    """
-
-    key: str
-    column: int
-    kind: PartKind
-    name: str
-    about: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Tie:
-    """Messages go from one part to another, named by their keys.
-
-    `route` and `label` are those of the metrics. A tie to a case is counted as
-    `messages_received{route, source=label}`, for ANY the sum over all sources; one from a case as `datagrams_sent`
-    or `messages_published`; a gateway's to its clients as `messages_sent`. `about` says under which conditions.
-    """
-
-    start: str
-    end: str
-    route: str
-    label: str
-    about: str = ""
-
-
-def map_parts(table: RouteTable) -> tuple[list[Part], list[Tie]]:
-    """Everything that the table names in a route or a gateway, each once in a column, in the order of the table."""
-    parts: dict[str, Part] = {}
-    ties: list[Tie] = []
-    for route in table.routes:
-        for part in (_case(route), *_sources(route, table), *_targets(route, table)):
-            parts.setdefault(part.key, part)
-        ties += _ties(route)
-    for gateway in table.gateways.values():
-        for part in _gateway_parts(gateway, table):
-            parts.setdefault(part.key, part)
-        ties += _gateway_ties(gateway, table)
-    return list(parts.values()), ties
-
-
-def _case(route: Route) -> Part:
-    case = route.case.value
-    if route.ignore is not None:
-        return Part(f"case:{case}", 1, PartKind.IGNORED, case, f"ignored: {route.ignore}")
-    words = []
-    if route.ttl is not None:
-        words.append(f"dropped when older than {duration(route.ttl.value)}")
-    if route.deadman is not None:
-        words.append(f"deadman after {duration(route.deadman.timeout.value)}")
-    if route.collect is not None:
-        words.append("collected to frames")
-    return Part(f"case:{case}", 1, PartKind.CASE, case, ", ".join(words))
-
-
-def _sources(route: Route, table: RouteTable) -> Iterator[Part]:
-    if route.ignore is not None:
-        return
-    if route.is_outbound:
-        for topic in route.topics:
-            yield Part(f"from:{topic.topic.value}", 0, PartKind.TOPIC, topic.topic.value, topic.type.value)
-        return
-    for source in route.sources:
-        if source.value == ANY:
-            yield Part(f"from:@{ANY}", 0, PartKind.ANYONE, "any sender")
-        else:
-            yield _endpoint(table.endpoints[source.value], "from", 0)
-
-
-def _targets(route: Route, table: RouteTable) -> Iterator[Part]:
-    for destination in route.destinations:
-        yield _endpoint(table.endpoints[destination.endpoint.value], "to", 2)
-    for topic in () if route.is_outbound else route.topics:
-        yield Part(f"to:{topic.topic.value}", 2, PartKind.TOPIC, topic.topic.value, topic.type.value)
-
-
-def _endpoint(endpoint: Endpoint, side: str, column: int) -> Part:
-    about = f"{endpoint.kind.value}, {endpoint.address.value}"
-    return Part(f"{side}:@{endpoint.name}", column, PartKind.ENDPOINT, endpoint.name, about)
-
-
-def _ties(route: Route) -> Iterator[Tie]:
-    case = f"case:{route.case.value}"
-    if route.ignore is not None:
-        return
-    if route.is_outbound:
-        for topic in route.topics:
-            yield Tie(f"from:{topic.topic.value}", case, route.name, topic.topic.value, _condition(topic))
-    else:
-        for source in (source.value for source in route.sources):
-            yield Tie(f"from:@{source}", case, route.name, source)
-    for destination in route.destinations:
-        name = destination.endpoint.value
-        yield Tie(case, f"to:@{name}", route.name, name, _condition(destination))
-    for topic in () if route.is_outbound else route.topics:
-        name = topic.topic.value
-        yield Tie(case, f"to:{name}", route.name, name, _condition(topic))
-
-
-def _condition(target: Destination | Topic) -> str:
-    return ", ".join(" ".join(words.split()) for key, words in phrases(target).items() if key != "keep")
-
-
-def _gateway_parts(gateway: Gateway, table: RouteTable) -> Iterator[Part]:
-    yield Part(_key(gateway), 1, PartKind.GATEWAY, gateway.name, f"gateway, {gateway.transport.value.value}")
-    included = ", ".join(pattern.text for pattern in gateway.include) or "all"
-    excluded = ", ".join(pattern.text for pattern in gateway.exclude)
-    about = f"{included} but {excluded}" if excluded else included
-    yield Part(f"from:{_key(gateway)}", 0, PartKind.TOPIC, "ROS topics", about)
-    place = gateway.address.value if gateway.address is not None else gateway.transport.value.value
-    yield Part(f"to:{_key(gateway)}", 2, PartKind.CLIENTS, f"clients of {gateway.name}", str(place))
-    for inbound in gateway.inbound:
-        yield Part(f"clients:{_key(gateway)}", 0, PartKind.CLIENTS, f"clients of {gateway.name}", str(place))
-        name = resolved(inbound.topic.topic.value, table.node)
-        yield Part(f"to:{name}", 2, PartKind.TOPIC, name, inbound.topic.type.value)
-
-
-def _gateway_ties(gateway: Gateway, table: RouteTable) -> Iterator[Tie]:
-    key = _key(gateway)
-    yield Tie(f"from:{key}", key, gateway.name, ROS)
-    yield Tie(key, f"to:{key}", gateway.name, CLIENTS)
-    if gateway.inbound:
-        yield Tie(f"clients:{key}", key, gateway.name, CLIENTS)
-    for inbound in gateway.inbound:
-        name = resolved(inbound.topic.topic.value, table.node)
-        yield Tie(key, f"to:{name}", gateway.name, name, _condition(inbound.topic))
-
-
-def _key(gateway: Gateway) -> str:
-    return f"gateway:{gateway.name}"
+    for index, edge in enumerate(edges):
+        start, end = boxes[edge.start], boxes[edge.end]
+        yield Curve(edge, start.x + start.width, heights[_Side.START, index], end.x, heights[_Side.END, index])

@@ -132,26 +132,26 @@ _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 def _map_json(drawing: RouteMap) -> Json:
     nodes = [
         {
-            "key": node.part.key,
-            "column": node.part.column,
-            "kind": node.part.kind.value,
-            "name": node.part.name,
-            "about": node.part.about,
-            "label": node.label,
-            "box": [node.x, node.y, node.width, node.height],
+            "key": box.node.key,
+            "column": box.node.column,
+            "kind": box.node.kind.value,
+            "name": box.node.name,
+            "about": box.node.about,
+            "label": box.label,
+            "box": [box.x, box.y, box.width, box.height],
         }
-        for node in drawing.nodes
+        for box in drawing.boxes
     ]
     links = [
         {
-            "start": link.tie.start,
-            "end": link.tie.end,
-            "route": link.tie.route,
-            "label": link.tie.label,
-            "about": link.tie.about,
-            "path": link.path,
+            "start": curve.edge.start,
+            "end": curve.edge.end,
+            "route": curve.edge.route,
+            "label": curve.edge.label,
+            "about": curve.edge.about,
+            "path": curve.path,
         }
-        for link in drawing.links
+        for curve in drawing.curves
     ]
     measures = drawing.measures
     return {

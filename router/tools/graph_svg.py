@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from xml.sax.saxutils import escape, quoteattr
 
-from router.observe.route_map import COLUMNS, Link, Node, RouteMap
+from router.observe.route_map import COLUMNS, Box, Curve, RouteMap
 
 _STYLE = """
 .route-map { --ground: #fff; --box: #f3f4f6; --text: #000; --faint: #505050; --line: #b4b8bf; --edge: #7d838c;
@@ -34,7 +34,7 @@ _STYLE = """
 
 def svg(drawing: RouteMap, title: str) -> str:
     font = drawing.measures.font
-    names = {node.part.key: node.part.name for node in drawing.nodes}
+    names = {box.node.key: box.node.name for box in drawing.boxes}
     width, height = f"{drawing.width:g}", f"{drawing.height:g}"
     size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}" font-size="{font:g}"'
     lines = [
@@ -42,8 +42,8 @@ def svg(drawing: RouteMap, title: str) -> str:
         f"<title>{escape(title)}</title>",
         f"<style>{_STYLE}</style>",
         *_heads(drawing),
-        *(_link(link, names) for link in drawing.links),
-        *(_node(node, drawing) for node in drawing.nodes),
+        *(_link(curve, names) for curve in drawing.curves),
+        *(_node(box, drawing) for box in drawing.boxes),
         "</svg>",
     ]
     return "\n".join(lines) + "\n"
@@ -55,18 +55,18 @@ def _heads(drawing: RouteMap) -> Iterator[str]:
         yield f'<text class="head" x="{x + drawing.measures.pad:g}" y="{y:g}">{text}</text>'
 
 
-def _link(link: Link, names: Mapping[str, str]) -> str:
-    tie = link.tie
-    said = f"{names[tie.start]} to {names[tie.end]}" + (f"\n{tie.about}" if tie.about else "")
-    return f'<path class="link" d="{link.path}"><title>{escape(said)}</title></path>'
+def _link(curve: Curve, names: Mapping[str, str]) -> str:
+    edge = curve.edge
+    said = f"{names[edge.start]} to {names[edge.end]}" + (f"\n{edge.about}" if edge.about else "")
+    return f'<path class="link" d="{curve.path}"><title>{escape(said)}</title></path>'
 
 
-def _node(node: Node, drawing: RouteMap) -> str:
-    part, pad = node.part, drawing.measures.pad
-    baseline = node.y + node.height / 2 + drawing.measures.font * 0.35
-    said = f"{part.name}\n{part.about}" if part.about else part.name
+def _node(box: Box, drawing: RouteMap) -> str:
+    node, pad = box.node, drawing.measures.pad
+    baseline = box.y + box.height / 2 + drawing.measures.font * 0.35
+    said = f"{node.name}\n{node.about}" if node.about else node.name
     return (
-        f'<g class="node {part.kind.value}"><title>{escape(said)}</title>'
-        f'<rect x="{node.x:g}" y="{node.y:g}" width="{node.width:g}" height="{node.height:g}" rx="4"/>'
-        f'<text x="{node.x + pad:g}" y="{baseline:g}">{escape(node.label)}</text></g>'
+        f'<g class="node {node.kind.value}"><title>{escape(said)}</title>'
+        f'<rect x="{box.x:g}" y="{box.y:g}" width="{box.width:g}" height="{box.height:g}" rx="4"/>'
+        f'<text x="{box.x + pad:g}" y="{baseline:g}">{escape(box.label)}</text></g>'
     )

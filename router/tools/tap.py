@@ -27,7 +27,7 @@ PATIENCE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class TappedDatagram:
     """One datagram: when (local time), from whom, its bytes, and what it means or why it means nothing."""
 
     at: dt.datetime
@@ -51,20 +51,20 @@ class Heard:
 
     def json(self, with_hex: bool) -> str:
         """One JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
-        said: dict[str, object] = {"time": self.at.isoformat(), "peer": self.peer, "bytes": len(self.data)}
+        document: dict[str, object] = {"time": self.at.isoformat(), "peer": self.peer, "bytes": len(self.data)}
         if self.decoded is None:
-            said["problem"] = self.problem
+            document["problem"] = self.problem
         else:
-            said["case"] = self.decoded.case.name
-            said["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
-            said["zeros_restored"] = self.decoded.zeros
+            document["case"] = self.decoded.case.name
+            document["fields"] = MessageToDict(self.decoded.message, preserving_proto_field_name=True)
+            document["zeros_restored"] = self.decoded.zeros
         if with_hex or self.decoded is None:
-            said["hex"] = self.data.hex()
-        return json.dumps(said)
+            document["hex"] = self.data.hex()
+        return json.dumps(document)
 
 
 @dataclass(frozen=True, slots=True)
-class HeardMessage:
+class TappedMessage:
     """One ROS message: when it arrived (local time), its type, its CDR bytes, and rclpy's object of them."""
 
     at: dt.datetime
@@ -79,13 +79,13 @@ class HeardMessage:
 
     def json(self, with_hex: bool) -> str:
         """One JSON object."""
-        said = {
+        document = {
             "time": self.at.isoformat(),
             "type": self.type_name,
             "bytes": len(self.cdr),
             "fields": ros_json(self.message),
         }
-        return json.dumps(said | {"hex": self.cdr.hex()} if with_hex else said)
+        return json.dumps(document | {"hex": self.cdr.hex()} if with_hex else document)
 
 
 def _clock(at: dt.datetime) -> str:
@@ -116,52 +116,52 @@ class RunningTap:
         self._cases = cases
         self._condition = condition
 
-    def take(self, batches: Iterable[list[MirroredDatagram | Lost]]) -> Iterator[list[Heard]]:
+    def take(self, batches: Iterable[list[MirroredDatagram | Lost]]) -> Iterator[list[TappedDatagram]]:
         """Yield for each batch what is to be shown of it, which may be nothing."""
         for batch in batches:
             shown = []
             for each in batch:
                 if isinstance(each, Lost):
                     self.missed += each.number
-                elif (heard := self._heard(each)) is not None:
-                    shown.append(heard)
+                elif (tapped := self._tapped(each)) is not None:
+                    shown.append(tapped)
             yield shown
 
-    def _heard(self, seen: MirroredDatagram) -> Heard | None:
+    def _tapped(self, seen: MirroredDatagram) -> TappedDatagram | None:
         """None where it is not wanted."""
         peer = self._name_of(seen.peer, seen.listener)
         try:
             decoded = self._wire.decode(seen.data)
         except DecodeError as error:
             is_wanted = not self._cases and self._condition is None
-            return Heard(_local_time(seen.at), peer, seen.data, None, str(error)) if is_wanted else None
+            return TappedDatagram(_local_time(seen.at), peer, seen.data, None, str(error)) if is_wanted else None
         case = decoded.case.name
         if self._cases and case not in self._cases:
             return None
         if self._condition is not None and not self._condition.holds(case, decoded.message, peer, seen.at):
             return None
-        return Heard(_local_time(seen.at), peer, seen.data, decoded)
+        return TappedDatagram(_local_time(seen.at), peer, seen.data, decoded)
 
 
-def listen_to_topic(listener: TopicListener) -> Iterator[HeardMessage]:
+def listen_to_topic(listener: TopicListener) -> Iterator[TappedMessage]:
     """Wait for one message after the other, for ever."""
     while True:
         for cdr, arrived in listener.take(PATIENCE):
-            yield HeardMessage(_local_time(arrived), listener.type_name, cdr, listener.message(cdr))
+            yield TappedMessage(_local_time(arrived), listener.type_name, cdr, listener.message(cdr))
 
 
-def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> Iterator[Heard]:
+def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> Iterator[TappedDatagram]:
     """Wait for one datagram after the other, for ever."""
     receiver.setblocking(True)
     while True:
         data, peer = receiver.recvfrom(LARGEST_DATAGRAM)
-        yield heard(data, name_of(peer), wire)
+        yield received(data, name_of(peer), wire)
 
 
-def heard(data: bytes, peer: str, wire: Wire) -> Heard:
+def received(data: bytes, peer: str, wire: Wire) -> TappedDatagram:
     """A datagram that has just arrived."""
     at = dt.datetime.now().astimezone()
     try:
-        return Heard(at, peer, data, wire.decode(data))
+        return TappedDatagram(at, peer, data, wire.decode(data))
     except DecodeError as error:
-        return Heard(at, peer, data, None, str(error))
+        return TappedDatagram(at, peer, data, None, str(error))

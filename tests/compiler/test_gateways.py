@@ -476,4 +476,4 @@ def test_what_it_does_otherwise_than_another_is_told(tmp_path: Path) -> None:
 def test_it_is_drawn(tmp_path: Path) -> None:
     table = check_file(tmp_path, ONLY).table
     assert table is not None
-    assert [node.part.name for node in route_map(table).nodes] == ["ROS topics", "headset", "clients of headset"]
+    assert [box.node.name for box in route_map(table).boxes] == ["ROS topics", "headset", "clients of headset"]

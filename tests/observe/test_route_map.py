@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.observe.route_map import NARROW, WIDE, Measures, PartKind, map_parts, route_map, shortened, spread
+from router.observe.route_map import NARROW, WIDE, Measures, NodeKind, nodes_and_edges, route_map, shortened, spread
 from router.table.model import ANY, RouteTable
 from tests.tables import PROTOS, ROUTES
 
@@ -50,42 +50,42 @@ routes:
 @pytest.mark.parametrize("measures", [WIDE, NARROW], ids=["wide", "narrow"])
 def test_no_box_overlaps_another_and_all_are_in_the_picture(name: str, measures: Measures) -> None:
     drawing = route_map(table_of(ROUTES / name), measures)
-    for node in drawing.nodes:
-        assert 0 <= node.x < node.x + node.width <= drawing.width
-        assert 0 <= node.y < node.y + node.height <= drawing.height
-    for one, other in itertools.combinations(drawing.nodes, 2):
+    for box in drawing.boxes:
+        assert 0 <= box.x < box.x + box.width <= drawing.width
+        assert 0 <= box.y < box.y + box.height <= drawing.height
+    for one, other in itertools.combinations(drawing.boxes, 2):
         apart = one.y + one.height <= other.y or other.y + other.height <= one.y
-        assert apart or one.part.column != other.part.column, (one, other)
+        assert apart or one.node.column != other.node.column, (one, other)
 
 
 @pytest.mark.parametrize("name", TABLES)
 def test_links_run_from_the_right_of_a_box_to_the_left_of_another(name: str) -> None:
     drawing = route_map(table_of(ROUTES / name))
-    nodes = {node.part.key: node for node in drawing.nodes}
-    assert len(nodes) == len(drawing.nodes)
-    for link in drawing.links:
-        start, end = nodes[link.tie.start], nodes[link.tie.end]
-        assert (link.x0, link.x1) == (start.x + start.width, end.x)
-        assert start.y < link.y0 < start.y + start.height
-        assert end.y < link.y1 < end.y + end.height
+    boxes = {box.node.key: box for box in drawing.boxes}
+    assert len(boxes) == len(drawing.boxes)
+    for curve in drawing.curves:
+        start, end = boxes[curve.edge.start], boxes[curve.edge.end]
+        assert (curve.x0, curve.x1) == (start.x + start.width, end.x)
+        assert start.y < curve.y0 < start.y + start.height
+        assert end.y < curve.y1 < end.y + end.height
 
 
 @pytest.mark.parametrize("name", TABLES)
 def test_links_are_named_as_the_metrics_name_what_flows(name: str) -> None:
     program = program_of(name)
     series = {(each.metric, *each.labels) for each, _ in program.counters.series()}
-    parts, ties = map_parts(program.table)
-    kinds = {part.key: part.kind for part in parts}
-    columns = {part.key: part.column for part in parts}
-    for tie in ties:
-        if columns[tie.start] == 0:
-            assert tie.label == ANY or ("messages_received", tie.route, tie.label) in series
-        elif kinds[tie.end] is PartKind.CLIENTS:
-            assert ("messages_sent", tie.route, tie.label) in series
+    nodes, edges = nodes_and_edges(program.table)
+    kinds = {node.key: node.kind for node in nodes}
+    columns = {node.key: node.column for node in nodes}
+    for edge in edges:
+        if columns[edge.start] == 0:
+            assert edge.label == ANY or ("messages_received", edge.route, edge.label) in series
+        elif kinds[edge.end] is NodeKind.CLIENTS:
+            assert ("messages_sent", edge.route, edge.label) in series
         else:
-            metric = "messages_published" if kinds[tie.end] is PartKind.TOPIC else "datagrams_sent"
-            assert (metric, tie.route, tie.label) in series
-            assert any(each[:3] == ("messages_dropped", tie.route, tie.label) for each in series)
+            metric = "messages_published" if kinds[edge.end] is NodeKind.TOPIC else "datagrams_sent"
+            assert (metric, edge.route, edge.label) in series
+            assert any(each[:3] == ("messages_dropped", edge.route, edge.label) for each in series)
 
 
 def test_every_delivery_of_the_books_has_a_link() -> None:
@@ -93,14 +93,14 @@ def test_every_delivery_of_the_books_has_a_link() -> None:
     delivered = ("datagrams_sent", "messages_published", "messages_sent")
     ways = {(name, gateway.transport.value.value) for name, gateway in program.table.gateways.items()}
     counted = {each.labels for each, _ in program.counters.series() if each.metric in delivered} - ways
-    assert counted <= {(tie.route, tie.label) for tie in map_parts(program.table)[1]}
+    assert counted <= {(edge.route, edge.label) for edge in nodes_and_edges(program.table)[1]}
 
 
 def test_an_ignored_case_stands_there_with_its_reason(tmp_path: Path) -> None:
-    parts, ties = map_parts(hostile(tmp_path))
-    ignored = next(part for part in parts if part.kind is PartKind.IGNORED)
+    nodes, edges = nodes_and_edges(hostile(tmp_path))
+    ignored = next(node for node in nodes if node.kind is NodeKind.IGNORED)
     assert ignored.about == 'ignored: because "x" < y & so'
-    assert all(ignored.key not in (tie.start, tie.end) for tie in ties)
+    assert all(ignored.key not in (edge.start, edge.end) for edge in edges)
 
 
 @given(st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(1, 100)), max_size=20), st.floats(0, 1e3))

@@ -41,11 +41,11 @@ def table(request: pytest.FixtureRequest, tmp_path: Path) -> RouteTable:
 def test_the_picture_has_a_box_and_a_line_for_everything(table: RouteTable) -> None:
     drawing = route_map(table)
     picture = ET.fromstring(svg(drawing, 'a "title" <&>'))  # noqa: S314 - our own
-    assert len(list(picture.iter(f"{SVG}rect"))) == len(drawing.nodes)
-    assert len(list(picture.iter(f"{SVG}path"))) == len(drawing.links)
+    assert len(list(picture.iter(f"{SVG}rect"))) == len(drawing.boxes)
+    assert len(list(picture.iter(f"{SVG}path"))) == len(drawing.curves)
     said = "".join(picture.itertext())
-    assert all(node.part.name in said and node.part.about in said for node in drawing.nodes)
-    assert all(link.tie.about in said for link in drawing.links)
+    assert all(box.node.name in said and box.node.about in said for box in drawing.boxes)
+    assert all(curve.edge.about in said for curve in drawing.curves)
 
 
 def test_it_refers_to_nothing_outside_itself(table: RouteTable) -> None:

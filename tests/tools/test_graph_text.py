@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from router.observe.route_map import map_parts
+from router.observe.route_map import nodes_and_edges
 from router.table.model import RouteTable
 from router.tools.graph_text import dot, mermaid
 from tests.tables import PROTOS, ROUTES
@@ -40,23 +40,23 @@ def table(request: pytest.FixtureRequest, tmp_path: Path) -> RouteTable:
 
 
 @pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")
-def test_dot_draws_every_part_and_tie(table: RouteTable) -> None:
+def test_dot_draws_every_node_and_edge(table: RouteTable) -> None:
     text = dot(table, 'with "quotes" \\')
     drawn = subprocess.run([str(DOT), "-Tplain"], input=text, capture_output=True, text=True, check=True)
-    parts, ties = map_parts(table)
+    nodes, edges = nodes_and_edges(table)
     assert drawn.stderr == ""
-    assert drawn.stdout.count("\nnode ") == len(parts)
-    assert drawn.stdout.count("\nedge ") == len(ties)
+    assert drawn.stdout.count("\nnode ") == len(nodes)
+    assert drawn.stdout.count("\nedge ") == len(edges)
 
 
-def test_mermaid_has_a_line_for_every_part_and_tie(table: RouteTable) -> None:
-    parts, ties = map_parts(table)
+def test_mermaid_has_a_line_for_every_node_and_edge(table: RouteTable) -> None:
+    nodes, edges = nodes_and_edges(table)
     lines = mermaid(table).splitlines()
     assert lines[0] == "flowchart LR"
-    nodes = [line for line in lines if re.fullmatch(r'    n\d+(\[|\(\(|\(\[)"[^"]*"(\]|\)\)|\]\))', line)]
-    links = [line for line in lines if re.fullmatch(r'  n\d+ -->(\|"[^"#<>]*"\|)? n\d+', line)]
-    assert (len(nodes), len(links)) == (len(parts), len(ties))
-    assert len(lines) == 1 + 2 * 3 + len(parts) + len(ties)
+    boxes = [line for line in lines if re.fullmatch(r'    n\d+(\[|\(\(|\(\[)"[^"]*"(\]|\)\)|\]\))', line)]
+    curves = [line for line in lines if re.fullmatch(r'  n\d+ -->(\|"[^"#<>]*"\|)? n\d+', line)]
+    assert (len(boxes), len(curves)) == (len(nodes), len(edges))
+    assert len(lines) == 1 + 2 * 3 + len(nodes) + len(edges)
 
 
 @pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")
