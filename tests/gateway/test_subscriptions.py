@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, closing
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,6 +25,7 @@ from router.gateway.style import Style, UnreadableError
 from router.gateway.subscriptions import READ_PER_TURN, Subscriptions, TopicSubscription
 from router.types.ros import RosInterfaces, ros_interfaces
 from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+from tests.gateway.asynchronous import asynchronous, until
 from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, padded, string_topic
 from tests.ros.ros_publisher import Publisher
 
@@ -46,10 +46,6 @@ def publisher() -> Iterator[Publish]:
         yield lambda *arguments: peers.enter_context(closing(Publisher("greeting", *arguments)))
 
 
-def run(story: Coroutine[Any, Any, None]) -> None:
-    asyncio.run(asyncio.wait_for(story, 2 * PATIENCE_S))
-
-
 @asynccontextmanager
 async def opened(*publishers: TopicPlan) -> AsyncIterator[Subscriptions]:
     """A subscriptions on a node that publishes on these."""
@@ -58,13 +54,6 @@ async def opened(*publishers: TopicPlan) -> AsyncIterator[Subscriptions]:
         closing(Subscriptions(ros.topics, INTERFACES, asyncio.get_running_loop())) as subscriptions,
     ):
         yield subscriptions
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    deadline = asyncio.get_running_loop().time() + PATIENCE_S
-    while not condition():
-        assert asyncio.get_running_loop().time() < deadline, "it never happened"
-        await asyncio.sleep(0.01)
 
 
 async def seen(subscriptions: Subscriptions, condition: Callable[[Selection], bool] = lambda _: True) -> Selection:
@@ -97,77 +86,69 @@ async def heard(peer: Publisher, cdr: bytes, subscription: TopicSubscription) ->
     await until(came)
 
 
-def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: Publish) -> None:
+@asynchronous
+async def test_wanted_topics_are_seen_as_their_publishers_have_them(publisher: Publish) -> None:
     publisher(STRING, "--transient-local")
-
-    async def story() -> None:
-        async with opened(string_topic(topic="own")) as subscriptions:
-            await seen(subscriptions)
-            assert await subscriptions.discover((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
-                "/greeting": Selection(STRING, is_reliable=True, keeps=True, others=()),
-                "/own": OURS,
-            }
-            assert await subscriptions.discover((), lambda _: False) == {}
-
-    run(story())
+    async with opened(string_topic(topic="own")) as subscriptions:
+        await seen(subscriptions)
+        assert await subscriptions.discover((), lambda topic: topic in ("/greeting", "/own", "/nobody")) == {
+            "/greeting": Selection(STRING, is_reliable=True, keeps=True, others=()),
+            "/own": OURS,
+        }
+        assert await subscriptions.discover((), lambda _: False) == {}
 
 
-def test_what_only_we_publish_on_a_topic_that_is_let_in_is_not_seen() -> None:
-    async def story() -> None:
-        async with opened(string_topic()) as subscriptions:
-            assert await seen(subscriptions) == OURS
-            assert await subscriptions.discover(["/greeting"], lambda topic: topic == "/greeting") == {}
-
-    run(story())
+@asynchronous
+async def test_what_only_we_publish_on_a_topic_that_is_let_in_is_not_seen() -> None:
+    async with opened(string_topic()) as subscriptions:
+        assert await seen(subscriptions) == OURS
+        assert await subscriptions.discover(["/greeting"], lambda topic: topic == "/greeting") == {}
 
 
-def test_looking_lets_others_have_their_turn_between_topics() -> None:
-    async def story() -> None:
-        turns = 0
+@asynchronous
+async def test_looking_lets_others_have_their_turn_between_topics() -> None:
+    turns = 0
 
-        async def other() -> None:
-            nonlocal turns
-            while True:
-                turns += 1
-                await asyncio.sleep(0)
+    async def other() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
 
-        async with opened(*(string_topic(topic=f"number_{number}") for number in range(20))) as subscriptions:
-            await subscriptions.discover((), lambda _: True)  # the type is ready from here on
-            task = asyncio.get_running_loop().create_task(other())
-            assert len(await subscriptions.discover((), lambda topic: topic.startswith("/number_"))) == 20
-            assert turns >= 20
-            task.cancel()
-
-    run(story())
+    async with opened(*(string_topic(topic=f"number_{number}") for number in range(20))) as subscriptions:
+        await subscriptions.discover((), lambda _: True)  # the type is ready from here on
+        task = asyncio.get_running_loop().create_task(other())
+        assert len(await subscriptions.discover((), lambda topic: topic.startswith("/number_"))) == 20
+        assert turns >= 20
+        task.cancel()
 
 
-def test_the_latest_value_is_the_newest_and_stays_until_another_one_comes(publisher: Publish) -> None:
-    async def story() -> None:
-        async with opened() as subscriptions:
-            subscription = subscriptions.join("/greeting", PLAIN, None)
-            assert (subscription.topic, subscription.type_name, subscription.message) == (
-                "/greeting",
-                STRING,
-                INTERFACES.get(STRING),
-            )
-            assert json.loads(subscription.schema)["name"] == "String"
-            assert subscription.latest() is None
-            peer = publisher(STRING)
-            await matched(peer)
-            peer.publish(cdr(str(number)) for number in range(50))
-            await until(lambda: subscription.arrived == 50)
-            sample = subscription.latest()
-            assert sample
-            assert (sample.topic, sample.type_name, sample.cdr) == ("/greeting", STRING, cdr("49"))
-            assert subscription.latest() is sample
-            peer.publish([HELLO])
-            await until(lambda: latest(subscription) == HELLO)
-            assert subscription.arrived == 51
-
-    run(story())
+@asynchronous
+async def test_the_latest_value_is_the_newest_and_stays_until_another_one_comes(publisher: Publish) -> None:
+    async with opened() as subscriptions:
+        subscription = subscriptions.join("/greeting", PLAIN, None)
+        assert (subscription.topic, subscription.type_name, subscription.message) == (
+            "/greeting",
+            STRING,
+            INTERFACES.get(STRING),
+        )
+        assert json.loads(subscription.schema)["name"] == "String"
+        assert subscription.latest() is None
+        peer = publisher(STRING)
+        await matched(peer)
+        peer.publish(cdr(str(number)) for number in range(50))
+        await until(lambda: subscription.arrived == 50)
+        sample = subscription.latest()
+        assert sample
+        assert (sample.topic, sample.type_name, sample.cdr) == ("/greeting", STRING, cdr("49"))
+        assert subscription.latest() is sample
+        peer.publish([HELLO])
+        await until(lambda: latest(subscription) == HELLO)
+        assert subscription.arrived == 51
 
 
-def test_every_message_is_handed_on_in_order_and_a_turn_is_short(publisher: Publish) -> None:
+@asynchronous
+async def test_every_message_is_handed_on_in_order_and_a_turn_is_short(publisher: Publish) -> None:
     texts = [cdr(str(number)) for number in range(100)]
     samples: list[bytes] = []
     turns: list[int] = []
@@ -177,261 +158,234 @@ def test_every_message_is_handed_on_in_order_and_a_turn_is_short(publisher: Publ
         if len(samples) < len(texts):
             asyncio.get_running_loop().call_soon(turn)
 
-    async def story() -> None:
-        async with opened() as subscriptions:
-            subscription = subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
-            peer = publisher(STRING)
-            await matched(peer)
-            peer.publish(texts)
-            peer.await_receipt()  # while the loop stands still, so that they all wait
-            turn()
-            await until(lambda: samples == texts)
-            assert max(after - before for before, after in pairwise(turns)) <= READ_PER_TURN
-            assert subscription.arrived == len(texts)
-            assert latest(subscription) == texts[-1]
-
-    run(story())
+    async with opened() as subscriptions:
+        subscription = subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+        peer = publisher(STRING)
+        await matched(peer)
+        peer.publish(texts)
+        peer.await_receipt()  # while the loop stands still, so that they all wait
+        turn()
+        await until(lambda: samples == texts)
+        assert max(after - before for before, after in pairwise(turns)) <= READ_PER_TURN
+        assert subscription.arrived == len(texts)
+        assert latest(subscription) == texts[-1]
 
 
-def test_all_who_want_each_message_share_a_feed_and_all_who_want_the_latest_another(publisher: Publish) -> None:
+@asynchronous
+async def test_all_who_want_each_message_share_a_feed_and_all_who_want_the_latest_another(publisher: Publish) -> None:
     first: list[tuple[TopicSubscription, Sample]] = []
     second: list[tuple[TopicSubscription, Sample]] = []
 
     def each(subscription: TopicSubscription, sample: Sample) -> None:
         first.append((subscription, sample))
 
-    async def story() -> None:
-        async with opened() as subscriptions:
-            calm = subscriptions.join("/greeting", PLAIN, None)
-            subscription = subscriptions.join("/greeting", PLAIN, each)
-            assert subscriptions.join("/greeting", PLAIN, lambda *handed: second.append(handed)) is subscription
-            assert subscriptions.join("/greeting", PLAIN, None) is calm is not subscription
-            peer = publisher(STRING)
-            await heard(peer, cdr("one"), subscription)
-            peer.publish([cdr("two"), cdr("three")])
-            await until(lambda: latest(subscription) == latest(calm) == cdr("three"))
-            assert first == second
-            assert all(handed is subscription for handed, _ in first)
-            assert [sample.cdr for _, sample in first][-2:] == [cdr("two"), cdr("three")]
-            assert subscription.latest() is first[-1][1]
-            subscriptions.leave(subscription, each)
-            peer.publish([cdr("four")])
-            await until(lambda: latest(subscription) == cdr("four"))
-            assert len(first) == len(second) - 1
-
-    run(story())
+    async with opened() as subscriptions:
+        calm = subscriptions.join("/greeting", PLAIN, None)
+        subscription = subscriptions.join("/greeting", PLAIN, each)
+        assert subscriptions.join("/greeting", PLAIN, lambda *handed: second.append(handed)) is subscription
+        assert subscriptions.join("/greeting", PLAIN, None) is calm is not subscription
+        peer = publisher(STRING)
+        await heard(peer, cdr("one"), subscription)
+        peer.publish([cdr("two"), cdr("three")])
+        await until(lambda: latest(subscription) == latest(calm) == cdr("three"))
+        assert first == second
+        assert all(handed is subscription for handed, _ in first)
+        assert [sample.cdr for _, sample in first][-2:] == [cdr("two"), cdr("three")]
+        assert subscription.latest() is first[-1][1]
+        subscriptions.leave(subscription, each)
+        peer.publish([cdr("four")])
+        await until(lambda: latest(subscription) == cdr("four"))
+        assert len(first) == len(second) - 1
 
 
-def test_what_is_kept_comes_once_though_publishers_of_less_quality_come_and_go(publisher: Publish) -> None:
+@asynchronous
+async def test_what_is_kept_comes_once_though_publishers_of_less_quality_come_and_go(publisher: Publish) -> None:
     samples: list[bytes] = []
 
     def each(_: TopicSubscription, sample: Sample) -> None:
         samples.append(sample.cdr)
 
-    async def story() -> None:
-        async with opened() as subscriptions:
-            publisher(STRING, "--transient-local").publish([HELLO])
-            kept = await seen(subscriptions)
-            subscription = subscriptions.join("/greeting", kept, each)
-            await until(lambda: samples == [HELLO])
-            for wanted in (kept._replace(keeps=False), kept):
-                assert subscriptions.join("/greeting", wanted, each) is subscription
-                subscriptions.leave(subscription, each)
-            await until(lambda: subscription.arrived == 2)  # delivered again
-            await asyncio.sleep(0.1)
-            assert samples == [HELLO]
-            assert subscription.missed == 0
-
-    run(story())
+    async with opened() as subscriptions:
+        publisher(STRING, "--transient-local").publish([HELLO])
+        kept = await seen(subscriptions)
+        subscription = subscriptions.join("/greeting", kept, each)
+        await until(lambda: samples == [HELLO])
+        for wanted in (kept._replace(keeps=False), kept):
+            assert subscriptions.join("/greeting", wanted, each) is subscription
+            subscriptions.leave(subscription, each)
+        await until(lambda: subscription.arrived == 2)  # delivered again
+        await asyncio.sleep(0.1)
+        assert samples == [HELLO]
+        assert subscription.missed == 0
 
 
-def test_a_fault_of_one_follower_loses_nothing_else(publisher: Publish) -> None:
+@asynchronous
+async def test_a_fault_of_one_follower_loses_nothing_else(publisher: Publish) -> None:
     samples: list[bytes] = []
     faults: list[object] = []
 
     def fails(_: TopicSubscription, sample: Sample) -> None:
         raise RuntimeError("no")
 
-    async def story() -> None:
-        asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
-        async with opened() as subscriptions:
-            subscriptions.join("/greeting", PLAIN, fails)
-            subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
-            peer = publisher(STRING)
-            await matched(peer)
-            peer.publish([HELLO, cdr("newer")])
-            await until(lambda: samples == [HELLO, cdr("newer")])
-            assert [str(fault) for fault in faults] == ["no", "no"]
-
-    run(story())
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
+    async with opened() as subscriptions:
+        subscriptions.join("/greeting", PLAIN, fails)
+        subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+        peer = publisher(STRING)
+        await matched(peer)
+        peer.publish([HELLO, cdr("newer")])
+        await until(lambda: samples == [HELLO, cdr("newer")])
+        assert [str(fault) for fault in faults] == ["no", "no"]
 
 
-def test_a_feed_is_closed_when_the_last_follower_leaves() -> None:
-    async def story() -> None:
-        with (
-            closing(open_ros()) as ros,
-            closing(Subscriptions(ros.topics, INTERFACES, asyncio.get_running_loop())) as subscriptions,
-        ):
-            subscription = subscriptions.join("/nobody", PLAIN, None)
-            assert subscriptions.join("/nobody", PLAIN, None) is subscription
-            subscriptions.leave(subscription, None)
-            assert "/nobody" in ros.topics.names()
-            subscriptions.leave(subscription, None)
-            await until(lambda: "/nobody" not in ros.topics.names())
-            assert subscription.latest() is None
-            assert subscriptions.join("/nobody", PLAIN, None) is not subscription
-
-    run(story())
+@asynchronous
+async def test_a_feed_is_closed_when_the_last_follower_leaves() -> None:
+    with (
+        closing(open_ros()) as ros,
+        closing(Subscriptions(ros.topics, INTERFACES, asyncio.get_running_loop())) as subscriptions,
+    ):
+        subscription = subscriptions.join("/nobody", PLAIN, None)
+        assert subscriptions.join("/nobody", PLAIN, None) is subscription
+        subscriptions.leave(subscription, None)
+        assert "/nobody" in ros.topics.names()
+        subscriptions.leave(subscription, None)
+        await until(lambda: "/nobody" not in ros.topics.names())
+        assert subscription.latest() is None
+        assert subscriptions.join("/nobody", PLAIN, None) is not subscription
 
 
-def test_it_adapts_when_a_publisher_of_less_quality_joins(publisher: Publish) -> None:
-    async def story() -> None:
-        async with opened() as subscriptions:
-            reliable = publisher(STRING)
-            subscription = subscriptions.join("/greeting", before := await seen(subscriptions), None)
-            await matched(reliable)
-            lossy = publisher(STRING, "--best-effort")
-            after = await seen(subscriptions, lambda choice: not choice.is_reliable)
-            assert subscriptions.join("/greeting", after, None) is subscription
-            subscriptions.leave(subscription, None)
-            assert before.is_reliable
-            await heard(lossy, HELLO, subscription)
-            await heard(reliable, cdr("as well"), subscription)
-
-    run(story())
+@asynchronous
+async def test_it_adapts_when_a_publisher_of_less_quality_joins(publisher: Publish) -> None:
+    async with opened() as subscriptions:
+        reliable = publisher(STRING)
+        subscription = subscriptions.join("/greeting", before := await seen(subscriptions), None)
+        await matched(reliable)
+        lossy = publisher(STRING, "--best-effort")
+        after = await seen(subscriptions, lambda choice: not choice.is_reliable)
+        assert subscriptions.join("/greeting", after, None) is subscription
+        subscriptions.leave(subscription, None)
+        assert before.is_reliable
+        await heard(lossy, HELLO, subscription)
+        await heard(reliable, cdr("as well"), subscription)
 
 
-def test_whoever_follows_again_for_another_quality_gets_no_message_twice(publisher: Publish) -> None:
+@asynchronous
+async def test_whoever_follows_again_for_another_quality_gets_no_message_twice(publisher: Publish) -> None:
     samples: list[bytes] = []
 
     def each(_: TopicSubscription, sample: Sample) -> None:
         samples.append(sample.cdr)
 
-    async def story() -> None:
-        async with opened() as subscriptions:
-            subscription = subscriptions.join("/greeting", PLAIN, each)
-            peer = publisher(STRING)
-            await matched(peer)
-            peer.publish([HELLO])
-            peer.await_receipt()  # holds up the loop: what came is not taken yet
-            assert samples == []
-            assert subscriptions.join("/greeting", PLAIN._replace(is_reliable=False), each) is subscription
-            subscriptions.leave(subscription, each)
-            assert samples == [HELLO]
-
-    run(story())
+    async with opened() as subscriptions:
+        subscription = subscriptions.join("/greeting", PLAIN, each)
+        peer = publisher(STRING)
+        await matched(peer)
+        peer.publish([HELLO])
+        peer.await_receipt()  # holds up the loop: what came is not taken yet
+        assert samples == []
+        assert subscriptions.join("/greeting", PLAIN._replace(is_reliable=False), each) is subscription
+        subscriptions.leave(subscription, each)
+        assert samples == [HELLO]
 
 
-def test_what_gave_way_in_the_queue_is_counted_once_and_nothing_else(publisher: Publish) -> None:
+@asynchronous
+async def test_what_gave_way_in_the_queue_is_counted_once_and_nothing_else(publisher: Publish) -> None:
     samples: list[bytes] = []
-
-    async def story() -> None:
-        async with opened() as subscriptions:
-            subscription = subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
-            peer = publisher(STRING)
-            await matched(peer)
-            peer.publish([HELLO])
-            await until(lambda: samples == [HELLO])
-            peer.publish([HELLO] * 250)
-            peer.await_receipt()
-            await until(lambda: subscription.arrived == 251)
-            peer.publish([cdr("last")])
-            await until(lambda: samples[-1] == cdr("last"))
-            assert (len(samples), subscription.missed) == (102, 150)
-            peer.close()
-            await asyncio.sleep(0.5)  # a publisher that goes is no message
-            assert (subscription.arrived, subscription.missed) == (252, 150)
-
-    run(story())
+    async with opened() as subscriptions:
+        subscription = subscriptions.join("/greeting", PLAIN, lambda _, sample: samples.append(sample.cdr))
+        peer = publisher(STRING)
+        await matched(peer)
+        peer.publish([HELLO])
+        await until(lambda: samples == [HELLO])
+        peer.publish([HELLO] * 250)
+        peer.await_receipt()
+        await until(lambda: subscription.arrived == 251)
+        peer.publish([cdr("last")])
+        await until(lambda: samples[-1] == cdr("last"))
+        assert (len(samples), subscription.missed) == (102, 150)
+        peer.close()
+        await asyncio.sleep(0.5)  # a publisher that goes is no message
+        assert (subscription.arrived, subscription.missed) == (252, 150)
 
 
 @pytest.mark.parametrize("is_each", [False, True])
-def test_what_was_kept_comes_to_a_late_feed(publisher: Publish, is_each: bool) -> None:
+@asynchronous
+async def test_what_was_kept_comes_to_a_late_feed(publisher: Publish, is_each: bool) -> None:
     publisher(STRING, "--transient-local").publish([HELLO])
-
-    async def story() -> None:
-        async with opened() as subscriptions:
-            subscription = subscriptions.join(
-                "/greeting", await seen(subscriptions), (lambda *_: None) if is_each else None
-            )
-            await until(lambda: latest(subscription) == HELLO)
-
-    run(story())
+    async with opened() as subscriptions:
+        subscription = subscriptions.join(
+            "/greeting", await seen(subscriptions), (lambda *_: None) if is_each else None
+        )
+        await until(lambda: latest(subscription) == HELLO)
 
 
-def test_another_type_is_another_feed_and_the_old_one_ends(publisher: Publish) -> None:
-    async def story() -> None:
-        async with opened() as subscriptions:
-            text = publisher(STRING)
-            old = subscriptions.join("/greeting", await seen(subscriptions), None)
-            assert subscriptions.join("/greeting", PLAIN, None) is old  # somebody else, who does not know yet
-            await matched(text)
-            text.publish([HELLO])
-            await until(lambda: latest(old) == HELLO)
-            publisher(INT32)
-            number = publisher(INT32)
-            several = await seen(subscriptions, lambda choice: choice.type_name == INT32)
-            assert several.others == (STRING,)
-            new = subscriptions.join("/greeting", several, None)
-            assert (new is old, new.type_name) == (False, INT32)
-            assert (new.is_open, old.is_open) == (True, False)
-            subscriptions.leave(old, None)
-            await matched(number)
-            number.publish([FIVE])
-            await until(lambda: latest(new) == FIVE)
-            assert latest(old) == HELLO
-            assert subscriptions.join("/greeting", several, None) is new
-            subscriptions.leave(old, None)
-            assert latest(new) == FIVE
-
-    run(story())
+@asynchronous
+async def test_another_type_is_another_feed_and_the_old_one_ends(publisher: Publish) -> None:
+    async with opened() as subscriptions:
+        text = publisher(STRING)
+        old = subscriptions.join("/greeting", await seen(subscriptions), None)
+        assert subscriptions.join("/greeting", PLAIN, None) is old  # somebody else, who does not know yet
+        await matched(text)
+        text.publish([HELLO])
+        await until(lambda: latest(old) == HELLO)
+        publisher(INT32)
+        number = publisher(INT32)
+        several = await seen(subscriptions, lambda choice: choice.type_name == INT32)
+        assert several.others == (STRING,)
+        new = subscriptions.join("/greeting", several, None)
+        assert (new is old, new.type_name) == (False, INT32)
+        assert (new.is_open, old.is_open) == (True, False)
+        subscriptions.leave(old, None)
+        await matched(number)
+        number.publish([FIVE])
+        await until(lambda: latest(new) == FIVE)
+        assert latest(old) == HELLO
+        assert subscriptions.join("/greeting", several, None) is new
+        subscriptions.leave(old, None)
+        assert latest(new) == FIVE
 
 
-def test_a_publisher_that_was_killed_is_followed_by_its_successor() -> None:
-    async def story() -> None:
-        async with opened() as subscriptions:
-            subscription = subscriptions.join("/greeting", PLAIN, None)
-            killed = Publisher("greeting", STRING)
-            await matched(killed)
-            killed.publish([HELLO])
-            await until(lambda: latest(subscription) == HELLO)
-            killed.kill()
-            with closing(Publisher("greeting", STRING)) as successor:
-                await matched(successor)
-                successor.publish([cdr("again")])
-                await until(lambda: latest(subscription) == cdr("again"))
-
-    run(story())
+@asynchronous
+async def test_a_publisher_that_was_killed_is_followed_by_its_successor() -> None:
+    async with opened() as subscriptions:
+        subscription = subscriptions.join("/greeting", PLAIN, None)
+        killed = Publisher("greeting", STRING)
+        await matched(killed)
+        killed.publish([HELLO])
+        await until(lambda: latest(subscription) == HELLO)
+        killed.kill()
+        with closing(Publisher("greeting", STRING)) as successor:
+            await matched(successor)
+            successor.publish([cdr("again")])
+            await until(lambda: latest(subscription) == cdr("again"))
 
 
 EVENT = "rcl_interfaces/srv/GetParameters_Event"
 
 
-def test_a_part_of_a_service_is_followed_though_no_msg_file_declares_it(publisher: Publish) -> None:
+@asynchronous
+async def test_a_part_of_a_service_is_followed_though_no_msg_file_declares_it(publisher: Publish) -> None:
     happened = GetParameters.Event(request=[GetParameters.Request(names=["speed"])])
-
-    async def story() -> None:
-        async with opened() as subscriptions:
-            peer = publisher(EVENT)
-            subscription = subscriptions.join(
-                "/greeting", await seen(subscriptions, lambda choice: choice.type_name == EVENT), None
-            )
-            await heard(peer, padded(serialize_message(happened)), subscription)
-            sample = subscription.latest()
-            assert sample
-            assert sample.type_name == EVENT
-            value = json.loads(sample.text(Style.PLAIN))
-            assert (value["request"], value["response"]) == ([{"names": ["speed"]}], [])
-            schema = json.loads(subscription.schema)
-            assert (schema["name"], schema["namespace"]) == ("GetParameters_Event", "rcl_interfaces::srv")
-            request = schema["fields"][1]["subtype"]
-            assert (request["name"], request["namespace"]) == ("GetParameters_Request", "rcl_interfaces::srv")
-
-    run(story())
+    async with opened() as subscriptions:
+        peer = publisher(EVENT)
+        subscription = subscriptions.join(
+            "/greeting", await seen(subscriptions, lambda choice: choice.type_name == EVENT), None
+        )
+        await heard(peer, padded(serialize_message(happened)), subscription)
+        sample = subscription.latest()
+        assert sample
+        assert sample.type_name == EVENT
+        value = json.loads(sample.text(Style.PLAIN))
+        assert (value["request"], value["response"]) == ([{"names": ["speed"]}], [])
+        schema = json.loads(subscription.schema)
+        assert (schema["name"], schema["namespace"]) == ("GetParameters_Event", "rcl_interfaces::srv")
+        request = schema["fields"][1]["subtype"]
+        assert (request["name"], request["namespace"]) == ("GetParameters_Request", "rcl_interfaces::srv")
 
 
 @pytest.mark.parametrize("text", [None, "no_such_msgs/Thing it", "this is no definition"])
-def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
+@asynchronous
+async def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
     publisher: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None
 ) -> None:
     (tmp_path / "std_msgs" / "msg").mkdir(parents=True)
@@ -439,38 +393,30 @@ def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
         (tmp_path / "std_msgs" / "msg" / "String.msg").write_text(text, encoding="utf-8")
     monkeypatch.setattr(RosbagsDefinitions, "find", lambda *_: None)
     interfaces = RosInterfaces(MsgFiles([tmp_path]), RosbagsDefinitions())
-
-    async def story() -> None:
-        loop = asyncio.get_running_loop()
-        with closing(open_ros()) as ros, closing(Subscriptions(ros.topics, interfaces, loop)) as subscriptions:
-            subscription = subscriptions.join("/greeting", PLAIN, None)
-            await heard(publisher(STRING), HELLO, subscription)
-            sample = subscription.latest()
-            assert sample
-            assert sample.text(Style.PLAIN) == '{"data":"hello, rover"}'
-
-    run(story())
+    loop = asyncio.get_running_loop()
+    with closing(open_ros()) as ros, closing(Subscriptions(ros.topics, interfaces, loop)) as subscriptions:
+        subscription = subscriptions.join("/greeting", PLAIN, None)
+        await heard(publisher(STRING), HELLO, subscription)
+        sample = subscription.latest()
+        assert sample
+        assert sample.text(Style.PLAIN) == '{"data":"hello, rover"}'
 
 
 @pytest.mark.parametrize("type_name", ["std_msgs/msg/NoSuch", "no_such/msg/Thing", "some::Idl_", "a/action/B_Feedback"])
-def test_a_type_that_is_not_installed_is_refused_each_time(type_name: str) -> None:
-    async def story() -> None:
-        async with opened() as subscriptions:
-            for _ in range(2):
-                with pytest.raises(StartError, match=f"{type_name} is not installed"):
-                    subscriptions.join("/greeting", PLAIN._replace(type_name=type_name), None)
-
-    run(story())
+@asynchronous
+async def test_a_type_that_is_not_installed_is_refused_each_time(type_name: str) -> None:
+    async with opened() as subscriptions:
+        for _ in range(2):
+            with pytest.raises(StartError, match=f"{type_name} is not installed"):
+                subscriptions.join("/greeting", PLAIN._replace(type_name=type_name), None)
 
 
-def test_a_topic_that_a_route_has_with_another_type_is_refused_and_can_be_followed_with_its_own() -> None:
-    async def story() -> None:
-        async with opened(string_topic()) as subscriptions:
-            with pytest.raises(StartError, match="'/greeting' is std_msgs/msg/String in this router"):
-                subscriptions.join("/greeting", PLAIN._replace(type_name=INT32), None)
-            assert subscriptions.join("/greeting", PLAIN, None).type_name == STRING
-
-    run(story())
+@asynchronous
+async def test_a_topic_that_a_route_has_with_another_type_is_refused_and_can_be_followed_with_its_own() -> None:
+    async with opened(string_topic()) as subscriptions:
+        with pytest.raises(StartError, match="'/greeting' is std_msgs/msg/String in this router"):
+            subscriptions.join("/greeting", PLAIN._replace(type_name=INT32), None)
+        assert subscriptions.join("/greeting", PLAIN, None).type_name == STRING
 
 
 class Counted(ReadyType):

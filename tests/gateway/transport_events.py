@@ -13,8 +13,7 @@ from pathlib import Path
 
 from router.gateway.transport.base import Client, Frame, Transport
 from router.gateway.transport.stream import StreamTransport
-
-PATIENCE_SECONDS = 20.0
+from tests.gateway.asynchronous import PATIENCE_SECONDS, until
 
 
 def data(payload: bytes, topic: str = "/imu", type_name: str = "T") -> Frame:
@@ -67,14 +66,6 @@ class Events:
 
     def snapshot(self) -> Sequence[Frame]:
         return self.shown
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Waits until it holds."""
-    deadline = asyncio.get_running_loop().time() + PATIENCE_SECONDS
-    while not condition():
-        assert asyncio.get_running_loop().time() < deadline, "waited in vain"
-        await asyncio.sleep(0.002)
 
 
 @asynccontextmanager

@@ -14,8 +14,8 @@ import pytest
 import zenoh
 
 from router.gateway.transport.zenoh_session import Owner, owner_of
-from tests.gateway.test_gateway_zenoh import locator, session
-from tests.gateway.transport_events import PATIENCE_SECONDS
+from tests.gateway.asynchronous import PATIENCE_SECONDS
+from tests.gateway.test_zenoh import locator, session
 from tests.gateway.zenoh_gateway import Gateway
 
 KEY = "rovers/loki_1"
@@ -69,7 +69,7 @@ def test_the_second_tells_who_has_the_key_and_waits_until_it_is_free(gateway: St
     assert (second.contentions, third.contentions) == (1, 1)
 
 
-@pytest.mark.parametrize("number", range(5))
+@pytest.mark.parametrize("number", [0, *(pytest.param(again, marks=pytest.mark.slow) for again in range(1, 5))])
 def test_of_several_that_start_at_once_exactly_one_serves(where: str, number: int) -> None:
     with ExitStack() as started:
         rivals = [started.enter_context(closing(Gateway(KEY, where))) for _ in range(3)]

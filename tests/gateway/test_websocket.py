@@ -1,0 +1,403 @@
+"""A gateway's websocket clients and its page, with the library's own client, and with sockets that misbehave."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import re
+import socket
+from contextlib import AsyncExitStack, suppress
+from hashlib import sha256
+
+import pytest
+from structlog.testing import capture_logs
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from router.errors import StartError
+from router.gateway.transport import stream as gateway_stream
+from router.gateway.transport import websocket as gateway_websocket
+from router.gateway.transport.base import HIGH_WATER, Client
+from router.gateway.transport.stream import Limits
+from router.gateway.transport.websocket import WebsocketTransport
+from router.table.addresses import Address
+from tests.gateway.asynchronous import asynchronous, until
+from tests.gateway.transport_events import Events, close_while_clients_come, data, opened, resident_kib
+
+ANY = Address("127.0.0.1", 0)
+MOST = 1000
+PAGE = b"<!doctype html><style>a{}</style><p>\xc3\xa4</p><script>let a;</script><script>let b;</script>"
+
+
+def documents(events: Events, max_clients: int = 10) -> WebsocketTransport:
+    return WebsocketTransport(ANY, events, Limits(max_clients, max_clients, MOST), text=True, page=PAGE)
+
+
+def packets(events: Events) -> WebsocketTransport:
+    return WebsocketTransport(ANY, events, Limits(10, 10, MOST), text=False, page=PAGE)
+
+
+def dial(transport: WebsocketTransport, path: str = "/", host: str = "", **settings: str) -> connect:
+    """Used with `async with`. `settings` are the library's."""
+    assert transport.address is not None
+    uri = f"ws://{host or transport.address}{path}"
+    where = {"host": transport.address.host, "port": transport.address.port}
+    return connect(uri, max_size=None, proxy=None, **where, **settings)  # type: ignore[arg-type]
+
+
+async def dial_and_stand_still(transport: WebsocketTransport) -> socket.socket:
+    """A client that shakes hands and reads nothing, with a small buffer."""
+    assert transport.address is not None
+    peer = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    peer.setblocking(False)
+    loop = asyncio.get_running_loop()
+    await loop.sock_connect(peer, transport.address)
+    key = base64.b64encode(b"0123456789abcdef").decode()
+    await loop.sock_sendall(
+        peer, _request("/", "Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}")
+    )
+    assert (await loop.sock_recv(peer, 12)) == b"HTTP/1.1 101"
+    return peer
+
+
+def _request(path: str, *headers: str) -> bytes:
+    lines = [f"GET {path} HTTP/1.1", "Host: rover:8765", "Sec-WebSocket-Version: 13", *headers, "", ""]
+    return "\r\n".join(lines).encode()
+
+
+async def fetch(transport: WebsocketTransport, path: str, *headers: str) -> tuple[int, str, bytes]:
+    """Status, head and body of an HTTP answer."""
+    assert transport.address is not None
+    reader, writer = await asyncio.open_connection(*transport.address)
+    writer.write(_request(path, *headers))
+    head, _, body = (await reader.read()).partition(b"\r\n\r\n")
+    writer.close()
+    return int(head.split()[1]), head.decode(), body
+
+
+@asynchronous
+async def test_frames_of_one_writing_are_one_text_message_joined_by_newlines() -> None:
+    events = Events()
+    transport = documents(events)
+    async with opened(transport), dial(transport) as one, dial(transport, "/any/path?x=1") as other:
+        await until(lambda: len(events.clients) == 2)
+        assert events.clients[0].label == "{}:{}".format(*one.local_address)
+        transport.write_all(events.clients, [data(b'{"a":1}'), data('{"b":"ä"}'.encode())])
+        events.clients[1].write([data(b"{}")])
+        for end in (one, other):
+            assert await end.recv() == '{"a":1}\n{"b":"ä"}'
+        assert await other.recv() == "{}"
+        await one.send('{"op":"schema"}')
+        await one.send(b"\x00")
+        await until(lambda: len(events.said) == 2)
+        assert events.said == [b'{"op":"schema"}', b"\x00"]
+        assert events.said_by == [events.clients[0]] * 2
+
+
+@asynchronous
+async def test_packets_are_binary_messages_of_their_own() -> None:
+    events = Events()
+    transport = packets(events)
+    async with opened(transport), dial(transport) as end:
+        await until(lambda: events.clients)
+        events.clients[0].write([data(b"one"), data(b""), data(b"x" * 200_000)])
+        assert [await end.recv() for _ in range(3)] == [b"one", b"", b"x" * 200_000]
+
+
+@asynchronous
+async def test_nothing_is_compressed() -> None:
+    events = Events()
+    transport = documents(events)
+    async with opened(transport), dial(transport) as end:
+        assert end.protocol.extensions == []
+
+
+@asynchronous
+async def test_a_large_message_is_cut_so_that_pings_pass_and_arrives_whole() -> None:
+    large = "ä€" * 1_400_000
+    events = Events()
+    transport = documents(events)
+    async with opened(transport), dial(transport) as end:
+        await until(lambda: events.clients)
+        [client] = events.clients
+        client.write([data(large.encode())])
+        client.write([data(b"next")])
+        assert client.backlog() > 6_000_000
+        answered = await end.ping()
+        parts = [part async for part in end.recv_streaming()]
+        assert "".join(map(str, parts)) == large
+        assert len(parts) > 100
+        await answered
+        assert await end.recv() == "next"
+        await until(lambda: events.eased == [client])
+
+
+@asynchronous
+async def test_clients_that_stand_still_hold_up_nobody_and_cost_no_memory_of_their_own() -> None:
+    events = Events()
+    transport = documents(events, max_clients=51)
+    async with opened(transport):
+        still = [await dial_and_stand_still(transport) for _ in range(50)]
+        await until(lambda: len(events.clients) == 50)
+        async with dial(transport) as end:
+            await until(lambda: len(events.clients) == 51)
+            before = resident_kib()
+            transport.write_all(events.clients, [data(b"x" * 7_000_000)])
+            assert len(await end.recv()) == 7_000_000
+            assert resident_kib() - before < 100_000
+            assert all(client.backlog() > 6_000_000 for client in events.clients[:50])
+            events.clients[50].write([data(b"next")])
+            assert await end.recv() == "next"
+        await transport.close()  # at once, though they will not say goodbye
+        for peer in still:
+            peer.close()
+
+
+@asynchronous
+async def test_a_slow_client_is_told_when_it_has_drained_and_gets_all_in_order() -> None:
+    wanted = 400
+    events = Events()
+    transport = documents(events)
+    sent = 0
+
+    def send(client: Client) -> None:
+        nonlocal sent
+        while sent < wanted and client.backlog() < HIGH_WATER:
+            client.write([data(b"%04d" % sent + b"x" * 10_000)])
+            sent += 1
+
+    events.on_drained = send
+    async with opened(transport), dial(transport) as end:
+        await until(lambda: events.clients)
+        send(events.clients[0])
+        assert sent < wanted
+        for number in range(wanted):
+            message = await end.recv()
+            assert str(message).startswith(f"{number:04d}x")
+
+
+@asynchronous
+async def test_a_client_that_takes_nothing_for_long_is_closed_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_stream, "STALLED_SECONDS", 0.3)
+    events = Events()
+    transport = documents(events)
+    with capture_logs() as logs:
+        async with opened(transport):
+            peer = await dial_and_stand_still(transport)
+            await until(lambda: events.clients)
+            [client] = events.clients
+            client.write([data(b"x" * 10_000_000)])
+            await until(lambda: events.gone == [client])
+            peer.close()
+    assert ["send stalled" in log["event"] for log in logs if log["log_level"] == "warning"] == [True]
+
+
+@asynchronous
+async def test_a_client_that_does_not_answer_pings_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_websocket, "PING_SECONDS", 0.1)
+    monkeypatch.setattr(gateway_websocket, "CLOSING_SECONDS", 0.1)
+    events = Events()
+    transport = documents(events)
+    async with opened(transport):
+        peer = await dial_and_stand_still(transport)
+        await until(lambda: len(events.gone) == 1)
+        peer.close()
+
+
+@asynchronous
+async def test_a_client_that_pings_without_end_and_reads_nothing_is_closed() -> None:
+    pings = (b"\x89\xfdmask" + b"x" * 125) * 100
+    events = Events()
+    transport = documents(events)
+    async with opened(transport):
+        peer = await dial_and_stand_still(transport)
+        with suppress(ConnectionError):
+            while not events.gone:
+                await asyncio.get_running_loop().sock_sendall(peer, pings)
+        await until(lambda: len(events.gone) == 1)
+        peer.close()
+
+
+@asynchronous
+async def test_clients_that_leave_in_either_way_are_gone() -> None:
+    events = Events()
+    transport = documents(events)
+    async with opened(transport):
+        async with dial(transport) as end:
+            await until(lambda: len(events.clients) == 1)
+            end.transport.abort()
+            await until(lambda: len(events.gone) == 1)
+        async with dial(transport):
+            await until(lambda: len(events.clients) == 1)
+        await until(lambda: len(events.gone) == 2)
+        async with dial(transport) as end:
+            await until(lambda: len(events.clients) == 1)
+            events.clients[0].close()
+            with pytest.raises(ConnectionClosed):
+                await end.recv()
+            assert len(events.gone) == 3
+        events.gone[0].write([data(b"too late")])
+
+
+@asynchronous
+async def test_a_message_that_is_too_long_is_refused_and_its_sender_closed() -> None:
+    events = Events()
+    transport = documents(events)
+    async with opened(transport), dial(transport) as end:
+        await end.send("x" * MOST)
+        await end.send("x" * (MOST + 1))
+        await until(lambda: events.gone)
+        assert ([len(said) for said in events.said], events.refusals) == ([MOST], ["too_large"])
+        with pytest.raises(ConnectionClosed, match="1009"):
+            await end.recv()
+
+
+@asynchronous
+async def test_the_page_is_given_with_a_policy_that_lets_it_nothing_from_outside() -> None:
+    transport = documents(Events())
+    async with opened(transport):
+        status, head, body = await fetch(transport, "/")
+        assert (status, body) == (200, PAGE)
+        assert "Content-Type: text/html; charset=utf-8" in head
+        assert "Cache-Control: no-store" in head
+        [policy] = re.findall("Content-Security-Policy: (.*)\r", head)
+        hashes = [
+            "'sha256-" + base64.b64encode(sha256(text).digest()).decode() + "'"
+            for text in (b"let a;", b"let b;", b"a{}")
+        ]
+        assert policy == (
+            f"default-src 'none'; script-src {hashes[0]} {hashes[1]}; style-src {hashes[2]}; img-src data:; "
+            "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
+            "connect-src 'self' ws://rover:8765 wss://rover:8765"
+        )
+        assert (await fetch(transport, "/?topic=/imu"))[0] == 200
+        assert [(await fetch(transport, path))[0] for path in ("/favicon.ico", "//", "/../etc/passwd")] == [404] * 3
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "welcome"),
+    [
+        ("rover:8765", "http://rover:8765", True),
+        ("rover:8765", "https://ROVER:8765", True),
+        ("10.0.0.7:8765", "http://10.0.0.7:8765", True),
+        ("[fe80::1]:8765", "http://[fe80::1]:8765", True),
+        ("loki.local", "http://loki.local", True),
+        ("rover:8765", "http://rover", False),
+        ("rover:8765", "http://evil.example", False),
+        ("rover:8765", "http://rover:8765.evil.example", False),
+        ("evil.example:8765", "http://evil.example:8765", False),  # a name that was made to lead here
+        ("rover:8765", "null", False),
+        ("rover:8765", "", False),
+    ],
+)
+@asynchronous
+async def test_a_page_of_another_host_may_not_connect(host: str, origin: str, welcome: bool) -> None:
+    events = Events()
+    transport = documents(events)
+    async with opened(transport):
+        if welcome:
+            async with dial(transport, host=host, additional_headers={"Origin": origin}):  # type: ignore[arg-type]
+                await until(lambda: events.clients)
+            return
+        with pytest.raises(InvalidStatus, match="403"):
+            await dial(transport, host=host, additional_headers={"Origin": origin})  # type: ignore[arg-type]
+        assert not events.clients
+
+
+@asynchronous
+async def test_a_client_beyond_the_most_is_sent_away_and_told_but_may_see_the_page() -> None:
+    events = Events()
+    transport = documents(events, max_clients=1)
+    with capture_logs() as logs:
+        async with opened(transport), dial(transport):
+            await until(lambda: events.clients)
+            async with dial(transport) as second:
+                with pytest.raises(ConnectionClosed, match="1013"):
+                    await second.recv()
+            assert (await fetch(transport, "/"))[0] == 200
+    [warning] = [log for log in logs if log["log_level"] == "warning"]
+    assert "too many" in warning["event"]
+    assert len(events.gone) == 1
+
+
+@pytest.mark.parametrize(
+    "greeting", [b"", b"GET / HT", b"\x16\x03\x01" + b"x" * 100, b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 1000]
+)
+@asynchronous
+async def test_who_does_not_speak_http_does_not_hold_up_closing(greeting: bytes) -> None:
+    events = Events()
+    transport = documents(events)
+    with capture_logs() as logs:
+        async with opened(transport):
+            assert transport.address is not None
+            _, writer = await asyncio.open_connection(*transport.address)
+            writer.write(greeting)
+            await asyncio.sleep(0.05)
+            before = asyncio.get_running_loop().time()
+            await transport.close()
+            assert asyncio.get_running_loop().time() - before < 5
+            writer.close()
+    assert events.clients == events.gone == []
+    assert {log["log_level"] for log in logs} <= {"debug"}
+
+
+@asynchronous
+async def test_clients_that_say_goodbye_hear_that_the_gateway_goes_away() -> None:
+    events = Events()
+    transport = documents(events)
+    async with AsyncExitStack() as stack, opened(transport):
+        ends: list[ClientConnection] = [await stack.enter_async_context(dial(transport)) for _ in range(3)]
+        await until(lambda: len(events.clients) == 3)
+        await transport.close()
+        for end in ends:
+            with pytest.raises(ConnectionClosed, match="1001"):
+                await end.recv()
+        assert len(events.gone) == 3
+
+
+@asynchronous
+async def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
+    first = documents(Events())
+    async with opened(first):
+        assert first.address is not None
+        second = WebsocketTransport(first.address, Events(), Limits(1, 1, MOST), text=True, page=PAGE)
+        with pytest.raises(StartError, match=r"127\.0\.0\.1:\d+ cannot be used: .*\(pid \d+\) has the port"):
+            await second.open()
+        await second.close()
+
+
+@asynchronous
+async def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
+    events = Events()
+    faults: list[Exception] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
+    transport = documents(events)
+
+    def stumble(client: Client, data: bytes, arrived_ns: int) -> None:
+        raise ZeroDivisionError
+
+    events.received = stumble  # type: ignore[method-assign]
+    async with opened(transport), dial(transport) as one, dial(transport):
+        await until(lambda: len(events.clients) == 2)
+        with suppress(ConnectionClosed):
+            await one.send("x")
+            await one.recv()
+        await until(lambda: len(events.gone) == 1)
+    assert [type(fault) for fault in faults] == [ZeroDivisionError]
+
+
+@asynchronous
+async def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
+    events = Events()
+    transport = documents(events, max_clients=100)
+    async with opened(transport), AsyncExitStack() as stack:
+        ends = await asyncio.gather(*(stack.enter_async_context(dial(transport)) for _ in range(100)))
+        await until(lambda: len(events.clients) == 100)
+        transport.write_all(events.clients, [data(b"hello")])
+        assert await asyncio.gather(*(end.recv() for end in ends)) == ["hello"] * 100
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
+    asyncio.run(close_while_clients_come(documents(Events()), turns))
