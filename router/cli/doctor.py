@@ -10,7 +10,7 @@ from pathlib import Path
 
 from router.cli import DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, plural
-from router.tools.doctor_report import Finding, Grade
+from router.tools.doctor_checks import CheckResult, Grade
 
 SICK = 1
 
@@ -33,22 +33,22 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.doctor import before_start, examine
 
     grades: Counter[Grade] = Counter()
-    for finding in (before_start if args.pre_start else examine)(args.table, os.environ):
-        grades[finding.grade] += 1
-        if finding.grade is Grade.PROBLEM or not args.pre_start:
-            print(shown(finding, coloured=is_coloured(sys.stdout)), flush=True)
+    for result in (before_start if args.pre_start else examine)(args.table, os.environ):
+        grades[result.grade] += 1
+        if result.grade is Grade.PROBLEM or not args.pre_start:
+            print(shown(result, coloured=is_coloured(sys.stdout)), flush=True)
     if not args.pre_start:
         print(_summary(grades))
     return SICK if grades[Grade.PROBLEM] else OK
 
 
-def shown(finding: Finding, *, coloured: bool) -> str:
+def shown(result: CheckResult, *, coloured: bool) -> str:
     """A line, and another one with what to do."""
-    grade = f"{finding.grade.value:8}"
+    grade = f"{result.grade.value:8}"
     if coloured:
-        grade = f"{_STYLES[finding.grade]}{grade}{_RESET}"
-    text = f"{grade} {finding.about:10} {finding.text}"
-    return f"{text}\n{'':20}-> {finding.remedy}" if finding.remedy else text
+        grade = f"{_STYLES[result.grade]}{grade}{_RESET}"
+    text = f"{grade} {result.about:10} {result.text}"
+    return f"{text}\n{'':20}-> {result.remedy}" if result.remedy else text
 
 
 def _summary(grades: Counter[Grade]) -> str:

@@ -52,8 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _drawn(table: RouteTable, suffix: str) -> str:
     from router.observe.route_map import route_map
-    from router.tools.graph_svg import svg
-    from router.tools.graph_text import dot, mermaid
+    from router.tools.graph import dot, mermaid, svg
 
     if suffix == ".svg":
         return svg(route_map(table), table.path.name)

@@ -15,7 +15,7 @@ from router.cli.tool_options import explained, whole
 from router.errors import TransportError, UsageError
 
 if TYPE_CHECKING:
-    from router.tools.listening_reading import Heard
+    from router.tools.gateway_messages import Heard
 
 FORMATS = ("gateway_v1", "json_lines")
 
@@ -54,9 +54,9 @@ def _seconds(text: str) -> float:
 @explained
 def run(args: argparse.Namespace) -> int:
     from router.table.model import GatewayFormat
-    from router.tools.listening import Listening
-    from router.tools.listening_places import open_source, remote, topic_filter
-    from router.tools.listening_reading import Message
+    from router.tools.gateway_messages import Message
+    from router.tools.gateway_sources import open_source, remote
+    from router.tools.listening import Listening, topic_filter
 
     listening = Listening(topic_filter(args.topic or ()))
     form = GatewayFormat(args.format) if args.format else None
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
 @contextmanager
 def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
     """A function that appends a line to the file, which has it when it returns."""
-    from router.tools.listening_show import json_line
+    from router.tools.gateway_messages import json_line
 
     if path is None:
         yield lambda _: None
@@ -107,7 +107,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
 
 def _printer(as_json: bool) -> Callable[[Heard], None]:
     """Colours, and lines cut at the border, for a terminal alone."""
-    from router.tools.listening_show import json_line, pieces
+    from router.tools.gateway_messages import json_line, pieces
 
     if as_json:
         return lambda heard: print(json_line(heard), flush=True)

@@ -21,7 +21,7 @@ TERMINAL_REFRESH = 0.5
 JSON_REFRESH = 0.5
 LINE_REFRESH = 5.0
 CHANGE_REFRESH = 0.1
-"""Seconds between two looks at the statistics, by who looks and what for."""
+"""Seconds between two updates of what is shown."""
 
 CHANGES_SHOWN = 3
 
@@ -58,8 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from router.compiler import check_table
     from router.engine.wire import Wire
     from router.tools.sim_view import SimView
-    from router.tools.simulator import Simulator
-    from router.tools.streams import parse_silence
+    from router.tools.simulator import Simulator, parse_silence
 
     silences = [parse_silence(text) for text in args.silent]
     checked = check_table(args.table)
@@ -87,16 +86,16 @@ def _show_json(simulator: Simulator, view: SimView, args: argparse.Namespace) ->
 
 def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
     """A line now and then, and one for each change of a board."""
-    told, due = 0.0, LINE_REFRESH
+    shown, due = 0.0, LINE_REFRESH
 
     def write(seconds: float) -> None:
-        nonlocal told, due
-        for change in view.changes(since=told):
+        nonlocal shown, due
+        for change in view.changes(since=shown):
             print(change, flush=True)
-        told = seconds
+        shown = seconds
         if seconds >= due:
             due += LINE_REFRESH
-            view.look(seconds)
+            view.update(seconds)
             print(view.line(), flush=True)
 
     print(f"{simulator.summary}; Ctrl-C ends it", flush=True)
@@ -115,15 +114,15 @@ def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace
     with Live(console=console, screen=True, auto_refresh=False) as live:
 
         def draw(seconds: float) -> None:
-            view.look(seconds)
+            view.update(seconds)
             title = Text(f"{simulator.summary}; Ctrl-C ends it", style="bold", no_wrap=True, overflow="ellipsis")
-            conditions = view.conditions()
+            statuses = view.statuses()
             changes = [Text(str(change), style="dim") for change in view.changes(since=0)[-CHANGES_SHOWN:]]
-            room = console.height - 2 - conditions.row_count - len(changes)
-            live.update(Group(title, view.headline(), conditions, view.table(room), *changes), refresh=True)
+            room = console.height - 2 - statuses.row_count - len(changes)
+            live.update(Group(title, view.headline(), statuses, view.table(room), *changes), refresh=True)
 
         seconds = simulator.run(args.duration, TERMINAL_REFRESH, draw)
-    view.look(seconds)
+    view.update(seconds)
     console.print(view.table(1000))
-    console.print(view.conditions())
+    console.print(view.statuses())
     console.print(view.headline())

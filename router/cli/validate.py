@@ -10,16 +10,13 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
-from router.cli.findings import FORMATS, count_line, plural, print_findings, severity
+from router.cli.findings import FORMATS, count_line, print_findings, severity
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, Severity, shown_path
-
-if TYPE_CHECKING:
-    from router.table.model import RouteTable
+from router.table import summary
 
 DEFAULT = Path("routes")
 _DESCRIPTION = f"""Report every finding in the tables, with file, line, column and a hint.
@@ -78,16 +75,3 @@ def find_tables(paths: Sequence[Path]) -> list[Path]:
 def _is_table(file: Path) -> bool:
     is_yaml = file.suffix in (".yaml", ".yml") and not file.name.endswith((".test.yaml", ".test.yml"))
     return is_yaml and not file.name.startswith(".") and not file.is_dir()
-
-
-def summary(table: RouteTable) -> str:
-    """`26 payload cases, 31 topics, 8 endpoints, 1 gateway`, without what there is none of."""
-    topics = sum(len(route.topics) for route in table.routes)
-    cases = {route.case.value for route in table.routes}
-    counts = {
-        "payload case": len(cases),
-        "topic": topics,
-        "endpoint": len(table.endpoints),
-        "gateway": len(table.gateways),
-    }
-    return ", ".join(plural(count, noun) for noun, count in counts.items() if count) or "nothing to do"

@@ -46,3 +46,18 @@ def read_table(path: Path) -> RouteTable:
 def in_order(findings: list[Diagnostic]) -> list[Diagnostic]:
     """Each finding once (aliases repeat them), by its place."""
     return sorted(dict.fromkeys(findings), key=lambda found: (found.span, found.code.value, found.message))
+
+
+def summary(table: RouteTable) -> str:
+    """`26 payload cases, 31 topics, 8 endpoints, 1 gateway`, without what there is none of."""
+    topics = sum(len(route.topics) for route in table.routes)
+    cases = {route.case.value for route in table.routes}
+    counts = {
+        "payload case": len(cases),
+        "topic": topics,
+        "endpoint": len(table.endpoints),
+        "gateway": len(table.gateways),
+    }
+    return (
+        ", ".join(f"{count} {noun}{'s' * (count != 1)}" for noun, count in counts.items() if count) or "nothing to do"
+    )

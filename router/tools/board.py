@@ -1,19 +1,20 @@
-"""What a simulated board makes of what it is told: it obeys commands, halts for a deadman, stops when left alone.
-
-Knows neither sockets nor clocks: whoever calls tells the time, in seconds since the start.
-"""
+"""Simulated endpoints: what they make of the datagrams that they receive. Times are seconds since the start."""
 
 from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from google.protobuf.message import Message
 
 from router.compiler.program import DeadmanPlan
+from router.engine.collecting import Collector, PartOutcome
 from router.engine.wire import Decoded, Wire
+from router.errors import DecodeError, MappingError
 from router.table.model import EndpointKind, Priority, RouteTable
+from router.types.model import MessageType
 from router.values import compact
 
 TIMEOUT = 1.0
@@ -89,7 +90,7 @@ class Board:
         self._stops = stops
         self._changed = changed
         self._since = 0.0
-        self._told_at = 0.0
+        self._commanded_at = 0.0
         self._halted_until = 0.0
         self._halt = ""
 
@@ -98,25 +99,25 @@ class Board:
         case, message = decoded.case, decoded.message
         stop = next((stop for stop in self._stops if stop.case == case.name and stop.message == message), None)
         if stop is not None:
-            self._told_at, self._halted_until = now, now + stop.hold
+            self._commanded_at, self._halted_until = now, now + stop.hold
             self._halt = f"{case.name} {compact(message, case.type)}"
             self._become(now, State.HALTED)
         elif case.name in self._commands:
-            self._told_at = now
+            self._commanded_at = now
             if self.state is not State.HALTED or now >= self._halted_until:
                 self._become(now, State.OBEYING)
 
-    def look(self, now: float) -> None:
+    def advance(self, now: float) -> None:
         """Time has passed."""
-        if self.state in (State.OBEYING, State.HALTED) and now - self._told_at >= TIMEOUT:
+        if self.state in (State.OBEYING, State.HALTED) and now - self._commanded_at >= TIMEOUT:
             self._become(now, State.STOPPED)
 
-    def told(self, now: float) -> str:
+    def status(self, now: float) -> str:
         """The state in words."""
         if self.state is State.WAITING:
             return "no commands yet"
         if self.state is State.STOPPED:
-            return f"no commands for {now - self._told_at:.1f} s: stopped"
+            return f"no commands for {now - self._commanded_at:.1f} s: stopped"
         if self.state is State.HALTED:
             return f"halted by a deadman for {now - self._since:.1f} s: {self._halt}"
         return "obeys commands"
@@ -131,7 +132,7 @@ class Board:
         elif state is State.OBEYING and was is not State.WAITING:
             text = f"obeys commands again, after {lasted:.1f} s"
         else:
-            text = self.told(now)
+            text = self.status(now)
         self._changed(Change(now, self._name, state, text))
 
 
@@ -146,3 +147,96 @@ def boards(
         if endpoint.kind is EndpointKind.BOARD and (commands or stops):
             found[name] = Board(name, commands, stops, changed)
     return found
+
+
+PART = ("frame_id", "total_count", "index")
+"""The fields by which a payload says which frame it belongs to, of how many parts, and which of them it is."""
+
+FRAME_TIMEOUT = 1_000_000_000
+"""Nanoseconds from the first part of a frame after which the others are given up."""
+
+
+def is_part(kind: MessageType) -> bool:
+    return all(kind.field(name) for name in PART)
+
+
+class Frames(PartOutcome):
+    """Counts the frames of one payload case. `astray` are parts whose numbers fit no frame."""
+
+    def __init__(self) -> None:
+        self.complete = 0
+        self.incomplete = 0
+        self.astray = 0
+        self._collector = Collector(FRAME_TIMEOUT, [self])
+
+    def take(self, now: int, part: Any) -> None:
+        """A payload that `is_part`; monotonic ns."""
+        try:
+            whole = self._collector.offer(now, part.frame_id, part.total_count, part.index, part)
+        except MappingError:
+            self.astray += 1
+        else:
+            self.complete += whole is not None
+
+    def advance(self, now: int) -> None:
+        """Time has passed."""
+        self._collector.due(now)
+
+    # what becomes of the parts, as the collector says
+
+    def collected(self) -> None:
+        """A part is no frame yet."""
+
+    def filtered(self) -> None:
+        """Nor is a copy of one."""
+
+    def dropped(self, reason: str, *, detail: str) -> None:
+        self.incomplete += 1
+
+
+@dataclass(slots=True)
+class Arrivals:
+    """What was received of one payload case: the newest message and when, and how many."""
+
+    last: Message
+    at: float
+    count: int = 1
+
+
+class Inbox:
+    """`arrivals` and `frames` are by payload case. `board` is None where commands mean nothing: the basestation."""
+
+    def __init__(self, wire: Wire, board: Board | None) -> None:
+        self.board = board
+        self.arrivals: dict[str, Arrivals] = {}
+        self.frames: dict[str, Frames] = {}
+        self.undecodable = 0
+        self._wire = wire
+
+    def take(self, now: float, datagram: bytes) -> None:
+        try:
+            decoded = self._wire.decode(datagram)
+        except DecodeError:
+            self.undecodable += 1
+            return
+        case, message = decoded.case, decoded.message
+        arrivals = self.arrivals.get(case.name)
+        if arrivals is None:
+            self.arrivals[case.name] = Arrivals(message, now)
+        else:
+            arrivals.last, arrivals.at, arrivals.count = message, now, arrivals.count + 1
+        if self.board is not None:
+            self.board.take(now, decoded)
+        elif is_part(case.type):
+            self.frames.setdefault(case.name, Frames()).take(_nanoseconds(now), message)
+
+    def advance(self, now: float) -> None:
+        """Time has passed: commands may be missing, frames incomplete."""
+        if self.board is not None:
+            self.board.advance(now)
+        for frames in self.frames.values():
+            frames.advance(_nanoseconds(now))
+
+
+def _nanoseconds(seconds: float) -> int:
+    return int(seconds * 1e9)

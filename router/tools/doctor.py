@@ -1,32 +1,46 @@
-"""Looks for what keeps a router from working on this computer, and says what to do about it.
+"""What keeps a router from working on this computer, and what to do about it.
 
-`examine` goes from what is needed first, the table, to what only a running router can tell. What is looked at where is
-in the modules doctor_*.
+`examine` goes from what is needed first, the table, to what only a running router can tell.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-from router.compiler import check_table
+from router.compiler import Checked, check_table
+from router.compiler.metrics import INTENDED_REASONS
 from router.compiler.program import Program
-from router.errors import Severity, shown_path
-from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
-from router.tools.doctor_network import endpoints, interfaces, ports
-from router.tools.doctor_report import Finding, fine, problem, warning
-from router.tools.doctor_ros import open_domain, ros
-from router.tools.doctor_running import Health, health
+from router.errors import Severity, TransportError, shown_path
+from router.observe.snapshot import Snapshot, parse_metrics
+from router.table import summary
+from router.table.model import RouteTable
+from router.table.units import duration
+from router.tools.doctor_checks import (
+    CheckResult,
+    clock,
+    endpoints,
+    fine,
+    interfaces,
+    open_domain,
+    ports,
+    problem,
+    receive_buffers,
+    recordings,
+    ros,
+    shared_memory,
+    warning,
+)
+from router.tools.running_router import metrics, url_of
 
 
-def examine(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
-    """Each finding as soon as there is one; a reachable board or none takes a second."""
-    program = None
-    for finding in _table(path, variables):
-        if isinstance(finding, Program):
-            program = finding
-        else:
-            yield finding
+def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
+    """Each result as soon as it is known; pings take up to a second."""
+    checked = check_table(path, variables)
+    yield from _table(checked)
+    program = checked.program
     if program is None:
         return
     running = health(program)
@@ -43,21 +57,18 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
     yield from _running(program, running)
 
 
-def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[Finding]:
-    """Only what would make the start fail. Ports of listeners are left out: systemd may keep them for the router."""
-    for finding in _table(path, variables):
-        if isinstance(finding, Program):
-            yield from ros(finding)
-            yield from interfaces(finding)
-            yield from ports(finding, running=False, with_listeners=False)
-            yield from recordings(finding)
-        else:
-            yield finding
-
-
-def _table(path: Path, variables: Mapping[str, str]) -> Iterator[Finding | Program]:
-    """What is wrong with it, and at the end the program, if it can run."""
+def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
+    """Only what would make the start fail, without the ports of listeners: systemd may hold them for the router."""
     checked = check_table(path, variables)
+    yield from _table(checked)
+    if checked.program is not None:
+        yield from ros(checked.program)
+        yield from interfaces(checked.program)
+        yield from ports(checked.program, running=False, with_listeners=False)
+        yield from recordings(checked.program)
+
+
+def _table(checked: Checked) -> Iterator[CheckResult]:
     warnings = 0
     for found in checked.diagnostics:
         if found.severity is Severity.ERROR:
@@ -69,14 +80,11 @@ def _table(path: Path, variables: Mapping[str, str]) -> Iterator[Finding | Progr
     table = checked.program.table
     if warnings:
         count = f"{warnings} warning{'s' if warnings > 1 else ''}"
-        yield warning("table", count, f"`router validate {shown_path(path)}` shows them")
-    counts = {"route": len(table.routes), "endpoint": len(table.endpoints), "gateway": len(table.gateways)}
-    told = ", ".join(f"{count} {noun}{'s' * (count > 1)}" for noun, count in counts.items() if count)
-    yield fine("table", f"{shown_path(path)}: {told}")
-    yield checked.program
+        yield warning("table", count, f"`router validate {shown_path(checked.path)}` shows them")
+    yield fine("table", f"{shown_path(checked.path)}: {summary(table)}")
 
 
-def _running(program: Program, running: Health | None) -> Iterator[Finding]:
+def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
     if program.table.metrics is None:
         yield warning(
             "router",
@@ -88,3 +96,98 @@ def _running(program: Program, running: Health | None) -> Iterator[Finding]:
         yield fine("router", what)
     else:
         yield from running.findings()
+
+
+_SHOWN = 3
+"""Targets that are named for each reason of losses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The metrics of a router that may run another version of `table` by now. `now` in seconds since the epoch."""
+
+    table: RouteTable
+    snapshot: Snapshot
+    now: float
+
+    def findings(self) -> Iterator[CheckResult]:
+        found = [*self._table(), *self._silent(), *self._lost(), *self._kept_away(), *self._deadmen()]
+        yield from found or [fine("router", "it runs, hears every endpoint that sends, and loses nothing")]
+
+    def _table(self) -> Iterator[CheckResult]:
+        if self.snapshot.counts("config_last_reload_successful").get(()) == 0:
+            what = "its last reload failed, and the table from before it goes on"
+            yield problem("router", what, "`router reload` says why")
+        elif self.snapshot.table_sha256 != self.table.sha256:
+            yield warning("router", "it runs another table than this file", "router reload, or systemctl restart")
+
+    def _silent(self) -> Iterator[CheckResult]:
+        sources = {source.value for route in self.table.routes for source in route.sources}
+        for (name,), seen in self.snapshot.counts("endpoint_last_seen_timestamp_seconds").items():
+            endpoint = self.table.endpoints.get(name)
+            if endpoint is None or endpoint.stale_after is None or name not in sources:
+                continue
+            believed_by = endpoint.listener.value if endpoint.listener else None
+            listeners = [each for each in self.table.listeners.values() if believed_by in (None, each.name)]
+            listening = ", ".join(each.bound_to for each in listeners)
+            remedy = (
+                f"is it on, and does it send to this computer, where the router listens ({listening})? "
+                f"`tcpdump -n udp and host {endpoint.address.value.host}` shows whether anything comes"
+            )
+            if not seen:
+                yield warning("endpoints", f"{name} was never heard since the router started", remedy)
+            elif self.now - seen > endpoint.stale_after / 1e9:
+                limit = duration(endpoint.stale_after)
+                what = f"{name} is stale: silent for {self.now - seen:.0f} s, and more than {limit} is too long"
+                yield problem("endpoints", what, remedy)
+
+    def _lost(self) -> Iterator[CheckResult]:
+        for (listener,), count in self.snapshot.counts("kernel_drops").items():
+            if count:
+                yield warning(
+                    "router",
+                    f"the kernel has dropped {count:.0f} datagrams of listener '{listener}'",
+                    "a larger `receive_buffer`, or less load on this computer; `router top` shows whether it goes on",
+                )
+        lost: dict[str, list[tuple[float, str]]] = defaultdict(list)
+        for (route, target, reason), count in self.snapshot.counts("messages_dropped").items():
+            if count and reason not in INTENDED_REASONS:
+                lost[reason].append((count, f"{count:.0f} of {route} for {target}"))
+        for reason, each in lost.items():
+            worst = [text for _, text in sorted(each, reverse=True)[:_SHOWN]]
+            others = f" and {len(each) - _SHOWN} more targets" if len(each) > _SHOWN else ""
+            yield warning(
+                "router",
+                f"messages lost as {reason}: {', '.join(worst)}{others}",
+                "docs/metrics.md says what the reason means, the log what happened: journalctl -u rover-router",
+            )
+
+    def _kept_away(self) -> Iterator[CheckResult]:
+        for (route, topic, policy), peers in self.snapshot.counts("qos_incompatible").items():
+            if peers:
+                yield problem(
+                    "ROS",
+                    f"{peers:.0f} peers get nothing of topic {topic}, or are not heard there, for their {policy}",
+                    f"`ros2 topic info -v {topic}` shows their QoS, `router explain {route}` ours",
+                )
+
+    def _deadmen(self) -> Iterator[CheckResult]:
+        for (route,), active in self.snapshot.counts("deadman_active").items():
+            if active:
+                yield warning(
+                    "router",
+                    f"{route}: commands stopped coming, and the deadman sends in their place",
+                    "does whoever commands still send, often enough, and with a clock that agrees with this one?",
+                )
+
+
+def health(program: Program) -> Health | None:
+    """None where nobody answers, or another program, and where the table does not say at which address."""
+    table = program.table
+    if table.metrics is None:
+        return None
+    try:
+        snapshot = parse_metrics(*metrics(url_of(table)))
+    except (TransportError, ValueError, KeyError):  # nobody, or somebody else
+        return None
+    return Health(table, snapshot, snapshot.at) if snapshot.values else None

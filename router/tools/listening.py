@@ -1,23 +1,21 @@
-"""What a gateway sends, heard one by one and counted: the reference for those who write clients.
-
-A source brings bytes. Datagrams are taken apart and put together (`gateway.fragments`), then each packet or document is
-read (`listening_reading`). A client asks for schemas until it has one; a schema comes before the messages of its type.
-Knows no sockets and no command line.
-"""
+"""What a gateway sends, one by one and counted: the reference for those who write clients."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
 
+from router.compiler.selection import matcher, pattern_problem
+from router.errors import SourceSpan, UsageError
 from router.gateway.fragments import Reassembler
 from router.gateway.packets import PacketError
-from router.tools.listening_reading import Heard, Message, Problem, Remark, Schema, Shape, read
+from router.table.model import TopicPattern
+from router.tools.gateway_messages import Heard, Message, Problem, Remark, Schema, Shape, read
+from router.tools.gateway_sources import Arrival, Source
 
 PATIENCE = 0.2
-"""Seconds that a source waits at most, so that what is to end does."""
+"""Seconds that a source waits at most, so that Ctrl-C and `seconds` are noticed."""
 
 ASK_AGAIN = 1.0
 """Seconds after which schemas are asked for again."""
@@ -25,30 +23,6 @@ ASK_AGAIN = 1.0
 
 _MOST_SHAPES = 10_000
 """Schemas that are remembered. More have only those who make senders up."""
-
-
-class Arrival(NamedTuple):
-    """A datagram, packet or document. Fragments and schemas count for those of the same `sender` alone."""
-
-    data: bytes
-    sender: Hashable
-
-
-class Source(Protocol):
-    """Where bytes come from. `place` says it in words; `lost` counts what is known to be missing."""
-
-    place: str
-
-    @property
-    def lost(self) -> int: ...
-
-    def ask(self) -> None:
-        """Ask for schemas and latest values, where a gateway does not send them unasked."""
-
-    def arrivals(self, timeout: float) -> Sequence[Arrival]:
-        """What came in, after at most so many seconds."""
-
-    def close(self) -> None: ...
 
 
 @dataclass(slots=True)
@@ -142,3 +116,15 @@ class Listening:
     def _problem(self, error: PacketError, data: bytes) -> Problem:
         self._tally.undecodable += 1
         return Problem(str(error), data)
+
+
+_COMMAND_LINE = SourceSpan("command line", 1, 1)
+
+
+def topic_filter(globs: Sequence[str]) -> Callable[[str], bool]:
+    """Whether any of them matches a topic; without globs each topic does. Raises UsageError."""
+    patterns = [TopicPattern(glob, is_regex=False, span=_COMMAND_LINE) for glob in globs]
+    for problem in filter(None, map(pattern_problem, patterns)):
+        raise UsageError(f"--topic: {problem.what}; {problem.hint}")
+    matchers = [matcher(pattern) for pattern in patterns]
+    return lambda topic: not matchers or any(matches(topic) for matches in matchers)

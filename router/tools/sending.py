@@ -1,13 +1,26 @@
-"""One datagram sent once or at a rate, and what came of it. Knows no payloads."""
+"""One datagram sent once or at a rate."""
 
 from __future__ import annotations
 
+import itertools
 import socket
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from router.errors import TransportError
 from router.table.addresses import Address
-from router.tools.pacing import paced
+
+
+def paced(count: int | None, rate: float | None) -> Iterator[float]:
+    """Yield `count` times (None: for ever) at `rate` Hz (None: at once) the seconds since the first time."""
+    start = time.monotonic()
+    for index in itertools.count() if count is None else range(count):
+        now = time.monotonic()
+        if rate is not None and (wait := start + index / rate - now) > 0:
+            time.sleep(wait)
+            now = time.monotonic()
+        yield now - start
 
 
 @dataclass(slots=True)

@@ -1,7 +1,4 @@
-"""How the simulator's statistics look: a table for a terminal, lines for a log, JSON for programs.
-
-Remembers the counts of the last looks, to tell rates.
-"""
+"""The simulator's statistics as a table for a terminal, as lines for a log, and as JSON."""
 
 from __future__ import annotations
 
@@ -14,8 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from router.engine.wire import Wire
-from router.tools.board import Change, State
-from router.tools.inbox import Arrivals
+from router.tools.board import Arrivals, Change, State
 from router.tools.simulator import Statistics
 from router.values import compact, rate_text
 
@@ -34,22 +30,22 @@ _STYLES = {State.WAITING: "dim", State.OBEYING: "green", State.HALTED: "bold yel
 
 
 class SimView:
-    """Looks at one simulator's statistics, which it never changes."""
+    """A read-only view of one simulator's statistics; keeps earlier counts for the rates."""
 
     def __init__(self, wire: Wire, statistics: Statistics) -> None:
         self._wire = wire
         self._statistics = statistics
-        self._looks: deque[tuple[float, dict[Key, int]]] = deque([(0.0, {})])
+        self._history: deque[tuple[float, dict[Key, int]]] = deque([(0.0, {})])
         self._rates: dict[Key, float] = {}
 
-    def look(self, seconds: float) -> None:
-        """Compute the rates over the last RATE_WINDOW seconds, or since the last look; `seconds` since the start."""
+    def update(self, seconds: float) -> None:
+        """Compute the rates over the last RATE_WINDOW seconds, or since the last update; `seconds` since the start."""
         counts = {key: arrivals.count for key, arrivals in self._arrivals()}
-        while len(self._looks) > 1 and seconds - self._looks[1][0] >= RATE_WINDOW:
-            self._looks.popleft()
-        before_at, before = self._looks[0]
+        while len(self._history) > 1 and seconds - self._history[1][0] >= RATE_WINDOW:
+            self._history.popleft()
+        before_at, before = self._history[0]
         self._rates = {key: (count - before.get(key, 0)) / (seconds - before_at) for key, count in counts.items()}
-        self._looks.append((seconds, counts))
+        self._history.append((seconds, counts))
 
     def _arrivals(self) -> Iterator[tuple[Key, Arrivals]]:
         for endpoint, inbox in self._statistics.inboxes.items():
@@ -58,7 +54,7 @@ class SimView:
 
     @property
     def _seconds(self) -> float:
-        return self._looks[-1][0]
+        return self._history[-1][0]
 
     def changes(self, since: float) -> list[Change]:
         """How the boards' states have changed after `since`, seconds since the start."""
@@ -82,33 +78,33 @@ class SimView:
         """The headline, and what each endpoint received."""
         counts: dict[str, int] = defaultdict(int)
         rates: dict[str, float] = defaultdict(float)
-        for (endpoint, case), count in self._looks[-1][1].items():
+        for (endpoint, case), count in self._history[-1][1].items():
             counts[endpoint] += count
             rates[endpoint] += self._rates[endpoint, case]
         parts = [f"{endpoint} {counts[endpoint]} ({rate_text(rates[endpoint])}/s)" for endpoint in sorted(counts)]
-        parts += [f"{endpoint} {told}" for endpoint, told, _ in self._conditions()]
+        parts += [f"{endpoint} {text}" for endpoint, text, _ in self._statuses()]
         return self.headline() + (f"; {', '.join(parts)}" if parts else "")
 
-    def _conditions(self) -> Iterator[tuple[str, str, str]]:
-        """Endpoint, in which condition it is, and the style of that."""
+    def _statuses(self) -> Iterator[tuple[str, str, str]]:
+        """Endpoint, its status in words, and the style of that."""
         for endpoint, inbox in self._statistics.inboxes.items():
             if inbox.board is not None:
-                yield endpoint, inbox.board.told(self._seconds), _STYLES[inbox.board.state]
+                yield endpoint, inbox.board.status(self._seconds), _STYLES[inbox.board.state]
             for case, frames in inbox.frames.items():
-                told = f"{case}: {frames.complete} frames complete, {frames.incomplete} incomplete"
+                text = f"{case}: {frames.complete} frames complete, {frames.incomplete} incomplete"
                 if frames.astray:
-                    told += f", {frames.astray} parts of no frame"
-                yield endpoint, told, "yellow" if frames.incomplete or frames.astray else "green"
+                    text += f", {frames.astray} parts of no frame"
+                yield endpoint, text, "yellow" if frames.incomplete or frames.astray else "green"
             if inbox.undecodable:
                 yield endpoint, f"{inbox.undecodable} undecodable datagrams", "bold red"
 
-    def conditions(self) -> Table:
+    def statuses(self) -> Table:
         """What boards make of their commands, and the basestation of frames: one line each."""
         table = Table(box=None, pad_edge=False, show_header=False, expand=True)
         table.add_column(no_wrap=True)
         table.add_column(no_wrap=True, ratio=1, overflow="ellipsis")
-        for endpoint, told, style in self._conditions():
-            table.add_row(Text(endpoint, style="cyan"), Text(told, style=style))
+        for endpoint, text, style in self._statuses():
+            table.add_row(Text(endpoint, style="cyan"), Text(text, style=style))
         return table
 
     def table(self, height: int) -> Table:

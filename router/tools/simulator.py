@@ -1,31 +1,91 @@
 """All boards and the basestation of a route table on one machine, over real UDP.
 
 Each endpoint binds its own address, sends what the table names it as the source of, and takes what it is sent.
-Who looks at that is not known here (see `sim_view`).
 """
 
 from __future__ import annotations
 
 import heapq
+import random
+import re
 import selectors
 import socket
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from router.compiler.program import DeadmanPlan
 from router.engine.wire import Wire
-from router.errors import UsageError
+from router.errors import UsageError, did_you_mean
 from router.table.addresses import Address
-from router.table.model import Endpoint, RouteTable
+from router.table.model import ANY, Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
-from router.tools.board import Change, boards
-from router.tools.inbox import Inbox
-from router.tools.models import moment
-from router.tools.payload_model import PayloadModel
+from router.tools.board import Change, Inbox, boards
+from router.tools.payloads import PayloadModel, pose, usual_rate
 from router.tools.places import LOOPBACK, listener_address, open_udp
-from router.tools.streams import STRANGER, Silence, check_silences, streams
+from router.types.protobuf import PayloadCase
+
+STRANGER = "(anybody)"
+"""Who sends the payload cases that the table takes from any source."""
+
+_SILENCE = re.compile(r"(?P<name>\w+):(?P<start>\d+(\.\d+)?)-(?P<end>\d+(\.\d+)?)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One payload case that one endpoint sends, at `rate` Hz, the first after `offset` seconds."""
+
+    endpoint: str
+    case: PayloadCase
+    rate: float
+    offset: float
+
+
+@dataclass(frozen=True, slots=True)
+class Silence:
+    """An endpoint, or whoever sends a payload case, says nothing from `start` to `end`, seconds since the start."""
+
+    name: str
+    start: float
+    end: float
+
+    def covers(self, stream: Stream, at: float) -> bool:
+        return self.start <= at < self.end and self.name in (stream.endpoint, stream.case.name)
+
+
+def parse_silence(text: str) -> Silence:
+    """`basestation:5-8`, `manual_drive:5-` (for ever). Raises UsageError."""
+    found = _SILENCE.fullmatch(text)
+    if found is None:
+        raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")
+    return Silence(found["name"], float(found["start"]), float(found["end"] or "inf"))
+
+
+def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
+    """Raises UsageError for one that silences nobody."""
+    known = {name for stream in streams for name in (stream.endpoint, stream.case.name)} - {STRANGER}
+    for silence in silences:
+        if silence.name not in known:
+            hint = did_you_mean(silence.name, known)
+            raise UsageError(f"nothing is sent that '{silence.name}' could silence; {hint}")
+
+
+def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iterator[Stream]:
+    """What the table's UDP sources send, in the order of the table. Raises UsageError for an unknown name."""
+    for route in table.routes:
+        if route.is_outbound:
+            continue
+        case = wire.case(route.case.value)
+        rate = usual_rate(case.name) * rate_scale
+        for source in route.sources:
+            sender = STRANGER if source.value == ANY else source.value
+            if sender != STRANGER and sender not in table.endpoints:
+                hint = did_you_mean(sender, table.endpoints)
+                raise UsageError(f"{source.span}: there is no endpoint '{sender}'; {hint}")
+            offset = random.Random(f"{seed}/{case.name}/{sender}").uniform(0, 1 / rate)
+            yield Stream(sender, case, rate, offset)
+
 
 DRAIN = 256
 """Datagrams taken from one socket before the others, and the sending, have their turn."""
@@ -80,9 +140,9 @@ class Simulator:
         self._silences = silences
         check_silences(silences, self._streams)
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed) for stream in self._streams]
-        # What is known by no listener in particular sends to the first one.
+        # Endpoints without a `listener` send to the first one.
         self._router = listener_address(next(iter(table.listeners.values())))
-        self._believed_at = {
+        self._destinations = {
             name: listener_address(table.listeners[endpoint.listener.value])
             for name, endpoint in table.endpoints.items()
             if endpoint.listener is not None
@@ -153,7 +213,7 @@ class Simulator:
                 self._receive(receiver, inbox, time.monotonic() - start)
             now = time.monotonic() - start
             for inbox in self.statistics.inboxes.values():
-                inbox.look(now)
+                inbox.advance(now)
         return now
 
     def _next(self, at: float, rate: float, now: float) -> float:
@@ -166,9 +226,9 @@ class Simulator:
         if any(silence.covers(stream, at) for silence in self._silences):
             return
         message = stream.case.message_class()
-        self._models[index].fill(message, moment(at, epoch))
+        self._models[index].fill(message, pose(at, epoch))
         try:
-            to = self._believed_at.get(stream.endpoint, self._router)
+            to = self._destinations.get(stream.endpoint, self._router)
             self._senders[stream.endpoint].sendto(self._wire.encode(stream.case, message), to)
         except OSError:
             self.statistics.unsent += 1

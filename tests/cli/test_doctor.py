@@ -9,7 +9,7 @@ import pytest
 
 from router.cli import main
 from router.cli.doctor import shown
-from router.tools.doctor_report import Grade, fine, problem, warning
+from router.tools.doctor_checks import Grade, fine, problem, warning
 from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent.parent

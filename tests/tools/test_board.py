@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from router.compiler.program import DeadmanPlan
-from router.engine.wire import Decoded, Wire
+from router.engine.wire import Decoded, Wire, wire_of_protos
 from router.table.model import RouteTable
-from router.tools.board import Board, Change, State, Stop, boards
+from router.tools.board import FRAME_TIMEOUT, Board, Change, Frames, State, Stop, boards, is_part
 from router.values import payload
+from tests.tables import PROTOS
 
 
 def decoded(wire: Wire, case: str, *words: str) -> Decoded:
@@ -26,23 +29,23 @@ def board(wire: Wire, changes: list[Change]) -> Board:
 
 
 def test_a_board_without_commands_waits_for_ever(board: Board, changes: list[Change]) -> None:
-    board.look(1000.0)
-    assert (board.told(1000.0), changes) == ("no commands yet", [])
+    board.advance(1000.0)
+    assert (board.status(1000.0), changes) == ("no commands yet", [])
 
 
 def test_a_board_obeys_as_long_as_commands_come(wire: Wire, board: Board) -> None:
     for tenth in range(0, 50, 9):
         board.take(tenth / 10, decoded(wire, "plain"))
-        board.look(tenth / 10)
-    assert board.told(5.0) == "obeys commands"
+        board.advance(tenth / 10)
+    assert board.status(5.0) == "obeys commands"
 
 
 def test_a_board_left_alone_for_a_second_stops(wire: Wire, board: Board, changes: list[Change]) -> None:
     board.take(2.0, decoded(wire, "plain"))
-    board.look(2.99)
+    board.advance(2.99)
     assert board.state is State.OBEYING
-    board.look(3.0)
-    assert board.told(3.2) == "no commands for 1.2 s: stopped"
+    board.advance(3.0)
+    assert board.status(3.2) == "no commands for 1.2 s: stopped"
     board.take(4.5, decoded(wire, "plain"))
     assert [str(change) for change in changes] == [
         "2.0 s: board obeys commands",
@@ -55,24 +58,24 @@ def test_a_deadman_halts_until_it_lets_go_and_a_command_comes(wire: Wire, board:
     stop, command = decoded(wire, "every_kind", "i32=1"), decoded(wire, "plain")
     board.take(1.0, stop)
     board.take(1.1, command)
-    assert board.told(1.2) == "halted by a deadman for 0.2 s: every_kind i32=1"
+    assert board.status(1.2) == "halted by a deadman for 0.2 s: every_kind i32=1"
     board.take(1.25, stop)
     board.take(1.5, command)
-    assert board.told(1.9).startswith("halted by a deadman for 0.9 s")
+    assert board.status(1.9).startswith("halted by a deadman for 0.9 s")
     board.take(2.1, command)
-    assert board.told(2.2) == "obeys commands"
+    assert board.status(2.2) == "obeys commands"
 
 
 def test_a_deadman_that_dies_as_well_is_noticed(wire: Wire, board: Board) -> None:
     board.take(1.0, decoded(wire, "every_kind", "i32=1"))
-    board.look(2.0)
+    board.advance(2.0)
     assert board.state is State.STOPPED
 
 
 def test_what_is_neither_command_nor_stop_keeps_no_board_going(wire: Wire, board: Board) -> None:
     board.take(1.0, decoded(wire, "plain"))
     board.take(1.9, decoded(wire, "every_kind", "i32=2"))
-    board.look(2.0)
+    board.advance(2.0)
     assert board.state is State.STOPPED
 
 
@@ -87,3 +90,39 @@ def test_a_board_knows_what_the_deadmen_send_it(wire: Wire, table: RouteTable, c
     board.take(0.0, decoded(wire, "every_kind", "i32=1"))
     board.take(0.31, decoded(wire, "plain"))
     assert [change.state for change in changes] == [State.HALTED, State.OBEYING]
+
+
+def part(frame_id: int, total_count: int, index: int) -> SimpleNamespace:
+    return SimpleNamespace(frame_id=frame_id, total_count=total_count, index=index)
+
+
+def counts(frames: Frames) -> tuple[int, int, int]:
+    return frames.complete, frames.incomplete, frames.astray
+
+
+def test_a_frame_is_complete_with_its_last_part_in_any_order() -> None:
+    frames = Frames()
+    for index in (2, 0, 0, 1):
+        frames.take(0, part(7, 3, index))
+    assert counts(frames) == (1, 0, 0)
+
+
+def test_a_frame_that_lacks_a_part_is_given_up_in_time() -> None:
+    frames = Frames()
+    frames.take(5, part(7, 2, 1))
+    frames.advance(FRAME_TIMEOUT)
+    assert counts(frames) == (0, 0, 0)
+    frames.advance(5 + FRAME_TIMEOUT)
+    assert counts(frames) == (0, 1, 0)
+
+
+def test_a_part_of_no_possible_frame_is_astray() -> None:
+    frames = Frames()
+    frames.take(0, part(7, 2, 2))
+    frames.take(0, part(7, 0, 0))
+    assert counts(frames) == (0, 0, 2)
+
+
+def test_parts_are_known_by_their_fields() -> None:
+    cases = wire_of_protos(PROTOS).envelope.cases
+    assert [name for name, case in cases.items() if is_part(case.type)] == ["detected_object"]

@@ -17,13 +17,20 @@ import pytest
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.tools import doctor_host, doctor_network, doctor_ros
-from router.tools.doctor import before_start, examine
-from router.tools.doctor_host import clock, receive_buffers, recordings, shared_memory
-from router.tools.doctor_network import endpoints, interfaces, ports
-from router.tools.doctor_report import Finding, Grade
-from router.tools.doctor_ros import open_domain
-from router.tools.doctor_running import health
+from router.tools import doctor_checks
+from router.tools.doctor import before_start, examine, health
+from router.tools.doctor_checks import (
+    CheckResult,
+    Grade,
+    clock,
+    endpoints,
+    interfaces,
+    open_domain,
+    ports,
+    receive_buffers,
+    recordings,
+    shared_memory,
+)
 from tests.ports import free_port
 
 ROOT = Path(__file__).parent.parent.parent
@@ -57,7 +64,7 @@ def compiled(table: Path) -> Program:
     return program
 
 
-def texts(found: list[Finding], grade: Grade) -> list[str]:
+def texts(found: list[CheckResult], grade: Grade) -> list[str]:
     return [finding.text for finding in found if finding.grade is grade]
 
 
@@ -132,7 +139,7 @@ def test_an_address_that_a_gateway_waits_for_is_a_warning(tmp_path: Path) -> Non
 
 def test_a_port_that_systemd_keeps_is_the_services(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = compiled(table)
-    monkeypatch.setattr(doctor_network, "port_holder", lambda *_: "systemd (pid 1)")
+    monkeypatch.setattr(doctor_checks, "port_holder", lambda *_: "systemd (pid 1)")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(program.listeners[0].address)
         [found] = ports(program, running=False)
@@ -160,7 +167,7 @@ def test_an_open_ros_domain_is_a_warning(
     table: Path, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], networks: list[str], warned: str | None
 ) -> None:
     monkeypatch.setattr(socket, "if_nameindex", lambda: list(enumerate(networks, 1)))
-    monkeypatch.setattr(doctor_ros, "interface_is_up", lambda _: True)
+    monkeypatch.setattr(doctor_checks, "interface_is_up", lambda _: True)
     assert list(open_domain(compiled(table), variables)) == []  # without topics
     table.write_text(
         table.read_text().replace(
@@ -194,7 +201,7 @@ def test_an_interface_that_is_not_there_is_a_problem(table: Path, look: type) ->
 
 def test_an_interface_that_is_down_is_a_problem(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = on_interface(table, "dummy0")
-    monkeypatch.setattr(doctor_network, "interface_is_up", lambda _: False)
+    monkeypatch.setattr(doctor_checks, "interface_is_up", lambda _: False)
     [found] = interfaces(program)
     assert (found.grade, found.remedy) == (Grade.PROBLEM, "ip link set dummy0 up")
 
@@ -203,7 +210,7 @@ def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
     table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "rmem_max").write_text("65535\n")
-    monkeypatch.setattr(doctor_host, "RMEM_MAX", tmp_path / "rmem_max")
+    monkeypatch.setattr(doctor_checks, "RMEM_MAX", tmp_path / "rmem_max")
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     [found] = receive_buffers(compiled(table))
     assert found.grade is Grade.WARNING
@@ -214,7 +221,7 @@ def test_where_the_kernel_does_not_tell_of_buffers_that_is_said(
     table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As in a container on many kernels."""
-    monkeypatch.setattr(doctor_host, "RMEM_MAX", tmp_path / "rmem_max")
+    monkeypatch.setattr(doctor_checks, "RMEM_MAX", tmp_path / "rmem_max")
     assert [found.grade for found in receive_buffers(compiled(table))] == [Grade.WARNING]
 
 
@@ -321,7 +328,7 @@ def test_a_network_that_is_not_there_is_a_problem(table: Path) -> None:
 
 def test_who_answers_a_ping() -> None:
     try:
-        assert doctor_network.answering({"127.0.0.30", "127.0.0.40"}) == {"127.0.0.30", "127.0.0.40"}
+        assert doctor_checks.answering({"127.0.0.30", "127.0.0.40"}) == {"127.0.0.30", "127.0.0.40"}
     except PermissionError:
         pytest.skip("this user may not ping")
 
@@ -367,7 +374,7 @@ def seen(endpoint: str, ago: float) -> str:
     return f'router_endpoint_last_seen_timestamp_seconds{{endpoint="{endpoint}"}} {time() - ago}'
 
 
-def diagnosis(table: Path, *samples: str) -> list[Finding]:
+def diagnosis(table: Path, *samples: str) -> list[CheckResult]:
     with answering(table, *samples) as program:
         running = health(program)
     assert running is not None

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import zenoh
 
 from router.errors import TransportError, UsageError
 from router.table.model import ZenohSettings
-from router.tools.listening import Arrival
+from router.tools.gateway_sources import Arrival, Say
 
 _ANSWER_TIMEOUT = 1.0
 """Seconds in which gateways answer."""
@@ -26,7 +26,7 @@ class ZenohSource:
     lost = 0
     """Zenoh does not tell."""
 
-    def __init__(self, settings: ZenohSettings, say: Callable[[str], None]) -> None:
+    def __init__(self, settings: ZenohSettings, say: Say) -> None:
         self._key = settings.key.value
         self._say = say
         self._is_answered = False

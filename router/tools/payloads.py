@@ -1,13 +1,16 @@
-"""A rover walking a figure of eight: what its sensors and motors then say, and how often.
-
-Plain functions of time. Which messages they end up in, and what other fields hold, is `payload_model`'s.
-"""
+"""Plausible, smoothly moving values for every payload that a simulated endpoint sends."""
 
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
+
+from google.protobuf.message import Message
+
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 
 METRES_PER_DEGREE = 111_320.0
 """Of latitude, and of longitude at the equator."""
@@ -17,7 +20,7 @@ START = (51.0993, 17.0184)
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class Pose:
     """The simulated rover at one time: a figure of eight of 20 by 10 metres, walked in about two minutes.
 
     `t` seconds since the start, `north` and `east` metres, `heading` degrees clockwise from north,
@@ -34,7 +37,7 @@ class Moment:
     turn_rate: float
 
 
-def moment(t: float, epoch: float) -> Moment:
+def pose(t: float, epoch: float) -> Pose:
     """Where the rover is `t` seconds after the start."""
     rate = math.tau / 120
     phase = rate * t
@@ -44,7 +47,7 @@ def moment(t: float, epoch: float) -> Moment:
     speed = math.hypot(v_east, v_north)
     heading = math.degrees(math.atan2(v_east, v_north)) % 360
     turn_rate = math.degrees((v_north * a_east - v_east * a_north) / speed**2)
-    return Moment(t, epoch, north, east, heading, speed, turn_rate)
+    return Pose(t, epoch, north, east, heading, speed, turn_rate)
 
 
 Noise = Callable[[float], float]
@@ -53,7 +56,7 @@ Noise = Callable[[float], float]
 Values = Mapping[str, object]
 
 
-def _imu(now: Moment, noise: Noise) -> Values:
+def _imu(now: Pose, noise: Noise) -> Values:
     """Level, gravity up, turning with the walk; m/s^2, deg/s, microtesla."""
     heading = math.radians(now.heading)
     return {
@@ -70,7 +73,7 @@ def _imu(now: Moment, noise: Noise) -> Values:
     }
 
 
-def _gps(now: Moment, noise: Noise) -> Values:
+def _gps(now: Pose, noise: Noise) -> Values:
     latitude, longitude = START
     return {
         "latitude": latitude + (now.north + noise(0.02)) / METRES_PER_DEGREE,
@@ -86,18 +89,18 @@ def _gps(now: Moment, noise: Noise) -> Values:
     }
 
 
-def _ph(now: Moment, noise: Noise) -> Values:
+def _ph(now: Pose, noise: Noise) -> Values:
     value = 6.8 + 0.4 * math.sin(now.t / 15) + noise(0.01)
     return {"ph_value": value, "voltage": 2.5 - 0.177 * (value - 7), "temperature": 22 + 2 * math.sin(now.t / 60)}
 
 
-def _pressure(now: Moment, noise: Noise) -> Values:
+def _pressure(now: Pose, noise: Noise) -> Values:
     kpa = 99.8 + 0.3 * math.sin(now.t / 20) + noise(0.01)
     celsius = 23 + 1.5 * math.sin(now.t / 45)
     return {"pressure_kpa": kpa, "temperature_c": celsius, "voltage": kpa / 40, "is_calibrated": True}
 
 
-def _load_cell(now: Moment, noise: Noise) -> Values:
+def _load_cell(now: Pose, noise: Noise) -> Values:
     newtons = 4 + 3 * math.sin(now.t / 10) + noise(0.02)
     scale = 0.0005
     return {
@@ -110,26 +113,26 @@ def _load_cell(now: Moment, noise: Noise) -> Values:
     }
 
 
-def _motor(now: Moment, noise: Noise) -> Values:
+def _motor(now: Pose, noise: Noise) -> Values:
     """A wheel of 25 cm that follows the walk."""
     turns = now.speed / (math.pi * 0.25)
     return {"rpm": 60 * turns + noise(0.2), "voltage": 24 + noise(0.1), "encoder_angle": 360 * turns * now.t % 360}
 
 
-def _sensor_board(now: Moment, noise: Noise) -> Values:
+def _sensor_board(now: Pose, noise: Noise) -> Values:
     return {"board_temperature": 35 + 3 * math.sin(now.t / 60) + noise(0.1), "board_voltage": 5 + noise(0.01)}
 
 
-def _manual_drive(now: Moment, noise: Noise) -> Values:
+def _manual_drive(now: Pose, noise: Noise) -> Values:
     return {"forward_backward": round(60 + 30 * math.sin(now.t / 8)), "turn": round(40 * math.sin(now.t / 5))}
 
 
-def _manual_brake(now: Moment, noise: Noise) -> Values:
+def _manual_brake(now: Pose, noise: Noise) -> Values:
     """Off while the operator drives: a brake at the driving board is a deadman's."""
     return {"brake": False}
 
 
-MODELS: Mapping[str, Callable[[Moment, Noise], Values]] = {
+MODELS: Mapping[str, Callable[[Pose, Noise], Values]] = {
     "SensorBoardIMUInfo": _imu,
     "SensorBoardGPSInfo": _gps,
     "SensorBoardPHInfo": _ph,
@@ -169,3 +172,87 @@ USUAL_RATE = 2.0
 def usual_rate(case: str) -> float:
     """Hz, also of a payload case that nobody has described here yet."""
     return RATES.get(case, USUAL_RATE)
+
+
+NESTING = 3
+"""Messages within themselves are filled to this depth."""
+
+NAMING = ("_id", "index")
+"""How integer fields end that name a thing; they stand still."""
+
+HEALTHY = ("OPERATING", "_OK", "NO_ERROR")
+"""How the names of enum values end that say that all is well; a healthy rover stays there."""
+
+
+class PayloadModel:
+    """The values of one payload case over time. The same seed and times give the same messages."""
+
+    def __init__(self, name: str, kind: MessageType, seed: int) -> None:
+        self._name, self._kind, self._seed = name, kind, seed
+        self._random = random.Random(f"{seed}/{name}")
+        self._phases: dict[str, float] = {}
+
+    def fill(self, message: Message, now: Pose) -> None:
+        """Set every field of an empty message."""
+        self._fill(message, self._kind, now, self._name, NESTING)
+
+    def _fill(self, message: Any, kind: MessageType, now: Pose, path: str, depth: int) -> None:
+        model = MODELS.get(kind.name)
+        values = {} if model is None else model(now, self._noise)
+        for field in kind.fields:
+            if field.name in values:
+                setattr(message, field.name, values[field.name])
+            else:
+                self._fill_field(message, field, now, f"{path}.{field.name}", depth)
+
+    def _fill_field(self, message: Any, field: Field, now: Pose, path: str, depth: int) -> None:
+        member = getattr(message, field.name)
+        if isinstance(field.type, MessageType):
+            member.SetInParent()
+            if depth:
+                self._fill(member, field.type, now, path, depth - 1)
+        elif not isinstance(field.type, List):
+            setattr(message, field.name, self._value(field.type, now, path))
+        elif isinstance(field.type.element, MessageType):
+            for index in range(_length(field.type) if depth else 0):
+                self._fill(member.add(), field.type.element, now, f"{path}[{index}]", depth - 1)
+        else:
+            element = field.type.element
+            member.extend(self._value(element, now, f"{path}[{index}]") for index in range(_length(field.type)))
+
+    def _value(self, kind: Type, now: Pose, path: str) -> object:
+        """A value of a scalar type: waves of half a minute, each path with a phase of its own."""
+        wave = math.sin(now.t * math.tau / 30 + self._phase(path))
+        if isinstance(kind, Float):
+            return 10 * wave + self._noise(0.05)
+        if isinstance(kind, Int) and path.endswith(NAMING):
+            return int(self._phase(path))
+        if isinstance(kind, Int):
+            return round(50 * (wave + (0 if kind.signed else 1)))
+        if isinstance(kind, Bool):
+            return wave > 0
+        if isinstance(kind, Enum):
+            return _enum_value(kind, wave)
+        text = f"{self._name} {now.t:.1f}"[: kind.bound if isinstance(kind, (String, Bytes)) else None]
+        return text if isinstance(kind, String) else text.encode()
+
+    def _phase(self, path: str) -> float:
+        if path not in self._phases:
+            self._phases[path] = random.Random(f"{self._seed}/{path}").uniform(0, math.tau)
+        return self._phases[path]
+
+    def _noise(self, deviation: float) -> float:
+        return self._random.gauss(0.0, deviation)
+
+
+def _length(kind: List) -> int:
+    return kind.length if kind.length is not None else min(3, 3 if kind.bound is None else kind.bound)
+
+
+def _enum_value(kind: Enum, wave: float) -> int:
+    """The value that means health if the enum has one, else all of them in turn."""
+    for name, number in kind.values:
+        if name.endswith(HEALTHY):
+            return number
+    position = min(int((wave + 1) / 2 * len(kind.values)), len(kind.values) - 1)
+    return kind.values[position][1]

@@ -1,0 +1,379 @@
+"""Checks of this computer: kernel limits, clock, shared memory, network, ports, ROS 2."""
+
+from __future__ import annotations
+
+import ctypes
+import enum
+import errno
+import os
+import pwd
+import shutil
+import socket
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from datetime import datetime, timezone
+from pathlib import Path
+from time import monotonic
+from typing import NamedTuple
+
+from router.compiler.program import Program
+from router.errors import Located, StartError
+from router.net.kernel import interface_is_up, port_holder
+from router.recording.writer import recording_sizes
+from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy
+from router.table.addresses import LOCATOR, Address, BadAddressError, parse_address
+from router.table.model import Transport, bound_to
+
+
+class Grade(enum.Enum):
+    FINE = "ok"
+    WARNING = "warning"
+    PROBLEM = "problem"
+
+
+class CheckResult(NamedTuple):
+    """`about` is a word such as `ports`; `remedy` is empty where nothing has to be done."""
+
+    grade: Grade
+    about: str
+    text: str
+    remedy: str = ""
+
+
+def fine(about: str, text: str) -> CheckResult:
+    return CheckResult(Grade.FINE, about, text)
+
+
+def warning(about: str, text: str, remedy: str) -> CheckResult:
+    """Something works worse than it could, or will not work for somebody."""
+    return CheckResult(Grade.WARNING, about, text, remedy)
+
+
+def problem(about: str, text: str, remedy: str) -> CheckResult:
+    """The router does not start, or what the table wants does not happen."""
+    return CheckResult(Grade.PROBLEM, about, text, remedy)
+
+
+RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
+
+_BUILT = datetime(2025, 1, 1, tzinfo=timezone.utc)
+"""A clock that says less was never set."""
+
+_TIMEX = struct.Struct("@i4xqqqqi")
+"""The beginning of Linux's struct timex: modes, offset, freq, maxerror, esterror, status."""
+_TIMEX_BYTES = 256
+_UNSYNCHRONISED = 0x40
+
+
+def receive_buffers(program: Program) -> Iterator[CheckResult]:
+    """Whether a burst has the room that the table wants for it."""
+    if not program.listeners:
+        return
+    wanted = max(listener.receive_buffer for listener in program.listeners)
+    try:
+        allowed = int(RMEM_MAX.read_text())
+    except FileNotFoundError:  # in a container with a network of its own
+        what = "the kernel does not say here how large receive buffers may be"
+        yield warning("buffers", what, "run this on the host as well; the router's log says when it got less")
+        return
+    if wanted <= allowed or os.geteuid() == 0:
+        yield fine("buffers", f"a listener may have the {wanted} bytes that the table asks for")
+        return
+    yield warning(
+        "buffers",
+        f"the table asks for receive buffers of {wanted} bytes, the kernel allows {allowed}: bursts may be dropped",
+        f"sysctl -w net.core.rmem_max={wanted}, and for good in /etc/sysctl.d/60-rover-router.conf; the service of "
+        "`make install-service` need not be told",
+    )
+
+
+def recordings(program: Program) -> Iterator[CheckResult]:
+    """Whether there is a place for them, and room for as many as the table keeps."""
+    settings = program.table.record
+    if settings is None:
+        return
+    directory = settings.directory.resolve()
+    # os.path, since Path.exists raises where a folder above is not ours to read.
+    there = next(folder for folder in (directory, *directory.parents) if os.path.exists(folder))  # noqa: PTH110
+    if not there.is_dir():
+        remedy = "move that file away, or give `record` another directory"
+        yield problem("recordings", f"{there} is a file, and no folder", remedy)
+        return
+    if not os.access(there, os.R_OK | os.W_OK | os.X_OK):
+        yield problem(
+            "recordings",
+            f"{_user(os.geteuid())} may not write to {there}",
+            "chown it, or give `record` another directory; for a service, run deploy/install-service.sh again then",
+        )
+        return
+    kept = sum(recording_sizes(directory, program.table.path.stem).values())
+    free = shutil.disk_usage(there).free
+    if settings.continuous and kept + free < settings.keep:
+        yield warning(
+            "recordings",
+            f"the disk with {directory} has room for {(kept + free) >> 20} MiB, `keep` says {settings.keep >> 20}",
+            "a smaller `keep`: the oldest files go before the disk is full",
+        )
+    else:
+        yield fine("recordings", f"{directory}, with {free >> 20} MiB free")
+
+
+def clock(now: datetime | None = None, status: int | None = None) -> Iterator[CheckResult]:
+    """`ttl` compares stamps of computers, so their clocks have to agree. Other arguments than none are for tests."""
+    now = now or datetime.now(timezone.utc)
+    status = _clock_status() if status is None else status
+    if now < _BUILT:
+        yield problem("clock", f"it says {now:%Y-%m-%d %H:%M}", "set it: `timedatectl set-ntp true`, or `date -s`")
+    elif status is None:
+        yield warning("clock", "the kernel does not say whether it is synchronised", "look at `timedatectl`")
+    elif status & _UNSYNCHRONISED:
+        yield warning(
+            "clock",
+            "nothing synchronises it: messages of other computers may seem stale, and `ttl` then drops them",
+            "install chrony on all computers of the rover, with one of them as the others' server; `timedatectl`",
+        )
+    else:
+        yield fine("clock", "synchronised")
+
+
+def _clock_status() -> int | None:
+    """The status bits of adjtimex; None where it may not be asked."""
+    timex = ctypes.create_string_buffer(_TIMEX_BYTES)
+    if ctypes.CDLL(None).adjtimex(timex) < 0:
+        return None
+    return int(_TIMEX.unpack_from(timex)[-1])
+
+
+def shared_memory(variables: Mapping[str, str], folder: Path = SHM) -> Iterator[CheckResult]:
+    """Fast DDS shares memory with processes of its own user only, and tells nobody of what it could not hand over."""
+    owners = {each.stat().st_uid for each in folder.glob("fastrtps_port*") if not each.name.endswith("_el")}
+    if len(owners) > 1 or (owners - {os.geteuid()} and variables.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4"):
+        yield warning(
+            "ROS",
+            f"nodes of {' and '.join(sorted(map(_user, owners)))} share memory here: Fast DDS loses what goes from one "
+            "user's node to another's, without a word",
+            "run all nodes as one user, or with FASTDDS_BUILTIN_TRANSPORTS=UDPv4 in their environment, as the service "
+            "of the router has it; `fastdds shm clean` removes what ended nodes have left",
+        )
+
+
+def _user(number: int) -> str:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return f"user {number}"
+
+
+PATIENCE = 1.0
+"""Seconds for an answer to a ping; a board answers within milliseconds."""
+
+_ECHO, _ECHO_REPLY = 8, 0
+_ICMP = struct.Struct("!BBHHH")
+
+_KEEPS = "systemd"
+"""The name of the process that keeps the ports of an installed service."""
+
+
+def ports(program: Program, *, running: bool, with_listeners: bool = True) -> Iterator[CheckResult]:
+    """Whether the router can have its ports. With a router `running` they are taken, and should be."""
+    if running:
+        yield fine("ports", "the running router has them")
+        return
+    wanted: list[tuple[str, Address, str | None, str]] = []
+    wanted += [("tcp", found.value, None, what) for found, what in _pages(program) if found is not None]
+    gateways = [(protocol, address, None, what) for protocol, address, what in _gateways(program)]
+    wanted += gateways
+    if with_listeners:
+        wanted += [("udp", each.address, each.interface, f"listener '{each.name}'") for each in program.listeners]
+    refused = [finding for each in wanted for finding in _port(*each, waits=each in gateways)]
+    free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
+    yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])
+
+
+def interfaces(program: Program) -> Iterator[CheckResult]:
+    """Whether the network interfaces of listeners are there and up."""
+    for listener in program.listeners:
+        if listener.interface is None:
+            continue
+        is_up = interface_is_up(listener.interface)
+        about = f"listener '{listener.name}': network interface {listener.interface}"
+        if is_up is None:
+            remedy = "`ip link` lists those there are; a tunnel has to be up before the router starts"
+            yield problem("interfaces", f"{about} does not exist", remedy)
+        elif is_up:
+            yield fine("interfaces", f"{about} is up")
+        else:
+            yield problem("interfaces", f"{about} is down: nothing comes in", f"ip link set {listener.interface} up")
+
+
+def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
+    return (program.table.metrics, "metrics.address"), (program.table.foxglove, "foxglove.address")
+
+
+def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
+    """What gateways bind. Of Zenoh's locators those of tcp; a name or IPv6 in one is not looked at."""
+    for gateway in program.table.gateways.values():
+        what = f"gateway '{gateway.name}'"
+        if gateway.receive is not None:
+            yield "udp", gateway.receive.value, what
+        if gateway.address is not None and gateway.transport.value in (Transport.TCP, Transport.WEBSOCKET):
+            yield "tcp", gateway.address.value, what
+        for locator in gateway.zenoh.listen if gateway.zenoh is not None else ():
+            if (found := LOCATOR.fullmatch(locator)) and found["protocol"] == "tcp/":
+                with suppress(BadAddressError):
+                    yield "tcp", parse_address(found["address"]), what
+
+
+def _port(protocol: str, address: Address, interface: str | None, what: str, waits: bool) -> Iterator[CheckResult]:
+    """`waits`: whether the router waits for an address that no interface has yet."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM) as probe:
+        if protocol == "tcp":
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as a server has it
+        try:
+            if interface is not None:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
+            probe.bind(address)
+        except OSError as error:
+            if error.errno == errno.ENODEV:  # `interfaces` tells
+                return
+            yield from _refused(protocol, address, what, error, waits)
+
+
+def _refused(protocol: str, address: Address, what: str, error: OSError, waits: bool) -> Iterator[CheckResult]:
+    if error.errno == errno.EADDRNOTAVAIL:
+        remedy = "give the interface that address (`ip address`), or have the table say 0.0.0.0"
+        grade = warning if waits else problem
+        yield grade("ports", f"{what}: no interface of this computer has {address.host}", remedy)
+        return
+    if error.errno != errno.EADDRINUSE:
+        yield problem("ports", f"{what} cannot use {address}: {error.strerror}", "choose another port")
+        return
+    holder = port_holder(protocol, address.port)
+    if holder.startswith(_KEEPS):
+        yield fine(
+            "ports", f"{what}: {holder} keeps {address} for the service; start that: systemctl start rover-router"
+        )
+        return
+    yield problem(
+        "ports",
+        f"{what}: {holder} has {protocol} port {address.port}",
+        "stop it, or choose another port; root is told who it is, and `systemctl status` tells of which service",
+    )
+
+
+def endpoints(program: Program) -> Iterator[CheckResult]:
+    """Whether a network leads to each endpoint, and whether there is somebody."""
+    reachable = {}
+    for endpoint in program.table.endpoints.values():
+        address = endpoint.address.value
+        if (why := _no_way(address)) is not None:
+            remedy = "does `ip address` show an interface in its network? is the cable in?"
+            yield problem("endpoints", f"{endpoint.name}: no network leads to {address.host} ({why})", remedy)
+        else:
+            reachable[endpoint.name] = address.host
+    try:
+        answered = answering(set(reachable.values()))
+    except PermissionError:
+        remedy = "run this as root, or: sysctl -w net.ipv4.ping_group_range='0 2147483647'"
+        yield warning("endpoints", "this user may not ping, so nobody knows whether they are there", remedy)
+        return
+    for name, host in reachable.items():
+        if host in answered:
+            yield fine("endpoints", f"{name}: {host} answers a ping")
+        else:
+            remedy = "is it on, and is its cable in? Some boards never answer a ping"
+            yield warning("endpoints", f"{name}: {host} does not answer a ping", remedy)
+
+
+def _no_way(address: Address) -> str | None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(address)  # sends nothing
+        except OSError as error:
+            return error.strerror
+    return None
+
+
+def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
+    """Those of `hosts` that answer a ping in time. Raises PermissionError where this user may not ask."""
+    answered: set[str] = set()
+    with _open_ping() as pinging:
+        request = _request(os.getpid() & 0xFFFF)
+        for host in hosts:
+            with suppress(OSError):  # no way there after all
+                pinging.sendto(request, (host, 0))
+        deadline = monotonic() + patience
+        while answered != hosts and (left := deadline - monotonic()) > 0:
+            pinging.settimeout(left)
+            try:
+                reply, (host, _) = pinging.recvfrom(1500)
+            except OSError:  # a timeout is one
+                continue
+            if pinging.type == socket.SOCK_RAW:
+                reply = reply[(reply[0] & 0xF) * 4 :]  # what follows the IP header
+            if reply[:1] == bytes([_ECHO_REPLY]):
+                answered.add(host)
+    return answered & hosts
+
+
+def _open_ping() -> socket.socket:
+    """Of the kind that everybody may have where the system allows that, else of the kind that root may have."""
+    try:
+        return socket.socket(socket.AF_INET, socket.SOCK_DGRAM, socket.IPPROTO_ICMP)
+    except PermissionError:
+        return socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_ICMP)
+
+
+def _request(identity: int) -> bytes:
+    """With a checksum, which the kernel puts in anew where the socket is not raw."""
+    total = (_ECHO << 8) + identity + 1
+    return _ICMP.pack(_ECHO, 0, 0xFFFF - (total % 0xFFFF), identity, 1)
+
+
+def ros(program: Program) -> Iterator[CheckResult]:
+    plans = (*program.publishers, *program.subscriptions)
+    if not plans and not program.gateways:
+        return
+    found = [problem("ROS", what, remedy) for what, remedy in obstacles(os.environ)]
+    yield from found
+    if found:  # to load it would end this process
+        return
+    try:
+        from router.ros.installation import middleware, usable_class
+    except ImportError as error:
+        yield problem("ROS", f"the table has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
+        return
+    wrong: dict[str, dict[str, str]] = {}
+    for plan in plans:
+        try:
+            usable_class(plan.type_name, plan.definitions)
+        except StartError as error:
+            wrong.setdefault(plan.type_name.partition("/")[0], {})[plan.type_name] = str(error)
+    for package, errors in wrong.items():
+        remedy = ros_package_remedy(package)
+        what = next(iter(errors.values())).removesuffix(f"; {remedy}")
+        more = f"; and {len(errors) - 1} more of its types" if len(errors) > 1 else ""
+        yield problem("ROS", f"{what}{more}", remedy)
+    if not wrong:
+        domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+        types = len({plan.type_name for plan in plans})
+        yield fine("ROS", f"{middleware()} in domain {domain}, and the {types} message types of the table")
+
+
+def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[CheckResult]:
+    """Whether whoever reaches this computer by a network is in the ROS domain without having to look for it."""
+    if not (program.publishers or program.subscriptions or program.gateways):
+        return
+    found_everywhere = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "") in ("", "SUBNET", "SYSTEM_DEFAULT")
+    if variables.get("ROS_DOMAIN_ID", "") not in ("", "0") or not found_everywhere:
+        return
+    networks = [name for _, name in socket.if_nameindex() if name != "lo" and interface_is_up(name)]
+    if networks:
+        yield warning(
+            "ROS",
+            "whoever is in a network of this computer is in the ROS domain, and can publish commands: it is domain 0, "
+            f"and nodes are looked for by {', '.join(networks)}",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST where all nodes are on this computer, as the service has it by "
+            "itself; else a domain of your own, and docs/security.md",
+        )

@@ -1,0 +1,250 @@
+"""Packets and documents of a gateway taken apart, and printed: as a line with the values, or as JSON."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple, Union
+
+from router.gateway.compression import decompress
+from router.gateway.packets import HEAD, Packet, PacketError, unpack
+from router.values import SHOWN_ELEMENTS, Tree, list_text, one_line, plain_text, words
+
+MOST_TEXT = 256 << 20
+"""Bytes of the longest message that a gateway can be told to send."""
+
+_MOST_DEEP = 64
+"""Lists and objects within each other. Messages have a few."""
+
+
+class Shape(NamedTuple):
+    """What a schema says of a field; `members` of a message, by name."""
+
+    type_name: str
+    is_array: bool
+    members: Mapping[str, Shape]
+
+
+class Message(NamedTuple):
+    """A topic's message as received. In packets every single value is a list of one: `is_wrapped`.
+
+    `time` is the sender's wall clock, seconds since 1970. `shape` is None before the schema came.
+    """
+
+    time: float
+    topic: str
+    type_name: str
+    data: Mapping[str, Any]
+    is_wrapped: bool
+    shape: Mapping[str, Shape] | None = None
+
+
+class Schema(NamedTuple):
+    """The schema of a type, as received and taken apart. `topic` is empty in documents."""
+
+    time: float
+    topic: str
+    type_name: str
+    schema: Mapping[str, Any]
+    shape: Mapping[str, Shape]
+
+
+class Remark(NamedTuple):
+    """A document that is neither: which topics there are, what is taken, what was refused."""
+
+    document: Mapping[str, Any]
+
+
+class Problem(NamedTuple):
+    """Bytes that mean nothing, and why."""
+
+    reason: str
+    data: bytes
+
+
+Heard = Union[Message, Schema, Remark, Problem]
+
+
+def read(data: bytes) -> Message | Schema | Remark:
+    """What a packet or document says. Raises PacketError."""
+    # At a packet's ninth byte is 0 or 1, which no text has.
+    if data[:1] == b"{" and (len(data) < HEAD.size or data[HEAD.size - 1] > 1):
+        return _document(_object(data))
+    return _packet(unpack(data))
+
+
+def _packet(packet: Packet) -> Message | Schema:
+    text = decompress(packet.payload, MOST_TEXT) if packet.is_compressed else packet.payload
+    content = _object(text)
+    if _is_schema(content):
+        return Schema(packet.time, packet.topic, packet.type_name, content, shape(content))
+    return Message(packet.time, packet.topic, packet.type_name, content, is_wrapped=True)
+
+
+def _is_schema(content: Mapping[str, Any]) -> bool:
+    """Nothing else tells. In a message these would be lists, all three."""
+    return content.keys() >= {"name", "namespace", "fields"} and isinstance(content["name"], str)
+
+
+def _document(document: Mapping[str, Any]) -> Message | Schema | Remark:
+    op = document.get("op")
+    if not isinstance(op, str):
+        raise PacketError("a document that does not say what it is")
+    if op not in {"data", "schema"}:
+        return Remark(document)
+    time, type_name = document.get("time"), document.get("type")
+    if not isinstance(time, (int, float)) or not isinstance(type_name, str):
+        raise PacketError("a document without time or type")
+    if op == "schema":
+        return Schema(time, "", type_name, document.get("schema", {}), shape(document.get("schema")))
+    topic, data = document.get("topic"), document.get("data")
+    if not isinstance(topic, str) or not isinstance(data, dict):
+        raise PacketError("a document without topic or data")
+    return Message(time, topic, type_name, data, is_wrapped=False)
+
+
+def _object(text: bytes) -> dict[str, Any]:
+    try:
+        value = json.loads(text.decode())
+    except (ValueError, RecursionError) as error:
+        raise PacketError(f"no JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise PacketError("JSON that is no object")
+    _check_depth(value)
+    return value
+
+
+def _check_depth(value: Mapping[str, Any]) -> None:
+    level: list[Any] = [value]
+    for _ in range(_MOST_DEEP):
+        holders = (holder.values() if isinstance(holder, dict) else holder for holder in level)
+        level = [child for holder in holders for child in holder if isinstance(child, (dict, list))]
+        if not level:
+            return
+    raise PacketError(f"JSON with more than {_MOST_DEEP} levels")
+
+
+def shape(schema: object) -> Mapping[str, Shape]:
+    """The fields of `{"fields": [{"name", "is_array", "type", "subtype"}]}`. Raises PacketError."""
+    try:
+        return {field["name"]: _field(field) for field in schema["fields"]}  # type: ignore[index]
+    except (KeyError, TypeError) as error:
+        raise PacketError(f"no schema: {error!r}") from error
+
+
+def _field(field: Mapping[str, Any]) -> Shape:
+    if field["type"] != "message":
+        return Shape(str(field["type"]), bool(field["is_array"]), {})
+    subtype = field["subtype"]
+    return Shape(str(subtype["name"]), bool(field["is_array"]), shape(subtype))
+
+
+Piece = tuple[str, str]
+"""Text, and a style of rich."""
+
+_LONGEST_TEXT = 120
+"""Characters of a string."""
+
+_MOST_BYTES = 60
+"""Of what is no packet."""
+
+_NO_SHAPE: Mapping[str, Shape] = {}
+
+
+def json_line(heard: Heard) -> str:
+    """One JSON object, of what was received as it was received."""
+    return json.dumps(_as_json(heard), separators=(",", ":"))
+
+
+def _as_json(heard: Heard) -> Mapping[str, object]:
+    if isinstance(heard, Remark):
+        return heard.document
+    if isinstance(heard, Problem):
+        return {"problem": heard.reason, "bytes": len(heard.data), "hex": heard.data.hex()}
+    if isinstance(heard, Message):
+        return {"time": heard.time, "topic": heard.topic, "type": heard.type_name, "data": heard.data}
+    topic = {"topic": heard.topic} if heard.topic else {}
+    return {"time": heard.time, **topic, "type": heard.type_name, "schema": heard.schema}
+
+
+def pieces(heard: Heard) -> list[Piece]:
+    """`12:00:00.123 /imu/data sensor_msgs/msg/Imu x=0.01`."""
+    if isinstance(heard, Message):
+        values = _line(words(_tree(heard.data, heard.shape or _NO_SHAPE, heard.is_wrapped)))
+        return [(_clock(heard.time), "dim"), _name(heard.topic, "green"), _name(heard.type_name, "dim"), (values, "")]
+    if isinstance(heard, Schema):
+        fields = _line(f"{name}:{_type_text(shape)}" for name, shape in heard.shape.items())
+        where = [_name(heard.topic, "green")] if heard.topic else []
+        return [(_clock(heard.time), "dim"), *where, _name(heard.type_name, "dim"), (f"schema {fields}", "cyan")]
+    if isinstance(heard, Problem):
+        return [("undecodable", "red"), (f"({heard.reason}):", ""), (_bytes_text(heard.data), "")]
+    return [(_line(_remark(heard.document)), "yellow" if heard.document["op"] == "rejected" else "dim")]
+
+
+def _remark(document: Mapping[str, Any]) -> Iterable[str]:
+    """Of topics their names."""
+    if not isinstance(rows := document.get("topics"), list):
+        return words(_tree(document, _NO_SHAPE, is_wrapped=False))
+    names = (str(row["topic"]) for row in rows if isinstance(row, dict) and "topic" in row)
+    return [document["op"], f"{len(rows)}:", *names]
+
+
+def _clock(seconds: float) -> str:
+    """Local time of day; a sender's clock may say anything."""
+    try:
+        return f"{dt.datetime.fromtimestamp(seconds).astimezone():%H:%M:%S.%f}"[:-3]
+    except (OverflowError, OSError, ValueError):
+        return f"time={seconds}"
+
+
+def _bytes_text(data: bytes) -> str:
+    rest = f"...({len(data)} bytes)" if len(data) > _MOST_BYTES else ""
+    return data[:_MOST_BYTES].hex() + rest or "no bytes"
+
+
+def _name(text: str, style: str) -> Piece:
+    return one_line([text]), style
+
+
+def _line(listed: Iterable[str]) -> str:
+    return one_line(listed, empty="(empty)")
+
+
+def _type_text(shape: Shape) -> str:
+    return shape.type_name + "[]" * shape.is_array
+
+
+def _tree(values: Mapping[str, Any], shapes: Mapping[str, Shape], is_wrapped: bool) -> Mapping[str, Tree]:
+    """A single value is taken out of its list."""
+    tree: dict[str, Tree] = {}
+    for name, value in values.items():
+        shape = shapes.get(name)
+        if is_wrapped and shape is not None and not shape.is_array and isinstance(value, list) and len(value) == 1:
+            [value] = value  # noqa: PLW2901
+        if isinstance(value, list) and any(isinstance(element, dict) for element in value):
+            for index, element in enumerate(value[:SHOWN_ELEMENTS]):
+                tree[f"{name}[{index}]"] = _value(element, shape, is_wrapped)
+            if len(value) > SHOWN_ELEMENTS:
+                tree[name] = f"...({len(value)})"
+        else:
+            tree[name] = _value(value, shape, is_wrapped)
+    return tree
+
+
+def _value(value: Any, shape: Shape | None, is_wrapped: bool) -> Tree:
+    if isinstance(value, dict):
+        return _tree(value, shape.members if shape is not None else _NO_SHAPE, is_wrapped)
+    if isinstance(value, list):
+        return list_text((_text(element, shape) for element in value[:SHOWN_ELEMENTS]), len(value), SHOWN_ELEMENTS)
+    return _text(value, shape)
+
+
+def _text(value: Any, shape: Shape | None) -> str:
+    if isinstance(value, str):
+        return _cut(value)
+    return plain_text(value, 32 if shape is not None and shape.type_name == "float32" else 64)
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}...({len(text)})"

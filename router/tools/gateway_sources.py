@@ -1,0 +1,338 @@
+"""Where packets and documents of a gateway come from: UDP, TCP and WebSocket; `zenoh_source` has Zenoh."""
+
+from __future__ import annotations
+
+import re
+import select
+import socket
+import struct
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from typing import NamedTuple, Protocol
+from urllib.parse import parse_qs
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.sync.client import ClientConnection, connect
+
+from router.errors import Located, SourceSpan, UsageError, did_you_mean
+from router.gateway.packets import Packet, PacketError, pack
+from router.net.kernel import ask_for_receive_buffer, drops
+from router.table.addresses import Address
+from router.table.model import GatewayFormat, ZenohSettings
+from router.table.units import LARGEST_DATAGRAM
+from router.tools import places
+from router.tools.gateway_messages import MOST_TEXT
+
+Say = Callable[[str], None]
+
+
+class Arrival(NamedTuple):
+    """A datagram, packet or document. Fragments and schemas count for those of the same `sender` alone."""
+
+    data: bytes
+    sender: Hashable
+
+
+class Source(Protocol):
+    """Where bytes come from. `place` says it in words; `lost` counts what is known to be missing."""
+
+    place: str
+
+    @property
+    def lost(self) -> int: ...
+
+    def ask(self) -> None:
+        """Ask for schemas and latest values, where a gateway does not send them unasked."""
+
+    def arrivals(self, timeout: float) -> Sequence[Arrival]:
+        """What came in, after at most so many seconds."""
+
+    def close(self) -> None: ...
+
+
+_LENGTH = struct.Struct("<I")
+
+LONGEST = MOST_TEXT + (1 << 20)
+"""Bytes of a packet or document. Any text that begins with `{` would be a longer packet."""
+
+
+class Splitter:
+    """`form` None: the first bytes of the connection tell."""
+
+    def __init__(self, form: GatewayFormat | None) -> None:
+        self._form = form
+        self._buffer = bytearray()
+        self._searched = 0
+
+    @property
+    def unfinished(self) -> int:
+        """Bytes of what has not come to its end."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """What is whole now. Raises PacketError when there is no telling where the next begins."""
+        self._buffer += data
+        if self._form is None and len(self._buffer) >= _LENGTH.size:
+            is_text = self._buffer.startswith(b"{") and self._length() > LONGEST
+            self._form = GatewayFormat.JSON_LINES if is_text else GatewayFormat.GATEWAY_V1
+        if self._form is GatewayFormat.JSON_LINES:
+            yield from self._lines()
+        elif self._form is GatewayFormat.GATEWAY_V1:
+            yield from self._packets()
+
+    def _length(self) -> int:
+        [length] = _LENGTH.unpack_from(self._buffer)
+        return int(length)
+
+    def _packets(self) -> Iterator[bytes]:
+        while len(self._buffer) >= _LENGTH.size:
+            end = _LENGTH.size + self._length()
+            if end > LONGEST:
+                raise PacketError(f"a packet of {end - _LENGTH.size} bytes")
+            if len(self._buffer) < end:
+                return
+            yield bytes(self._buffer[_LENGTH.size : end])
+            del self._buffer[:end]
+
+    def _lines(self) -> Iterator[bytes]:
+        while (end := self._buffer.find(b"\n", self._searched)) >= 0:
+            yield bytes(self._buffer[:end])
+            del self._buffer[: end + 1]
+            self._searched = 0
+        self._searched = len(self._buffer)
+        if self._searched > LONGEST:
+            raise PacketError(f"a line of more than {LONGEST} bytes")
+
+
+_TRY_AGAIN = 0.5
+"""Seconds between two attempts to connect."""
+
+CONNECT_TIMEOUT = 2.0
+
+
+class ConnectedSource(ABC):
+    """Every connection is another sender: a gateway begins anew with its schemas."""
+
+    lost = 0
+    """TCP loses nothing; what is unfinished when a connection breaks is told."""
+
+    def __init__(self, protocol: str, address: Address, say: Say) -> None:
+        self.place = f"{protocol} {address}"
+        self._address = address
+        self._say = say
+        self._connected = ExitStack()
+        self._number = 0  # of the connection
+        self._is_connected = False
+        self._is_told = False
+        self._next_attempt = 0.0
+
+    def ask(self) -> None:  # noqa: B027 - there is nothing to ask
+        """A new client gets all schemas unasked."""
+
+    def arrivals(self, timeout: float) -> Sequence[Arrival]:
+        if not self._is_connected and not self._connect(timeout):
+            return ()
+        return [Arrival(data, self._number) for data in self._receive(timeout)]
+
+    def close(self) -> None:
+        self._connected.close()
+
+    @abstractmethod
+    def _open(self, opened: socket.socket, connected: ExitStack) -> None:
+        """Begin to receive; `connected` closes what is entered into it. Raises OSError."""
+
+    @abstractmethod
+    def _receive(self, timeout: float) -> Sequence[bytes]:
+        """What has come in; calls `_lose` when the connection has ended."""
+
+    def _connect(self, timeout: float) -> bool:
+        if (rest := self._next_attempt - time.monotonic()) > 0:
+            time.sleep(min(rest, timeout))
+            return False
+        try:
+            opened = socket.create_connection(self._address, CONNECT_TIMEOUT)
+            self._connected.enter_context(opened)
+            self._open(opened, self._connected)
+        except OSError as error:
+            self._lose(f"cannot be reached ({error.strerror or error})")
+            return False
+        if self._number or self._is_told:
+            self._say(f"{self.place} is connected")
+        self._is_connected, self._is_told = True, False
+        self._number += 1
+        return True
+
+    def _lose(self, why: str) -> None:
+        """Says so once, until there is a connection again."""
+        self._connected.close()
+        if not self._is_told:
+            self._say(f"{self.place} {why}; trying again")
+        self._is_connected, self._is_told = False, True
+        self._next_attempt = time.monotonic() + _TRY_AGAIN
+
+
+_READ_SIZE = 1 << 18
+
+
+class TcpSource(ConnectedSource):
+    """`form` is gateway_v1 or json_lines; None to see from the first bytes."""
+
+    def __init__(self, address: Address, form: GatewayFormat | None, say: Say) -> None:
+        super().__init__("tcp", address, say)
+        self._form = form
+
+    def _open(self, opened: socket.socket, connected: ExitStack) -> None:
+        self._socket = opened
+        self._splitter = Splitter(self._form)
+
+    def _receive(self, timeout: float) -> Sequence[bytes]:
+        self._socket.settimeout(timeout)
+        received: list[bytes] = []
+        try:
+            data = self._socket.recv(_READ_SIZE)
+            for one in self._splitter.feed(data):
+                received.append(one)  # noqa: PERF402 - what is whole counts, though the next be none
+        except TimeoutError:
+            return ()
+        except (OSError, PacketError) as error:
+            self._lose(f"is left ({error})")
+        else:
+            if not data:
+                unfinished = self._splitter.unfinished
+                self._lose(f"has gone, after {unfinished} bytes of a message" if unfinished else "has gone")
+        return received
+
+
+_CLOSE_TIMEOUT = 1.0
+
+
+class WebsocketSource(ConnectedSource):
+    """A text message holds documents, one a line; a binary message is a packet."""
+
+    def __init__(self, address: Address, say: Say) -> None:
+        super().__init__("websocket", address, say)
+
+    def _open(self, opened: socket.socket, connected: ExitStack) -> None:
+        try:
+            self._websocket: ClientConnection = connected.enter_context(
+                connect(
+                    f"ws://{self._address}/",
+                    sock=opened,
+                    compression=None,
+                    max_size=LONGEST,
+                    open_timeout=CONNECT_TIMEOUT,
+                    close_timeout=_CLOSE_TIMEOUT,
+                )
+            )
+        except InvalidHandshake as error:
+            raise OSError(f"it is no websocket: {error}") from error
+
+    def _receive(self, timeout: float) -> Sequence[bytes]:
+        try:
+            message = self._websocket.recv(timeout)
+        except TimeoutError:
+            return ()
+        except ConnectionClosed as error:
+            self._lose(f"has gone ({error})")
+            return ()
+        return message.encode().split(b"\n") if isinstance(message, str) else (bytes(message),)
+
+
+_RECEIVE_BUFFER = 4 << 20
+"""Bytes that the kernel is asked to keep while we are busy; it may grant less."""
+
+_MOST_AT_ONCE = 1000
+
+
+class UdpSource:
+    """Bound to `address`. `gateway` is where schemas are asked for, if they are. Raises UsageError."""
+
+    def __init__(self, address: Address, gateway: Address | None, say: Say) -> None:
+        self._socket = places.open_udp(address, "listen")
+        ask_for_receive_buffer(self._socket, _RECEIVE_BUFFER)
+        self._gateway = gateway
+        self._say = say
+        self.place = f"udp {Address(*self._socket.getsockname())}"
+
+    @property
+    def lost(self) -> int:
+        """Datagrams that the kernel threw away because we were too slow."""
+        return drops(self._socket)
+
+    def ask(self) -> None:
+        """An empty packet without a type asks for all schemas. It comes from the port that they are to be sent to."""
+        if self._gateway is None:
+            return
+        request = Packet(time.time(), is_compressed=False, topic="", type_name="", payload=b"")
+        try:
+            self._socket.sendto(pack(request), self._gateway)
+        except OSError as error:
+            self._say(f"cannot ask {self._gateway}: {error.strerror}")
+
+    def arrivals(self, timeout: float) -> Sequence[Arrival]:
+        """All that is there at once: a large message comes as more datagrams than the kernel keeps."""
+        found: list[Arrival] = []
+        if select.select([self._socket], [], [], timeout)[0]:
+            with suppress(BlockingIOError):
+                while len(found) < _MOST_AT_ONCE:
+                    found.append(Arrival(*self._socket.recvfrom(LARGEST_DATAGRAM)))
+        return found
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+_SPAN = SourceSpan("command line", 1, 1)
+_FORMS = "[udp://][HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?connect=LOCATOR"
+
+
+def open_source(text: str, form: GatewayFormat | None, gateway: Address | None, say: Say) -> Source:
+    """`form` is of tcp alone, `gateway` (to ask for schemas) of udp. Raises UsageError and TransportError."""
+    scheme, colon, rest = text.rpartition("://")
+    scheme = scheme if colon else "udp"
+    if form is not None and scheme != "tcp":
+        raise UsageError("--format belongs to tcp://; elsewhere what arrives tells")
+    if gateway is not None and scheme != "udp":
+        raise UsageError("--ask belongs to udp; elsewhere schemas come unasked")
+    match scheme:
+        case "udp":
+            return UdpSource(_local(rest), gateway, say)
+        case "tcp":
+            return TcpSource(remote(rest), form, say)
+        case "ws":
+            return WebsocketSource(remote(rest.removesuffix("/")), say)
+        case "zenoh":
+            from router.tools.zenoh_source import ZenohSource
+
+            return ZenohSource(_zenoh(rest), say)
+    raise UsageError(f"'{text}' is not {_FORMS}")
+
+
+def remote(text: str) -> Address:
+    """`HOST:PORT`. Raises UsageError."""
+    if not re.fullmatch(r".+:[0-9]+", text):
+        raise UsageError(f"'{text}' is not HOST:PORT")
+    return places.destination(text, None)
+
+
+def _local(text: str) -> Address:
+    if not re.fullmatch(r"(?:.+:)?[0-9]+", text):
+        raise UsageError(f"'{text}' is not {_FORMS}")
+    return places.listening(text, None)
+
+
+def _zenoh(text: str) -> ZenohSettings:
+    """`rovers/loki_1?mode=client&connect=tcp/10.0.0.1:7447`; several `connect` and `listen` are possible."""
+    key, _, query = text.partition("?")
+    options = parse_qs(query, keep_blank_values=True)
+    known = ("mode", "connect", "listen")
+    if unknown := [name for name in options if name not in known]:
+        raise UsageError(f"zenoh has no option '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
+    return ZenohSettings(
+        key=Located(key, _SPAN),
+        mode=options.get("mode", ["peer"])[-1],
+        connect=tuple(options.get("connect", ())),
+        listen=tuple(options.get("listen", ())),
+    )

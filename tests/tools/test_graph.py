@@ -1,0 +1,94 @@
+"""The picture of a table is one sound file with a box and a line for everything, and refers to nothing else."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from router.compiler import check_table
+from router.observe.route_map import nodes_and_edges, route_map
+from router.table.model import RouteTable
+from router.tools.graph import dot, mermaid, svg
+from tests.tables import PROTOS, ROUTES
+
+DOT = shutil.which("dot")
+SVG = "{http://www.w3.org/2000/svg}"
+HOSTILE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen: {{all: {{address: "127.0.0.1:5000"}}}}
+endpoints: {{a: {{address: "127.0.0.1:6000", kind: tool}}}}
+routes:
+  imu_info:
+    source: any
+    destinations: [{{endpoint: a, when: "str(state) != '\\"#<b>&lt;|\\\\\\\\'\\n and accel_x > 1\\n", max_rate: 5 Hz}}]
+  gps_info: {{ignore: 'because "x" < y & so'}}
+"""
+
+
+@pytest.fixture(params=["rover.yaml", "legacy.yaml", "hostile"], scope="module")
+def table(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RouteTable:
+    path = ROUTES / request.param
+    return checked_table(tmp_path_factory.mktemp("hostile") / "hostile.yaml" if request.param == "hostile" else path)
+
+
+def checked_table(path: Path) -> RouteTable:
+    if path.stem == "hostile":
+        path.write_text(HOSTILE.format(protos=PROTOS))
+    table = check_table(path).table
+    assert table is not None
+    return table
+
+
+def test_the_picture_has_a_box_and_a_line_for_everything(table: RouteTable) -> None:
+    drawing = route_map(table)
+    picture = ET.fromstring(svg(drawing, 'a "title" <&>'))  # noqa: S314 - our own
+    assert len(list(picture.iter(f"{SVG}rect"))) == len(drawing.boxes)
+    assert len(list(picture.iter(f"{SVG}path"))) == len(drawing.curves)
+    said = "".join(picture.itertext())
+    assert all(box.node.name in said and box.node.about in said for box in drawing.boxes)
+    assert all(curve.edge.about in said for curve in drawing.curves)
+
+
+def test_it_refers_to_nothing_outside_itself(table: RouteTable) -> None:
+    text = svg(route_map(table), "title").replace("http://www.w3.org/2000/svg", "")
+    for outside in ("http:", "https:", "url(", "@import", "href", "<script"):
+        assert outside not in text
+
+
+def test_browsers_that_darken_pages_on_their_own_leave_it_alone(table: RouteTable) -> None:
+    """They would make its dark boxes light, and keep the light text in them."""
+    assert "color-scheme: light dark" in svg(route_map(table), "title").replace("prefers-color-scheme", "")
+
+
+@pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")
+def test_dot_draws_every_node_and_edge(table: RouteTable) -> None:
+    text = dot(table, 'with "quotes" \\')
+    drawn = subprocess.run([str(DOT), "-Tplain"], input=text, capture_output=True, text=True, check=True)
+    nodes, edges = nodes_and_edges(table)
+    assert drawn.stderr == ""
+    assert drawn.stdout.count("\nnode ") == len(nodes)
+    assert drawn.stdout.count("\nedge ") == len(edges)
+
+
+def test_mermaid_has_a_line_for_every_node_and_edge(table: RouteTable) -> None:
+    nodes, edges = nodes_and_edges(table)
+    lines = mermaid(table).splitlines()
+    assert lines[0] == "flowchart LR"
+    drawn = [line for line in lines if re.fullmatch(r'    n\d+(\[|\(\(|\(\[)"[^"]*"(\]|\)\)|\]\))', line)]
+    links = [line for line in lines if re.fullmatch(r'  n\d+ -->(\|"[^"#<>]*"\|)? n\d+', line)]
+    assert (len(drawn), len(links)) == (len(nodes), len(edges))
+    assert len(lines) == 1 + 2 * 3 + len(nodes) + len(edges)
+
+
+@pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")
+def test_a_condition_is_shown_as_it_is_written_on_one_line(tmp_path: Path) -> None:
+    table = checked_table(tmp_path / "hostile.yaml")
+    drawn = subprocess.run([str(DOT), "-Tsvg"], input=dot(table, ""), capture_output=True, text=True, check=True)
+    assert "#&lt;b&gt;&amp;lt;|" in drawn.stdout
+    assert "and accel_x &gt; 1, at most 5 Hz" in drawn.stdout.replace("&#160;", " ").replace("&#45;", "-")
