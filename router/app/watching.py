@@ -12,7 +12,7 @@ from router.errors import StartError
 from router.log import logger
 from router.net.udp import Listener
 from router.table.model import RouteTable
-from router.types.proto_folder import walk
+from router.types.proto_files import walk
 
 PERIOD = 0.5
 """Seconds between two checks. A change is acted on once the next check finds the same: editors write in pieces."""

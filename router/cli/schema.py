@@ -1,7 +1,6 @@
 """`router schema lock`: record the field numbers of the `.proto` files, so that none is ever reused.
 
-Adds what is new and refuses everything else that is not accepted by name; comparing without writing is part of
-`router validate`.
+Adds what is new and refuses every other change that is not accepted by name. `router validate` compares as well.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from router.cli.findings import plural, print_findings
 from router.cli.tool_options import explained
 from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, shown_path
 from router.table import load_table
-from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings
-from router.types.lock_file import short_name
+from router.table.model import EnvelopeSettings
+from router.types.lock_file import ENVELOPE, ONEOF, short_name
 
 if TYPE_CHECKING:
     from router.types.lock import Conflict
@@ -48,20 +47,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 @explained
 def run(args: argparse.Namespace) -> int:
     """Raises TableError for broken `.proto` files and a broken lock file."""
-    from router.types.lock import conflicts, extended_lock
+    from router.types.lock import LockComparison
     from router.types.lock_file import read_lock, write_lock
     from router.types.protobuf import find_envelope, load_protos, lock_path
 
     settings = _settings(args)
-    path = lock_path(settings)
+    path = lock_path(settings.protos, settings.lock)
     if is_installed(path):
         what = f"{path} belongs to the installed router, and is lost when that is upgraded"
         raise UsageError(f"{what}; copy the protos with `router init`, and name yours: --protos protos")
-    old = read_lock(path)
-    settings = _with_names(settings, args, old)
-    schema = load_protos(settings)
-    envelope = find_envelope(schema, settings)
-    found = conflicts(schema, envelope)
+    settings = _with_names(settings, args, read_lock(path))
+    schema = load_protos(settings.protos, settings.message, settings.lock)
+    lock = LockComparison(schema, find_envelope(schema, settings.oneof))
+    found = lock.conflicts
     if problem := _unknown(args.accept, found):
         raise UsageError(f"{problem}; nothing was written")
     accepted = [each for each in found if each.name in args.accept or each.owner in args.accept]
@@ -71,12 +69,12 @@ def run(args: argparse.Namespace) -> int:
             names = " ".join(f"--accept {each.name}" for each in found)
             print(f"nothing was written; if all of it is intended, say so in one command: {names}")
         return BAD_TABLE
-    new = extended_lock(schema, envelope, accepted)
-    if new != old:
+    new = lock.extended(accepted)
+    if new != lock.lock:
         write_lock(path, new)
     for conflict in accepted:
         print(f"accepted: {conflict.finding.message}")
-    print(f"{shown_path(path)}: {_summary(old, new)}")
+    print(f"{shown_path(path)}: {_summary(lock.lock, new)}")
     return OK
 
 

@@ -21,7 +21,7 @@ from router.compiler.topics import diagnostics_topic, topic_findings
 from router.errors import Diagnostic, Severity, TableError
 from router.table import load_table
 from router.table.model import RouteTable, Topic
-from router.types.lock import check_lock, locked_size
+from router.types.lock import LockComparison
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, without_protos
 
@@ -73,8 +73,9 @@ def check_table(
         schema, envelope = _wire(table, definitions)
     except TableError as error:
         return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
-    locked = locked_size(schema) if table.envelope else None
-    lookup = Lookup(table, schema, envelope, definitions, locked or envelope.max_size)
+    lock = LockComparison(schema, envelope) if table.envelope else None
+    board_limit = lock.max_size if lock and lock.max_size else envelope.max_size
+    lookup = Lookup(table, schema, envelope, definitions, board_limit)
     routes = check_routes(lookup)
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
@@ -82,7 +83,7 @@ def check_table(
     findings = [
         *findings,
         *schema.warnings,
-        *(check_lock(schema, envelope, table.envelope.lock) if table.envelope else ()),
+        *(lock.findings(table.envelope.lock) if lock and table.envelope else ()),
         *network_findings(table),
         *lookup.findings,
         *clash_findings(table),
@@ -97,7 +98,7 @@ def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Env
     if table.envelope is None:
         return without_protos()
     schema = definitions.protos(table.envelope)
-    return schema, find_envelope(schema, table.envelope)
+    return schema, find_envelope(schema, table.envelope.oneof)
 
 
 def sorted_findings(findings: Sequence[Diagnostic]) -> list[Diagnostic]:

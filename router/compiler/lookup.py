@@ -15,7 +15,7 @@ from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did
 from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, Expression, RouteTable, Topic
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
-from router.types.proto_folder import read_folder
+from router.types.proto_files import read_folder
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, load_protos, lock_path
 from router.types.ros import RosInterfaces, definition, ros_interfaces
 
@@ -29,14 +29,16 @@ class Definitions:
 
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
         """Raises TableError; a folder that is broken is read again, and reported, by every table."""
-        key = settings.protos.value, settings.message.value, lock_path(settings)
+        key = settings.protos.value, settings.message.value, lock_path(settings.protos, settings.lock)
         if key not in self._protos:
-            self._protos[key] = self._unchanged(settings) or load_protos(settings)
+            known = self._unchanged(settings)
+            self._protos[key] = known or load_protos(settings.protos, settings.message, settings.lock)
         return self._protos[key]
 
     def _unchanged(self, settings: EnvelopeSettings) -> ProtoSchema | None:
         known = self._known
-        if known is None or (known.root, known.lock) != (settings.protos.value.resolve(), lock_path(settings)):
+        root, lock = settings.protos.value.resolve(), lock_path(settings.protos, settings.lock)
+        if known is None or (known.root, known.lock) != (root, lock):
             return None
         if settings.message.value not in (known.envelope, known.envelope.rpartition(".")[2]):
             return None

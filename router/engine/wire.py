@@ -11,7 +11,8 @@ from google.protobuf.message import Message
 from router.engine import MAX_DATAGRAM
 from router.engine.slow_path import restored, why_no_payload
 from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_mean, shown_path
-from router.table.model import ENVELOPE, ONEOF, EnvelopeSettings, RouteTable
+from router.table.model import RouteTable
+from router.types.lock_file import ENVELOPE, ONEOF
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
 
 
@@ -70,17 +71,15 @@ def wire_of_table(table: RouteTable) -> Wire:
     """The envelope that the table names. Raises TableError, and UsageError where it names none."""
     if table.envelope is None:
         raise UsageError(f"{shown_path(table.path)} has no 'envelope': there are no datagrams to build or to read")
-    return _wire(table.envelope)
+    settings = table.envelope
+    return Wire(find_envelope(load_protos(settings.protos, settings.message, settings.lock), settings.oneof))
 
 
 def wire_of_protos(root: Path) -> Wire:
     """The envelope `PBEnvelope.payload` of a folder of `.proto` files. Raises TableError."""
     span = SourceSpan(shown_path(root))
-    return _wire(EnvelopeSettings(Located(root, span), Located(ENVELOPE, span), Located(ONEOF, span)))
-
-
-def _wire(settings: EnvelopeSettings) -> Wire:
-    return Wire(find_envelope(load_protos(settings), settings))
+    schema = load_protos(Located(root, span), Located(ENVELOPE, span))
+    return Wire(find_envelope(schema, Located(ONEOF, span)))
 
 
 def framed(exact: bytes, trim: bool, pad: int) -> bytes:

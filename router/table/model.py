@@ -77,10 +77,6 @@ class Keep(enum.Enum):
     LATEST = "latest"
 
 
-ENVELOPE, ONEOF = "PBEnvelope", "payload"
-"""The envelope's names where there is no table to say them."""
-
-
 @dataclass(frozen=True, slots=True)
 class EnvelopeSettings:
     """`protos` is an absolute path, the router's own unless the table has one; `message` and `oneof` name the envelope.

@@ -36,7 +36,7 @@ from router.table.model import (
     ZenohSettings,
 )
 from router.table.units import duration
-from router.types.sizes import framed_size
+from router.types.boards import framed_size
 
 _WIDEST_CELL = 48
 

@@ -89,7 +89,8 @@ def site_of(checked: Checked, messages: Path) -> Site:
     settings = checked.table.envelope
     if settings is None:
         raise UsageError(f"{checked.path} has no 'envelope' that a message could be added to")
-    schema = load_protos(settings, with_others=True)  # a field's type may be in a file of its own
+    # A field's type may be in a file of its own.
+    schema = load_protos(settings.protos, settings.message, settings.lock, with_others=True)
     return Site(checked.table, settings, schema, checked.envelope, messages)
 
 

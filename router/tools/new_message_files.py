@@ -14,7 +14,7 @@ import yaml
 from router.errors import Severity, UsageError, shown_path
 from router.table.model import ANY, EndpointKind, Route, RouteTable
 from router.tools.new_message import SCALARS, NewField, NewMessage, Site
-from router.types.lock import check_lock, extended_lock
+from router.types.lock import LockComparison
 from router.types.lock_file import lock_text
 from router.types.model import Bool, Enum, Float, MessageType, Type
 from router.types.protobuf import find_envelope, load_protos
@@ -103,12 +103,12 @@ class Written:
 
 def locked(site: Site) -> str:
     """The lock with what the `.proto` files declare now. Raises UsageError and TableError."""
-    schema = load_protos(site.settings)
-    envelope = find_envelope(schema, site.settings)
-    errors = [each for each in check_lock(schema, envelope) if each.severity is Severity.ERROR]
+    schema = load_protos(site.settings.protos, site.settings.message, site.settings.lock)
+    lock = LockComparison(schema, find_envelope(schema, site.settings.oneof))
+    errors = [each for each in lock.findings() if each.severity is Severity.ERROR]
     if errors:
         raise UsageError("; ".join(each.message for each in errors))
-    return lock_text(extended_lock(schema, envelope))
+    return lock_text(lock.extended())
 
 
 # Protobuf and ROS declarations

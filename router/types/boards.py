@@ -1,14 +1,257 @@
 """What a board can take: boards decode with nanopb into structures of a fixed size.
 
-Knows payload cases; which of them go to a board is the table's business.
+nanopb's `.options` files say how large strings, bytes and repeated fields are. The largest encoding of a message in
+bytes is that of nanopb's `*_size` macros; boards reject a datagram that is longer. The rules of counting are checked
+against nanopb's generator in the tests: an int32 takes up to 10 bytes, an enum as many as its largest declared value.
 """
 
 from __future__ import annotations
 
-from router.errors import Code, Diagnostic, SourceSpan
-from router.types.descriptors import container
-from router.types.protobuf import PayloadCase, ProtoSchema
-from router.types.sizes import Unbounded, framed_size, unbounded_fields
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from google.protobuf.descriptor import Descriptor, FieldDescriptor, OneofDescriptor
+
+from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, shown_path
+from router.types.descriptors import container, enum_of, message_of
+
+_COMMENT = re.compile(r"//.*|#.*|/\*.*?\*/")
+_OPTION = re.compile(r"(?P<key>\w+)\s*:\s*(?P<value>\"[^\"]*\"|[\w.+-]+)\s*[,;]?\s*")
+_COUNTS = frozenset({"max_size", "max_length", "max_count"})
+_FLAGS = frozenset({"fixed_length", "fixed_count"})
+_WITHOUT_INFLUENCE = frozenset(
+    {
+        "long_names", "packed_struct", "packed_enum", "msgid", "anonymous_oneof", "proto3", "proto3_singular_msgs",
+        "enum_to_string", "enum_validate", "mangle_names", "callback_datatype", "callback_function", "descriptorsize",
+        "default_has", "include", "exclude", "package", "sort_by_tag", "initializer", "enum_intsize",
+        "discard_unused_automatic_types", "discard_deprecated",
+    }
+)  # fmt: skip
+_TYPES = {"FT_DEFAULT": True, "FT_STATIC": True, "FT_INLINE": True, "FT_CALLBACK": False, "FT_POINTER": False}
+
+
+@dataclass(frozen=True, slots=True)
+class BoardOptions:
+    """What nanopb is told about one field. Sizes in bytes, a string's with its final NUL.
+
+    `is_static` is False where the board holds the field by pointer or callback, which has no bound.
+    """
+
+    max_size: int | None = None
+    max_length: int | None = None
+    max_count: int | None = None
+    fixed_length: bool = False
+    fixed_count: bool = False
+    is_static: bool = True
+
+    @property
+    def string_size(self) -> int | None:
+        """As `max_size` of a string: `max_length` wins where both are given."""
+        return self.max_length + 1 if self.max_length is not None else self.max_size
+
+
+NO_OPTIONS = BoardOptions()
+
+
+@dataclass(frozen=True, slots=True)
+class OptionsFile:
+    """The lines of one file: which names (a pattern with wildcards), and what changes for them."""
+
+    lines: tuple[tuple[str, Mapping[str, int | bool]], ...] = ()
+
+    def of(self, message: str, field: str) -> BoardOptions:
+        """Full name of the message (or of the enclosing ones, by pattern), name of the field.
+
+        As in nanopb, options of a message hold for its fields, and later lines win over earlier ones.
+        """
+        options = NO_OPTIONS
+        for name in (message, f"{message}.{field}"):
+            for pattern, changes in self.lines:
+                if fnmatchcase(name, pattern):
+                    options = replace(options, **changes)  # type: ignore[arg-type]
+        return options
+
+
+def read_options(path: Path) -> tuple[OptionsFile, list[Diagnostic]]:
+    """An `.options` file and what is wrong with it."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        return OptionsFile(), [Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, f"cannot be read: {error}")]
+    lines = []
+    findings = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        bare = _COMMENT.sub("", line).strip()
+        if not bare:
+            continue
+        pattern, _, rest = bare.partition(" ") if " " in bare else bare.partition("\t")
+        changes, complaints = _changes(rest)
+        column = len(line) - len(line.lstrip()) + 1
+        span = SourceSpan(shown_path(path), number, column, column + len(bare))
+        findings += [Diagnostic(span, Code.BAD_PROTO, message, hint) for message, hint in complaints]
+        lines.append((pattern, changes))
+    return OptionsFile(tuple(lines)), findings
+
+
+def _changes(text: str) -> tuple[Mapping[str, int | bool], Iterable[tuple[str, str]]]:
+    """What one line sets, and (message, hint) of what cannot be understood."""
+    text = text.strip()
+    changes: dict[str, int | bool] = {}
+    if not text:
+        return changes, [("no option after the name", "write for example 'max_size:16'")]
+    at = 0
+    while at < len(text):
+        option = _OPTION.match(text, at)
+        if option is None:
+            return changes, [(f"'{text[at:]}' is no option of nanopb", "write for example 'max_size:16'")]
+        at = option.end()
+        key, value = option["key"], option["value"]
+        if key in _COUNTS and value.isdecimal():
+            changes[key] = int(value)
+        elif key in _FLAGS and value in ("true", "false"):
+            changes[key] = value == "true"
+        elif key == "type" and value in _TYPES:
+            changes["is_static"] = _TYPES[value]
+        elif key in _COUNTS | _FLAGS | {"type"}:
+            return changes, [(f"{key} cannot be '{value}'", "")]
+        elif key not in _WITHOUT_INFLUENCE:
+            hint = did_you_mean(key, _COUNTS | _FLAGS | {"type"})
+            return changes, [(f"the router cannot tell sizes with nanopb's option '{key}'", hint)]
+    return changes, []
+
+
+if TYPE_CHECKING:
+    from router.types.protobuf import PayloadCase, ProtoSchema
+
+OptionsOf = Callable[[FieldDescriptor], BoardOptions]
+
+_FIXED = {
+    FieldDescriptor.TYPE_BOOL: 1,
+    FieldDescriptor.TYPE_DOUBLE: 8,
+    FieldDescriptor.TYPE_FIXED32: 4,
+    FieldDescriptor.TYPE_FIXED64: 8,
+    FieldDescriptor.TYPE_FLOAT: 4,
+    FieldDescriptor.TYPE_INT32: 10,
+    FieldDescriptor.TYPE_INT64: 10,
+    FieldDescriptor.TYPE_SFIXED32: 4,
+    FieldDescriptor.TYPE_SFIXED64: 8,
+    FieldDescriptor.TYPE_SINT32: 5,
+    FieldDescriptor.TYPE_SINT64: 10,
+    FieldDescriptor.TYPE_UINT32: 5,
+    FieldDescriptor.TYPE_UINT64: 10,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Unbounded:
+    """A field without a largest encoding; `path` leads to it from the message that was asked for."""
+
+    path: tuple[FieldDescriptor, ...]
+    why: str
+
+
+def largest_encoding(message: Descriptor, options_of: OptionsOf) -> int | None:
+    """The largest encoding of a message in bytes, None where a field has no bound.
+
+    Of a oneof only the largest member counts. Extensions do not count.
+    """
+    if any(unbounded_fields(message, options_of)):
+        return None
+    return _message_size(message, options_of)
+
+
+def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
+    """The largest encoding of what a message holds beside one of its oneofs, fields without a bound left out."""
+    message = oneof.containing_type
+    unbounded = {found.path[0] for found in unbounded_fields(message, options_of)}
+    members = {*oneof.fields, *unbounded}
+    return _size_of([field for field in message.fields if field not in members], options_of)
+
+
+def framed_size(number: int, payload: int) -> int:
+    """The encoding of message field `number` in bytes: tag, length, and a payload of `payload` bytes."""
+    return _varint_size(number << 3) + _varint_size(payload) + payload
+
+
+def unbounded_fields(
+    message: Descriptor, options_of: OptionsOf, path: tuple[FieldDescriptor, ...] = ()
+) -> Iterator[Unbounded]:
+    """Every field inside the message, at any depth, that has no largest encoding."""
+    inside = {step.containing_type for step in path}
+    for field in message.fields:
+        here = (*path, field)
+        if why := _why_unbounded(field, options_of(field)):
+            yield Unbounded(here, why)
+        elif field.message_type is None:
+            continue
+        elif field.message_type == message or field.message_type in inside:
+            yield Unbounded(here, "contains itself")
+        else:
+            yield from unbounded_fields(field.message_type, options_of, here)
+
+
+def _why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
+    if field.type == FieldDescriptor.TYPE_GROUP:
+        return "is a group, which nanopb does not know"
+    if field.is_repeated and options.max_count is None:
+        return "is repeated without a max_count"
+    if field.type == FieldDescriptor.TYPE_STRING and options.string_size is None:
+        return "is a string without a max_size"
+    if field.type == FieldDescriptor.TYPE_BYTES and options.max_size is None:
+        return "is bytes without a max_size"
+    if not options.is_static:
+        return "is held by pointer or callback"
+    return None
+
+
+def _message_size(message: Descriptor, options_of: OptionsOf) -> int:
+    return _size_of(message.fields, options_of)
+
+
+def _size_of(fields: Iterable[FieldDescriptor], options_of: OptionsOf) -> int:
+    total = 0
+    in_oneofs: dict[str, int] = {}
+    for field in fields:
+        size = _field_size(field, options_of)
+        if field.containing_oneof is None:
+            total += size
+        else:
+            oneof = field.containing_oneof.name
+            in_oneofs[oneof] = max(in_oneofs.get(oneof, 0), size)
+    return total + sum(in_oneofs.values())
+
+
+def _field_size(field: FieldDescriptor, options_of: OptionsOf) -> int:
+    options = options_of(field)
+    size = _varint_size(field.number << 3) + _value_size(field, options, options_of)
+    if not field.is_repeated or options.max_count is None:
+        return size
+    # Room for the unpacked form, which every decoder must take; for one element the packed form is longer.
+    return size * options.max_count + (1 if options.max_count == 1 else 0)
+
+
+def _value_size(field: FieldDescriptor, options: BoardOptions, options_of: OptionsOf) -> int:
+    if field.type in _FIXED:
+        return _FIXED[field.type]
+    if field.type == FieldDescriptor.TYPE_ENUM:
+        return max(_varint_size(value.number) for value in enum_of(field).values)
+    if field.type == FieldDescriptor.TYPE_MESSAGE:
+        inner = _message_size(message_of(field), options_of)
+        return _varint_size(inner) + inner
+    if field.type == FieldDescriptor.TYPE_STRING:
+        size = options.string_size or 1
+        return _varint_size(size) + size - 1  # without its final NUL
+    size = options.max_size or 0
+    return _varint_size(size) + size
+
+
+def _varint_size(value: int) -> int:
+    """Bytes of a varint; a negative one has ten."""
+    return 10 if value < 0 else max(1, (value.bit_length() + 6) // 7)
 
 
 def board_findings(case: PayloadCase, schema: ProtoSchema, limit: int, span: SourceSpan) -> list[Diagnostic]:

@@ -20,9 +20,18 @@ from google.protobuf.descriptor import Descriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, shown_path
-from router.table.model import ENVELOPE, ONEOF
 from router.types.descriptors import declared_type
-from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, by_number, read_lock, short_name
+from router.types.lock_file import (
+    ENVELOPE,
+    LOCK_NAME,
+    ONEOF,
+    Declaration,
+    Entry,
+    Lock,
+    by_number,
+    read_lock,
+    short_name,
+)
 from router.types.proto_source import Part
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -40,194 +49,72 @@ class Conflict:
     entries: frozenset[Entry] = frozenset()
 
 
-def check_lock(schema: ProtoSchema, envelope: Envelope, named: Located[Path] | None = None) -> list[Diagnostic]:
-    """Every difference between the `.proto` files and the lock, and what is wrong with the lock file itself.
+class LockComparison:
+    """The `.proto` files compared with their lock file, which is read once.
 
-    `named` is where the table names the lock file: then it must exist. Ordered by place.
+    `lock` is what the file holds, None where there is none. `conflicts` break the wire, `additions` are warnings of
+    what is merely new, `faults` say what is wrong with the file itself.
     """
-    try:
-        lock = read_lock(schema.lock)
-    except TableError as error:
-        return list(error.diagnostics)
-    if lock is None:
-        hint = f"write it with `{_command(schema, envelope, None)}`"
-        if named is not None:
-            return [Diagnostic(named.span, Code.BAD_FILE, f"there is no lock file {shown_path(schema.lock)}", hint)]
-        message = "no lock file records the field numbers"
-        return [Diagnostic(schema.span(envelope.name), Code.NOT_LOCKED, message, hint)]
-    comparison = _Comparison(schema, envelope, lock)
-    errors = [conflict.finding for conflict in comparison.conflicts]
-    return sorted([*errors, *comparison.additions], key=lambda finding: finding.span)
 
-
-def conflicts(schema: ProtoSchema, envelope: Envelope) -> Sequence[Conflict]:
-    """What of the lock the `.proto` files break. Raises TableError when the lock file is broken."""
-    lock = read_lock(schema.lock)
-    return _Comparison(schema, envelope, lock).conflicts if lock is not None else []
-
-
-def extended_lock(schema: ProtoSchema, envelope: Envelope, accepted: Collection[Conflict] = ()) -> Lock:
-    """The lock with everything added that is new. Nothing else is taken out than what the accepted conflicts break.
-
-    Raises TableError when the lock file is broken. Every other conflict must have been refused, see `conflicts`.
-    """
-    current = _current_lock(schema, envelope)
-    lock = read_lock(schema.lock)
-    if lock is None:
-        return current
-    dropped: dict[str, set[Entry]] = defaultdict(set)
-    for conflict in accepted:
-        dropped[conflict.owner] |= conflict.entries
-    locked, _ = _in_new_names(lock, current)
-    return replace(
-        current,
-        messages=_extended(locked.messages, current.messages, dropped),
-        enums=_extended(locked.enums, current.enums, dropped),
-    )
-
-
-def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None) -> str:
-    """What records these protos, to be typed where the router runs."""
-    message, oneof = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
-    words = ["router", "schema", "lock", "--protos", shown_path(schema.root)]
-    if schema.lock != schema.root / LOCK_NAME:
-        words += ["--lock", shown_path(schema.lock)]
-    if short_name(envelope.name) != short_name(message):
-        words += ["--message", envelope.name]
-    if envelope.oneof != oneof:
-        words += ["--oneof", envelope.oneof]
-    return shlex.join(words)
-
-
-def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
-    """What the lock would be for the `.proto` files as they are."""
-    messages = {}
-    for name in schema.messages:
-        if (file := schema.sources.file(name)) in schema.files:
-            entries = frozenset(_entries(schema.descriptor(name)))
-            messages[name] = Declaration(file, entries, _reserved(schema, name))
-    enums = {}
-    for name, declared in schema.enums.items():
-        if (file := schema.sources.file(name)) in schema.files:
-            entries = frozenset(Entry(number, value) for value, number in declared.values)
-            enums[name] = Declaration(file, entries, _reserved(schema, name))
-    return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
-
-
-def _entries(message: Descriptor) -> Iterator[Entry]:
-    declared = DescriptorProto()
-    message.CopyToProto(declared)
-    optional = {field.number for field in declared.field if field.proto3_optional}  # protoc makes a oneof for each
-    for field in message.fields:
-        oneof = field.containing_oneof if field.number not in optional else None
-        yield Entry(field.number, field.name, declared_type(field), oneof.name if oneof is not None else "")
-
-
-def _reserved(schema: ProtoSchema, name: str) -> frozenset[tuple[int, int]]:
-    return frozenset((numbers.start, numbers.stop - 1) for numbers in schema.reserved_numbers(name))
-
-
-def locked_size(schema: ProtoSchema) -> int | None:
-    """The envelope's largest encoding that the lock records, None without a (readable) lock."""
-    try:
-        lock = read_lock(schema.lock)
-    except TableError:  # a finding of check_lock
-        return None
-    return lock.max_size if lock is not None else None
-
-
-def _extended(
-    locked: Mapping[str, Declaration], current: Mapping[str, Declaration], dropped: Mapping[str, set[Entry]]
-) -> Mapping[str, Declaration]:
-    extended = {**locked, **current}
-    for name in locked.keys() & current.keys():
-        now = current[name].entries
-        named = {(entry.number, entry.name) for entry in now}
-        kept = {entry for entry in locked[name].entries if (entry.number, entry.name) not in named}
-        reserved = locked[name].reserved | current[name].reserved
-        extended[name] = replace(current[name], entries=now | (kept - dropped.get(name, set())), reserved=reserved)
-    return extended
-
-
-def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
-    """The lock with its messages, enums and oneofs called as they are now, and from which name to which.
-
-    An envelope that is gone is taken for the present one: it is another then, but its numbers count.
-    """
-    moved = _moved(lock, current)
-    names = dict(moved)
-    if lock.message not in current.messages and current.message not in lock.messages:
-        names.setdefault(lock.message, current.message)
-    messages = _renamed(lock.messages, names)
-    for name in sorted(messages.keys() & current.messages):
-        if not (oneofs := _renamed_oneofs(messages[name], current.messages[name])):
-            continue
-        entries = {replace(entry, oneof=oneofs.get(entry.oneof, entry.oneof)) for entry in messages[name].entries}
-        messages[name] = replace(messages[name], entries=frozenset(entries))
-        moved |= {f"{name}.{old}": f"{name}.{new}" for old, new in oneofs.items()}
-    message = names.get(lock.message, lock.message)
-    oneof = moved.get(f"{message}.{lock.oneof}", "").rpartition(".")[2] or lock.oneof
-    enums = _renamed(lock.enums, names)
-    return replace(lock, message=message, oneof=oneof, messages=messages, enums=enums), moved
-
-
-def _moved(lock: Lock, current: Lock) -> dict[str, str]:
-    """From the full name of what is gone to that of what is new, if only the package differs, and that is certain."""
-    moved: dict[str, str] = {}
-    for locked, there in ((lock.messages, current.messages), (lock.enums, current.enums)):
-        new = [(_without_package(name, current.messages), name) for name in there if name not in locked]
-        gone = [(_without_package(name, lock.messages), name) for name in locked if name not in there]
-        counts = Counter(short for short, _ in gone)
-        known = dict(new)
-        moved |= {name: known[short] for short, name in gone if short in known and counts[short] == 1}
-    return moved
-
-
-def _without_package(name: str, messages: Container[str]) -> str:
-    """`Motor.State` of `rover.Motor.State`, if there is a message `rover.Motor`."""
-    around, _, last = name.rpartition(".")
-    return f"{_without_package(around, messages)}.{last}" if around in messages else last
-
-
-def _renamed(declared: Mapping[str, Declaration], names: Mapping[str, str]) -> dict[str, Declaration]:
-    if not names:
-        return dict(declared)
-    renamed: dict[str, Declaration] = {}
-    for name, declaration in declared.items():
-        entries = set()
-        for entry in declaration.entries:
-            label, space, type_ = entry.type.rpartition(" ")
-            entries.add(replace(entry, type=label + space + names.get(type_, type_)))
-        new = names.get(name, name)
-        before = renamed[new].entries if new in renamed else frozenset()
-        renamed[new] = replace(declaration, entries=before | entries)
-    return renamed
-
-
-def _renamed_oneofs(locked: Declaration, current: Declaration) -> dict[str, str]:
-    """From the name of a oneof that is gone to that of a new one with a member of it."""
-    was = {entry.oneof for entry in locked.entries}
-    if was == {entry.oneof for entry in current.entries}:
-        return {}
-    now = {entry.number: entry.oneof for entry in current.entries}
-    renamed: dict[str, str] = {}
-    for entry in by_number(locked):
-        new = now.get(entry.number, "")
-        is_gone, is_new = entry.oneof not in now.values(), new not in was
-        if entry.oneof and new and is_gone and is_new and new not in renamed.values():
-            renamed.setdefault(entry.oneof, new)
-    return renamed
-
-
-class _Comparison:
-    """The current declarations beside the locked ones: `conflicts`, and warnings of `additions`."""
-
-    def __init__(self, schema: ProtoSchema, envelope: Envelope, lock: Lock) -> None:
+    def __init__(self, schema: ProtoSchema, envelope: Envelope) -> None:
         self._schema = schema
-        self._command = _command(schema, envelope, lock)
+        self._envelope = envelope
+        self._current = _current_lock(schema, envelope)
+        self.lock: Lock | None = None
+        self.faults: Sequence[Diagnostic] = ()
         self.conflicts: list[Conflict] = []
         self.additions: list[Diagnostic] = []
-        current = _current_lock(schema, envelope)
+        try:
+            self.lock = read_lock(schema.lock)
+        except TableError as error:
+            self.faults = error.diagnostics
+        self._command = _command(schema, envelope, self.lock)
+        if self.lock is not None:
+            self._compare_with(self.lock)
+
+    @property
+    def max_size(self) -> int | None:
+        """The envelope's largest encoding in bytes that the lock records, None without a readable lock."""
+        return self.lock.max_size if self.lock is not None else None
+
+    def findings(self, named: Located[Path] | None = None) -> list[Diagnostic]:
+        """Every difference, and what is wrong with the lock file itself, ordered by place.
+
+        `named` is where the table names the lock file: then it must exist.
+        """
+        if self.lock is not None:
+            errors = [conflict.finding for conflict in self.conflicts]
+            return sorted([*errors, *self.additions], key=lambda finding: finding.span)
+        if self.faults:
+            return list(self.faults)
+        hint = f"write it with `{self._command}`"
+        if named is not None:
+            what = f"there is no lock file {shown_path(self._schema.lock)}"
+            return [Diagnostic(named.span, Code.BAD_FILE, what, hint)]
+        message = "no lock file records the field numbers"
+        return [Diagnostic(self._schema.span(self._envelope.name), Code.NOT_LOCKED, message, hint)]
+
+    def extended(self, accepted: Collection[Conflict] = ()) -> Lock:
+        """The lock with everything added that is new. Nothing else is taken out than what the accepted conflicts break.
+
+        Raises TableError when the lock file is broken. Every other conflict must have been refused.
+        """
+        if self.faults:
+            raise TableError(self.faults)
+        if self.lock is None:
+            return self._current
+        dropped: dict[str, set[Entry]] = defaultdict(set)
+        for conflict in accepted:
+            dropped[conflict.owner] |= conflict.entries
+        locked, _ = _in_new_names(self.lock, self._current)
+        return replace(
+            self._current,
+            messages=_extended(locked.messages, self._current.messages, dropped),
+            enums=_extended(locked.enums, self._current.enums, dropped),
+        )
+
+    def _compare_with(self, lock: Lock) -> None:
+        schema, envelope, current = self._schema, self._envelope, self._current
         locked, names = _in_new_names(lock, current)
         for was, now in ((locked.messages, current.messages), (locked.enums, current.enums)):
             for name, declaration in now.items():
@@ -336,3 +223,127 @@ def _place(entry: Entry) -> str:
 def _shown(entry: Entry) -> str:
     """As in a `.proto` file: `float ph_value = 1`, but with `enum` before the type of an enum."""
     return f"`{entry.type} {entry.name} = {entry.number}`".replace("` ", "`")
+
+
+def _command(schema: ProtoSchema, envelope: Envelope, lock: Lock | None) -> str:
+    """What records these protos, to be typed where the router runs."""
+    message, oneof = (lock.message, lock.oneof) if lock is not None else (ENVELOPE, ONEOF)
+    words = ["router", "schema", "lock", "--protos", shown_path(schema.root)]
+    if schema.lock != schema.root / LOCK_NAME:
+        words += ["--lock", shown_path(schema.lock)]
+    if short_name(envelope.name) != short_name(message):
+        words += ["--message", envelope.name]
+    if envelope.oneof != oneof:
+        words += ["--oneof", envelope.oneof]
+    return shlex.join(words)
+
+
+def _current_lock(schema: ProtoSchema, envelope: Envelope) -> Lock:
+    """What the lock would be for the `.proto` files as they are."""
+    messages = {}
+    for name in schema.messages:
+        if (file := schema.sources.file(name)) in schema.files:
+            entries = frozenset(_entries(schema.descriptor(name)))
+            messages[name] = Declaration(file, entries, _reserved(schema, name))
+    enums = {}
+    for name, declared in schema.enums.items():
+        if (file := schema.sources.file(name)) in schema.files:
+            entries = frozenset(Entry(number, value) for value, number in declared.values)
+            enums[name] = Declaration(file, entries, _reserved(schema, name))
+    return Lock(envelope.name, envelope.oneof, envelope.max_size, messages, enums)
+
+
+def _entries(message: Descriptor) -> Iterator[Entry]:
+    declared = DescriptorProto()
+    message.CopyToProto(declared)
+    optional = {field.number for field in declared.field if field.proto3_optional}  # protoc makes a oneof for each
+    for field in message.fields:
+        oneof = field.containing_oneof if field.number not in optional else None
+        yield Entry(field.number, field.name, declared_type(field), oneof.name if oneof is not None else "")
+
+
+def _reserved(schema: ProtoSchema, name: str) -> frozenset[tuple[int, int]]:
+    return frozenset((numbers.start, numbers.stop - 1) for numbers in schema.reserved_numbers(name))
+
+
+def _extended(
+    locked: Mapping[str, Declaration], current: Mapping[str, Declaration], dropped: Mapping[str, set[Entry]]
+) -> Mapping[str, Declaration]:
+    extended = {**locked, **current}
+    for name in locked.keys() & current.keys():
+        now = current[name].entries
+        named = {(entry.number, entry.name) for entry in now}
+        kept = {entry for entry in locked[name].entries if (entry.number, entry.name) not in named}
+        reserved = locked[name].reserved | current[name].reserved
+        extended[name] = replace(current[name], entries=now | (kept - dropped.get(name, set())), reserved=reserved)
+    return extended
+
+
+def _in_new_names(lock: Lock, current: Lock) -> tuple[Lock, Mapping[str, str]]:
+    """The lock with its messages, enums and oneofs called as they are now, and from which name to which.
+
+    An envelope that is gone is taken for the present one: it is another then, but its numbers count.
+    """
+    moved = _moved(lock, current)
+    names = dict(moved)
+    if lock.message not in current.messages and current.message not in lock.messages:
+        names.setdefault(lock.message, current.message)
+    messages = _renamed(lock.messages, names)
+    for name in sorted(messages.keys() & current.messages):
+        if not (oneofs := _renamed_oneofs(messages[name], current.messages[name])):
+            continue
+        entries = {replace(entry, oneof=oneofs.get(entry.oneof, entry.oneof)) for entry in messages[name].entries}
+        messages[name] = replace(messages[name], entries=frozenset(entries))
+        moved |= {f"{name}.{old}": f"{name}.{new}" for old, new in oneofs.items()}
+    message = names.get(lock.message, lock.message)
+    oneof = moved.get(f"{message}.{lock.oneof}", "").rpartition(".")[2] or lock.oneof
+    enums = _renamed(lock.enums, names)
+    return replace(lock, message=message, oneof=oneof, messages=messages, enums=enums), moved
+
+
+def _moved(lock: Lock, current: Lock) -> dict[str, str]:
+    """From the full name of what is gone to that of what is new, if only the package differs, and that is certain."""
+    moved: dict[str, str] = {}
+    for locked, there in ((lock.messages, current.messages), (lock.enums, current.enums)):
+        new = [(_without_package(name, current.messages), name) for name in there if name not in locked]
+        gone = [(_without_package(name, lock.messages), name) for name in locked if name not in there]
+        counts = Counter(short for short, _ in gone)
+        known = dict(new)
+        moved |= {name: known[short] for short, name in gone if short in known and counts[short] == 1}
+    return moved
+
+
+def _without_package(name: str, messages: Container[str]) -> str:
+    """`Motor.State` of `rover.Motor.State`, if there is a message `rover.Motor`."""
+    around, _, last = name.rpartition(".")
+    return f"{_without_package(around, messages)}.{last}" if around in messages else last
+
+
+def _renamed(declared: Mapping[str, Declaration], names: Mapping[str, str]) -> dict[str, Declaration]:
+    if not names:
+        return dict(declared)
+    renamed: dict[str, Declaration] = {}
+    for name, declaration in declared.items():
+        entries = set()
+        for entry in declaration.entries:
+            label, space, type_ = entry.type.rpartition(" ")
+            entries.add(replace(entry, type=label + space + names.get(type_, type_)))
+        new = names.get(name, name)
+        before = renamed[new].entries if new in renamed else frozenset()
+        renamed[new] = replace(declaration, entries=before | entries)
+    return renamed
+
+
+def _renamed_oneofs(locked: Declaration, current: Declaration) -> dict[str, str]:
+    """From the name of a oneof that is gone to that of a new one with a member of it."""
+    was = {entry.oneof for entry in locked.entries}
+    if was == {entry.oneof for entry in current.entries}:
+        return {}
+    now = {entry.number: entry.oneof for entry in current.entries}
+    renamed: dict[str, str] = {}
+    for entry in by_number(locked):
+        new = now.get(entry.number, "")
+        is_gone, is_new = entry.oneof not in now.values(), new not in was
+        if entry.oneof and new and is_gone and is_new and new not in renamed.values():
+            renamed.setdefault(entry.oneof, new)
+    return renamed

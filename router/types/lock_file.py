@@ -1,7 +1,4 @@
-"""The lock file: every field number that was ever given out, and what it was given to.
-
-Reads and writes it; knows no `.proto` file. What follows from a difference is `lock`'s business.
-"""
+"""The lock file: every field number that was ever given out, and what it was given to. Read and written here."""
 
 from __future__ import annotations
 
@@ -15,6 +12,9 @@ from typing import Any
 from router.errors import Code, Diagnostic, SourceSpan, TableError, shown_path
 
 LOCK_NAME = "envelope.lock.json"
+
+ENVELOPE, ONEOF = "PBEnvelope", "payload"
+"""The envelope's names where there is neither table nor lock to say them."""
 
 _FIELD = re.compile(r"(?:oneof (?P<oneof>\w+): )?(?P<type>\S.*) (?P<name>\w+)")
 _NUMBER = re.compile(r"-?[0-9]+")

@@ -1,35 +1,38 @@
 """The protobuf side of the type model: the envelope and what it imports, compiled at start-up.
 
-What else is in the folder of `.proto` files is no part of it, and what is wrong there is a warning.
+What else is in the folder of `.proto` files is no part of it, and what is wrong there is a warning. A map becomes a
+list of its entry messages and a group a message; extensions are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
 from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError, did_you_mean
-from router.table.model import EnvelopeSettings
-from router.types.board_options import NO_OPTIONS, BoardOptions, OptionsFile, read_options
-from router.types.descriptors import container, message_of
-from router.types.envelope_file import envelope_file
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean
+from router.types.boards import (
+    NO_OPTIONS,
+    BoardOptions,
+    OptionsFile,
+    framed_size,
+    largest_beside,
+    largest_encoding,
+    read_options,
+)
+from router.types.descriptors import container, enum_of, message_of
 from router.types.lock_file import LOCK_NAME, Lock, read_lock
-from router.types.model import Enum, MessageType
-from router.types.proto_folder import OPTIONS, PROTO, Folder, read_folder
-from router.types.proto_model import build_types
-from router.types.proto_scan import reached
+from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
+from router.types.proto_files import OPTIONS, PROTO, Folder, envelope_file, reached, read_folder
 from router.types.proto_source import Part, ProtoSources
-from router.types.protoc import WELL_KNOWN, check_protos, compile_protos
-from router.types.protoc_errors import findings_of
-from router.types.sizes import framed_size, largest_beside, largest_encoding
+from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
 
 MessageClass = type[Message]
 
@@ -123,18 +126,20 @@ class Envelope:
     max_size: int
 
 
-def load_protos(settings: EnvelopeSettings, *, with_others: bool = False) -> ProtoSchema:
-    """Compile the file that declares the envelope, and what it imports.
+def load_protos(
+    protos: Located[Path], message: Located[str], lock: Located[Path] | None = None, *, with_others: bool = False
+) -> ProtoSchema:
+    """Compile the file below `protos` that declares the envelope `message`, and what it imports.
 
     Other files of the folder are checked only, `with_others` compiled too where nothing is wrong with them. Raises
     TableError with every finding. What is wrong with the folder itself is blamed on the place that names it.
     """
-    root = settings.protos.value.resolve()
-    folder = read_folder(root, settings.protos.span)
-    lock = lock_path(settings)
-    locked = _readable_lock(lock)
+    root = protos.value.resolve()
+    folder = read_folder(root, protos.span)
+    path = lock_path(protos, lock)
+    locked = _readable_lock(path)
     homes = {name: message.file for name, message in locked.messages.items()} if locked is not None else {}
-    file, envelope = envelope_file(folder, settings, locked)
+    file, envelope = envelope_file(folder, protos, message, locked)
     used = reached(file, folder.files) if folder.faults else {file}
     if faults := [finding for name in sorted(used) for finding in _faults(folder, name)]:
         raise TableError(faults)
@@ -156,7 +161,7 @@ def load_protos(settings: EnvelopeSettings, *, with_others: bool = False) -> Pro
                 warnings.append(_unused(complaints[0], len(complaints)))
     if findings:
         raise TableError(findings)
-    return ProtoSchema(folder, envelope, lock, compiled, options, warnings)
+    return ProtoSchema(folder, envelope, path, compiled, options, warnings)
 
 
 def without_protos() -> tuple[ProtoSchema, Envelope]:
@@ -165,14 +170,13 @@ def without_protos() -> tuple[ProtoSchema, Envelope]:
     return schema, Envelope("", "", Empty, {}, 0)
 
 
-def lock_path(settings: EnvelopeSettings) -> Path:
-    """The lock file of these protos: beside them unless the table says where."""
-    path = settings.lock.value if settings.lock is not None else settings.protos.value / LOCK_NAME
-    return path.resolve()
+def lock_path(protos: Located[Path], lock: Located[Path] | None) -> Path:
+    """The lock file of these protos: beside them unless `lock` says where."""
+    return (lock.value if lock is not None else protos.value / LOCK_NAME).resolve()
 
 
 def _readable_lock(path: Path) -> Lock | None:
-    """What is wrong with the lock is a finding of `check_lock`."""
+    """What is wrong with the lock is a finding of `LockComparison`."""
     try:
         return read_lock(path)
     except TableError:
@@ -240,18 +244,18 @@ def _same_name_findings(folder: Folder, compiled: FileDescriptorSet, homes: Mapp
     return findings
 
 
-def find_envelope(schema: ProtoSchema, settings: EnvelopeSettings) -> Envelope:
-    """The message that the schema was loaded for, with the oneof that the table names.
+def find_envelope(schema: ProtoSchema, named: Located[str]) -> Envelope:
+    """The message that the schema was loaded for, with its oneof `named`.
 
     Raises TableError: an oneof that does not exist, a member of it that is no message.
     """
     name = schema.envelope
     descriptor = schema.descriptor(name)
-    oneof = descriptor.oneofs_by_name.get(settings.oneof.value)
+    oneof = descriptor.oneofs_by_name.get(named.value)
     if oneof is None:
-        hint = did_you_mean(settings.oneof.value, descriptor.oneofs_by_name)
-        message = f"{name} has no oneof '{settings.oneof.value}'"
-        raise TableError([Diagnostic(settings.oneof.span, Code.BAD_VALUE, message, hint)])
+        hint = did_you_mean(named.value, descriptor.oneofs_by_name)
+        message = f"{name} has no oneof '{named.value}'"
+        raise TableError([Diagnostic(named.span, Code.BAD_VALUE, message, hint)])
     if scalars := [field for field in oneof.fields if field.message_type is None]:
         raise TableError([_scalar_finding(schema, field) for field in scalars])
     cases = {field.name: _payload_case(schema, field) for field in oneof.fields}
@@ -271,3 +275,88 @@ def _payload_case(schema: ProtoSchema, field: FieldDescriptor) -> PayloadCase:
     message = message_of(field)
     size = largest_encoding(message, schema.board_options)
     return PayloadCase(field.name, field.number, schema.messages[message.full_name], GetMessageClass(message), size)
+
+
+_SCALARS: Mapping[int, Type] = {
+    FieldDescriptor.TYPE_BOOL: Bool(),
+    FieldDescriptor.TYPE_FLOAT: Float(32),
+    FieldDescriptor.TYPE_DOUBLE: Float(64),
+    FieldDescriptor.TYPE_INT32: Int(32, signed=True),
+    FieldDescriptor.TYPE_SINT32: Int(32, signed=True),
+    FieldDescriptor.TYPE_SFIXED32: Int(32, signed=True),
+    FieldDescriptor.TYPE_INT64: Int(64, signed=True),
+    FieldDescriptor.TYPE_SINT64: Int(64, signed=True),
+    FieldDescriptor.TYPE_SFIXED64: Int(64, signed=True),
+    FieldDescriptor.TYPE_UINT32: Int(32, signed=False),
+    FieldDescriptor.TYPE_FIXED32: Int(32, signed=False),
+    FieldDescriptor.TYPE_UINT64: Int(64, signed=False),
+    FieldDescriptor.TYPE_FIXED64: Int(64, signed=False),
+}
+
+
+def build_types(
+    pool: DescriptorPool,
+    file_names: Sequence[str],
+    sources: ProtoSources,
+    options_of: Callable[[FieldDescriptor], BoardOptions],
+) -> tuple[dict[str, MessageType], dict[str, Enum]]:
+    """All messages and enums of the files, nested ones too, by full name and in declared order."""
+    files = [pool.FindFileByName(name) for name in file_names]
+    descriptors = [
+        message for file in files for top in file.message_types_by_name.values() for message in _with_nested(top)
+    ]
+    declared = [enum for file in files for enum in file.enum_types_by_name.values()]
+    declared += [enum for message in descriptors for enum in message.enum_types]
+    enums = {enum.full_name: _enum(enum) for enum in declared}
+    messages = {
+        message.full_name: MessageType(message.full_name, is_map_entry=message.GetOptions().map_entry)
+        for message in descriptors
+    }
+    for message in descriptors:
+        messages[message.full_name].fields = tuple(
+            Field(
+                name=field.name,
+                type=_type(field, options_of(field), messages, enums),
+                number=field.number,
+                has_presence=field.has_presence,
+                is_required=field.is_required or messages[message.full_name].is_map_entry,
+                oneof=field.containing_oneof.name if field.containing_oneof else None,
+                comment=sources.comment(f"{message.full_name}.{field.name}"),
+            )
+            for field in message.fields
+        )
+    return messages, enums
+
+
+def _with_nested(message: Descriptor) -> Iterator[Descriptor]:
+    yield message
+    for nested in message.nested_types:
+        yield from _with_nested(nested)
+
+
+def _enum(enum: EnumDescriptor) -> Enum:
+    return Enum(enum.full_name, tuple((value.name, value.number) for value in enum.values))
+
+
+def _type(
+    field: FieldDescriptor, options: BoardOptions, messages: Mapping[str, MessageType], enums: Mapping[str, Enum]
+) -> Type:
+    element = _element(field, options, messages, enums)
+    if not field.is_repeated:
+        return element
+    count = options.max_count
+    return List(element, length=count) if options.fixed_count else List(element, bound=count)
+
+
+def _element(
+    field: FieldDescriptor, options: BoardOptions, messages: Mapping[str, MessageType], enums: Mapping[str, Enum]
+) -> Type:
+    if field.type in _SCALARS:
+        return _SCALARS[field.type]
+    if field.type == FieldDescriptor.TYPE_ENUM:
+        return enums[enum_of(field).full_name]
+    if field.type == FieldDescriptor.TYPE_STRING:
+        return String(options.string_size - 1 if options.string_size is not None else None)
+    if field.type == FieldDescriptor.TYPE_BYTES:
+        return Bytes(options.max_size)
+    return messages[message_of(field).full_name]

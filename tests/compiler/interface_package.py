@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from router.types.model import MessageType
-from router.types.ros import RosInterfaces
-from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces
 
 NAME = "nasty"
 MESSAGES: Mapping[str, str] = {

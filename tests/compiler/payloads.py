@@ -15,7 +15,7 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.payload import write_envelope
 from router.compiler.source import Source
 from router.errors import Located
-from router.table.model import EnvelopeSettings, FieldMap
+from router.table.model import FieldMap
 from router.types.model import Field, MessageType, Type
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema, find_envelope, load_protos
 from tests.compiler.compiling import RECEIVED_AT, SOURCE, SPAN, context_of
@@ -40,9 +40,8 @@ def rover_wire() -> Wire:
 
 
 def _wire(root: Path, name: str) -> Wire:
-    settings = EnvelopeSettings(Located(root, SPAN), Located(name, SPAN), Located("payload", SPAN))
-    schema = load_protos(settings)
-    return schema, find_envelope(schema, settings)
+    schema = load_protos(Located(root, SPAN), Located(name, SPAN))
+    return schema, find_envelope(schema, Located("payload", SPAN))
 
 
 def compiled_envelope(

@@ -10,7 +10,6 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from hypothesis import strategies as st
 
 from router.errors import Located, SourceSpan
-from router.table.model import EnvelopeSettings
 from router.types.protobuf import Envelope, find_envelope, load_protos
 from tests.tables import PROTOS
 
@@ -23,8 +22,7 @@ UNKNOWN_NUMBER = 30
 @cache
 def rover_envelope() -> Envelope:
     here = SourceSpan(__file__)
-    settings = EnvelopeSettings(Located(PROTOS, here), Located("PBEnvelope", here), Located("payload", here))
-    return find_envelope(load_protos(settings), settings)
+    return find_envelope(load_protos(Located(PROTOS, here), Located("PBEnvelope", here)), Located("payload", here))
 
 
 def varint(value: int) -> bytes:

@@ -17,8 +17,7 @@ from router.gateway.packets import Packet, pack, unpack
 from router.gateway.schema_text import schema_text
 from router.gateway.style import Style, UnreadableError
 from router.types.model import MessageType
-from router.types.ros import RosInterfaces
-from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces
 from tests.compiler.interface_package import MESSAGES, NAME
 
 TIME = 1795276800.25

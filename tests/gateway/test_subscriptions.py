@@ -23,8 +23,7 @@ from router.gateway.publishers import Selection
 from router.gateway.samples import ReadyType, Sample
 from router.gateway.style import Style, UnreadableError
 from router.gateway.subscriptions import READ_PER_TURN, Subscriptions, TopicSubscription
-from router.types.ros import RosInterfaces, ros_interfaces
-from router.types.ros_sources import MsgFiles, RosbagsDefinitions
+from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces, ros_interfaces
 from tests.gateway.asynchronous import asynchronous, until
 from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, padded, string_topic
 from tests.ros.ros_publisher import Publisher

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from router.errors import Diagnostic, Located, SourceSpan, TableError
-from router.table.model import EnvelopeSettings
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.tables import PROTOS
 
+ONEOF = Located("payload", SourceSpan("table.yaml", 4, 10))
 Write = Callable[[Mapping[str, str]], Path]
 
 
@@ -32,7 +32,7 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
 
 @pytest.fixture
 def load(write: Write) -> Callable[[Mapping[str, str]], ProtoSchema]:
-    return lambda files: load_protos(settings(with_envelope(write(files))))
+    return lambda files: load_protos(*settings(with_envelope(write(files))))
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def refused(write: Write) -> Callable[[Mapping[str, str]], tuple[Diagnostic, ...
     def findings(files: Mapping[str, str]) -> tuple[Diagnostic, ...]:
         root = with_envelope(write(files))
         with pytest.raises(TableError) as caught:
-            load_protos(settings(root))
+            load_protos(*settings(root))
         return caught.value.diagnostics
 
     return findings
@@ -61,22 +61,19 @@ def with_envelope(root: Path) -> Path:
 @pytest.fixture
 def envelope() -> Callable[[ProtoSchema], Envelope]:
     """The envelope `Envelope.payload` of a schema."""
-    return lambda schema: find_envelope(schema, settings(schema.root))
+    return lambda schema: find_envelope(schema, ONEOF)
 
 
-def settings(root: Path, message: str = "Envelope", oneof: str = "payload") -> EnvelopeSettings:
-    return EnvelopeSettings(
-        Located(root, SourceSpan("table.yaml", 2, 1)),
-        Located(message, SourceSpan("table.yaml", 3, 12)),
-        Located(oneof, SourceSpan("table.yaml", 4, 10)),
-    )
+def settings(root: Path, message: str = "Envelope") -> tuple[Located[Path], Located[str]]:
+    """The folder and the envelope's name as a table says them."""
+    return Located(root, SourceSpan("table.yaml", 2, 1)), Located(message, SourceSpan("table.yaml", 3, 12))
 
 
 @pytest.fixture(scope="session")
 def rover_schema() -> ProtoSchema:
-    return load_protos(settings(PROTOS, "PBEnvelope"))
+    return load_protos(*settings(PROTOS, "PBEnvelope"))
 
 
 @pytest.fixture(scope="session")
 def rover_envelope(rover_schema: ProtoSchema) -> Envelope:
-    return find_envelope(rover_schema, settings(rover_schema.root, "PBEnvelope"))
+    return find_envelope(rover_schema, ONEOF)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from router.errors import Code
-from router.types.board_options import NO_OPTIONS, BoardOptions, read_options
+from router.types.boards import NO_OPTIONS, BoardOptions, read_options
 
 
 def test_later_lines_win_and_a_field_wins_over_its_message(tmp_path: Path) -> None:

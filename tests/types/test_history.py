@@ -15,9 +15,9 @@ import yaml
 
 from router.cli import BAD_TABLE, OK, main
 from router.errors import TableError
-from router.types.lock import check_lock
+from router.types.lock import LockComparison
 from router.types.protobuf import find_envelope, load_protos
-from tests.types.conftest import settings
+from tests.types.conftest import ONEOF, settings
 
 Write = Callable[[Mapping[str, str]], Path]
 Change = Mapping[str, Any]
@@ -50,10 +50,10 @@ class Protos:
     def findings(self) -> list[str]:
         named = settings(self.root, "PBEnvelope")
         try:
-            schema = load_protos(named)
+            schema = load_protos(*named)
         except TableError as error:
             return [str(finding) for finding in error.diagnostics]
-        found = [*check_lock(schema, find_envelope(schema, named)), *schema.warnings]
+        found = [*LockComparison(schema, find_envelope(schema, ONEOF)).findings(), *schema.warnings]
         return [str(finding) for finding in found if "takes up to" not in finding.message]
 
     def lock(self, *accepted: str) -> int:

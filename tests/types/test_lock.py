@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.types.lock import check_lock, conflicts, extended_lock, locked_size
+from router.types.lock import LockComparison
 from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, read_lock, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
-from tests.types.conftest import settings
+from tests.types.conftest import ONEOF, settings
 
 Write = Callable[[Mapping[str, str]], Path]
 Find = Callable[[ProtoSchema], Envelope]
@@ -48,23 +48,27 @@ def changed(write: Write, envelope: Find) -> Callable[..., list[Diagnostic]]:
     def check(old: str, new: str) -> list[Diagnostic]:
         lock(write({"motor.proto": PROTO}), envelope)
         assert old in PROTO
-        schema = load_protos(settings(write({"motor.proto": PROTO.replace(old, new)})))
-        return check_lock(schema, envelope(schema))
+        schema = load_protos(*settings(write({"motor.proto": PROTO.replace(old, new)})))
+        return findings(schema, envelope)
 
     return check
 
 
+def findings(schema: ProtoSchema, envelope: Find) -> list[Diagnostic]:
+    return LockComparison(schema, envelope(schema)).findings()
+
+
 def lock(root: Path, envelope: Find) -> None:
-    schema = load_protos(settings(root))
-    write_lock(root / LOCK_NAME, extended_lock(schema, envelope(schema)))
+    schema = load_protos(*settings(root))
+    write_lock(root / LOCK_NAME, LockComparison(schema, envelope(schema)).extended())
 
 
 def test_locked_protos_have_no_findings(write: Write, envelope: Find) -> None:
     root = write({"motor.proto": PROTO})
     lock(root, envelope)
-    schema = load_protos(settings(root))
-    assert check_lock(schema, envelope(schema)) == []
-    assert locked_size(schema) == envelope(schema).max_size == 14
+    schema = load_protos(*settings(root))
+    assert findings(schema, envelope) == []
+    assert LockComparison(schema, envelope(schema)).max_size == envelope(schema).max_size == 14
 
 
 @pytest.mark.parametrize(
@@ -204,8 +208,8 @@ def test_number_stays_taken_after_its_reservation_is_gone(write: Write, envelope
     root = write({"motor.proto": PROTO})
     lock(root, envelope)
     lock(write({"motor.proto": PROTO.replace("float rpm = 1", "reserved 1")}), envelope)
-    schema = load_protos(settings(write({"motor.proto": PROTO.replace("float rpm = 1", "bool on = 1")})))
-    (finding,) = [found for found in check_lock(schema, envelope(schema)) if found.code is Code.WIRE_NUMBER_CONFLICT]
+    schema = load_protos(*settings(write({"motor.proto": PROTO.replace("float rpm = 1", "bool on = 1")})))
+    (finding,) = [found for found in findings(schema, envelope) if found.code is Code.WIRE_NUMBER_CONFLICT]
     assert "belongs to 'float rpm'" in finding.message
 
 
@@ -221,11 +225,11 @@ def test_number_that_was_reserved_before_the_first_lock_stays_taken(
 ) -> None:
     root = write({"motor.proto": PROTO.replace(old, f"{old} {reserved}")})
     lock(root, envelope)
-    schema = load_protos(settings(write({"motor.proto": PROTO.replace(old, f"{old} {new}")})))
-    (conflict,) = conflicts(schema, envelope(schema))
+    schema = load_protos(*settings(write({"motor.proto": PROTO.replace(old, f"{old} {new}")})))
+    (conflict,) = LockComparison(schema, envelope(schema)).conflicts
     assert conflict.finding.message.startswith(error)
-    write_lock(schema.lock, extended_lock(schema, envelope(schema), [conflict]))
-    assert check_lock(schema, envelope(schema)) == []
+    write_lock(schema.lock, LockComparison(schema, envelope(schema)).extended([conflict]))
+    assert findings(schema, envelope) == []
 
 
 def test_enums_of_one_name_are_not_taken_for_each_other(write: Write, envelope: Find) -> None:
@@ -237,8 +241,8 @@ def test_enums_of_one_name_are_not_taken_for_each_other(write: Write, envelope: 
     lock(root, envelope)
     moved = enum.format("pb").replace("package pb", "package qb")
     gone = 'syntax = "proto3"; package pa; import "b.proto"; message Mpa { qb.St s = 1; }'
-    schema = load_protos(settings(write({"a.proto": gone, "b.proto": moved, "e.proto": uses % (cases % "qb")})))
-    assert "pa.Mpa.s" in {conflict.name for conflict in conflicts(schema, envelope(schema))}
+    schema = load_protos(*settings(write({"a.proto": gone, "b.proto": moved, "e.proto": uses % (cases % "qb")})))
+    assert "pa.Mpa.s" in {conflict.name for conflict in LockComparison(schema, envelope(schema)).conflicts}
 
 
 def test_oneof_that_is_called_as_protoc_calls_its_own_is_a_oneof(changed: Callable[..., list[Diagnostic]]) -> None:
@@ -275,8 +279,8 @@ def test_package_alone_keeps_the_wire(changed: Callable[..., list[Diagnostic]]) 
 )
 def test_package_does_not_switch_the_lock_off(write: Write, envelope: Find, old: str, new: str, error: str) -> None:
     lock(write({"motor.proto": PROTO}), envelope)
-    schema = load_protos(settings(write({"motor.proto": PROTO.replace(*PACKAGE).replace(old, new)})))
-    assert error in said(check_lock(schema, envelope(schema)))
+    schema = load_protos(*settings(write({"motor.proto": PROTO.replace(*PACKAGE).replace(old, new)})))
+    assert error in said(findings(schema, envelope))
 
 
 def test_lock_of_another_package_is_recorded_under_the_new_names(write: Write, envelope: Find) -> None:
@@ -288,8 +292,8 @@ def test_lock_of_another_package_is_recorded_under_the_new_names(write: Write, e
     assert json.loads(text)["messages"].keys() == {"rover.Motor", "rover.Envelope"}
     assert '"9": "enum rover.Motor.Mode mode"' in text
     lock(write({"motor.proto": nested}), envelope)
-    schema = load_protos(settings(write({"motor.proto": nested.replace("ON = 0", "OFF = 0")})))
-    assert "error number 0 of Motor.Mode belongs to 'ON', not to 'OFF'" in said(check_lock(schema, envelope(schema)))
+    schema = load_protos(*settings(write({"motor.proto": nested.replace("ON = 0", "OFF = 0")})))
+    assert "error number 0 of Motor.Mode belongs to 'ON', not to 'OFF'" in said(findings(schema, envelope))
 
 
 @pytest.mark.parametrize(
@@ -364,8 +368,8 @@ def test_oneof_may_have_another_name_but_no_other_members(
     write: Write, envelope: Find, old: str, new: str, expected: list[str]
 ) -> None:
     lock(write({"motor.proto": TWO.replace("ONEOFS", old)}), envelope)
-    schema = load_protos(settings(write({"motor.proto": TWO.replace("ONEOFS", new)})))
-    assert sorted(said(check_lock(schema, envelope(schema)))) == expected
+    schema = load_protos(*settings(write({"motor.proto": TWO.replace("ONEOFS", new)})))
+    assert sorted(said(findings(schema, envelope))) == expected
 
 
 @pytest.mark.parametrize(
@@ -384,8 +388,8 @@ def test_how_a_message_is_encoded_is_locked(write: Write, envelope: Find, old: s
         'edition = "2023";\nmessage Motor { Motor m = 1 X; }\nmessage Envelope { oneof payload { Motor motor = 1; } }'
     )
     lock(write({"motor.proto": proto.replace("X", old)}), envelope)
-    schema = load_protos(settings(write({"motor.proto": proto.replace("X", new)})))
-    assert error in said(check_lock(schema, envelope(schema)))
+    schema = load_protos(*settings(write({"motor.proto": proto.replace("X", new)})))
+    assert error in said(findings(schema, envelope))
 
 
 def test_number_of_what_came_back_under_another_stays_taken(write: Write, envelope: Find) -> None:
@@ -396,14 +400,14 @@ def test_number_of_what_came_back_under_another_stays_taken(write: Write, envelo
     )
     lock(write({"motor.proto": back}), envelope)
     given = back.replace("reserved 1;\n  double", "bool on = 1;\n  double").replace("reserved 1;", "DONE = 1;")
-    schema = load_protos(settings(write({"motor.proto": given})))
-    assert said(check_lock(schema, envelope(schema))) == [
+    schema = load_protos(*settings(write({"motor.proto": given})))
+    assert said(findings(schema, envelope)) == [
         "error number 1 of State belongs to 'BUSY', not to 'DONE'",
         "error number 1 of Motor belongs to 'float rpm', not to 'bool on'",
     ]
     freed = back.replace("reserved 1;", "")
-    schema = load_protos(settings(write({"motor.proto": freed})))
-    assert said(check_lock(schema, envelope(schema))) == [
+    schema = load_protos(*settings(write({"motor.proto": freed})))
+    assert said(findings(schema, envelope)) == [
         "error number 1 of State, which was 'BUSY', is free to be reused",
         "error number 1 of Motor, which was 'rpm', is free to be reused",
     ]
@@ -411,12 +415,12 @@ def test_number_of_what_came_back_under_another_stays_taken(write: Write, envelo
 
 def test_envelope_that_is_gone_is_an_error_and_its_numbers_count(write: Write) -> None:
     named = settings(write({"motor.proto": PROTO}))
-    schema = load_protos(named)
-    write_lock(schema.lock, extended_lock(schema, find_envelope(schema, named)))
+    schema = load_protos(*named)
+    write_lock(schema.lock, LockComparison(schema, find_envelope(schema, ONEOF)).extended())
     changed = PROTO.replace("message Envelope", "message Rover").replace("motor = 1", "other = 1")
     named = settings(write({"motor.proto": changed}), "Rover")
-    schema = load_protos(named)
-    assert said(check_lock(schema, find_envelope(schema, named))) == [
+    schema = load_protos(*named)
+    assert said(LockComparison(schema, find_envelope(schema, ONEOF)).findings()) == [
         "error the lock is for the envelope Envelope.payload, not Rover.payload",
         "error number 1 of Rover belongs to 'motor', not to 'other'",
     ]
@@ -425,8 +429,8 @@ def test_envelope_that_is_gone_is_an_error_and_its_numbers_count(write: Write) -
 def test_unresolved_merge_of_the_lock_says_so(write: Write, envelope: Find) -> None:
     lock(write({"motor.proto": PROTO}), envelope)
     text = Path(LOCK_NAME).read_text().replace('        "2":', '<<<<<<< HEAD\n        "2":')
-    schema = load_protos(settings(write({LOCK_NAME: text})))
-    (finding,) = check_lock(schema, envelope(schema))
+    schema = load_protos(*settings(write({LOCK_NAME: text})))
+    (finding,) = findings(schema, envelope)
     assert str(finding) == (
         "envelope.lock.json:18:1: error[bad-file]: an unresolved merge; "
         "take one side; `router validate` then says how to record what the other one had"
@@ -450,17 +454,17 @@ def test_second_message_of_a_locked_name_is_blamed_although_it_comes_first(
     write({"a.proto": f'syntax = "proto3";\n{package}\nmessage Motor {{\n  bool on = 1;\n}}\n'})
     root = write({"motor.proto": PROTO.replace("enum", 'import "a.proto";\nenum', 1)})
     with pytest.raises(TableError) as caught:
-        load_protos(settings(root))
+        load_protos(*settings(root))
     (finding,) = caught.value.diagnostics
     assert (finding.code, finding.span) == (Code.DUPLICATE_MESSAGE, SourceSpan("a.proto", 3 + bool(package), 9, 14))
     assert "motor.proto" in f"{finding.message} {finding.hint}"
 
 
 def test_missing_lock_is_one_warning(write: Write, envelope: Find) -> None:
-    schema = load_protos(settings(write({"motor.proto": PROTO})))
-    (finding,) = check_lock(schema, envelope(schema))
+    schema = load_protos(*settings(write({"motor.proto": PROTO})))
+    (finding,) = findings(schema, envelope)
     assert (finding.code, finding.span) == (Code.NOT_LOCKED, SourceSpan("motor.proto", 14, 9, 17))
-    assert locked_size(schema) is None
+    assert LockComparison(schema, envelope(schema)).max_size is None
 
 
 def lock_text(**changes: object) -> str:
@@ -487,11 +491,11 @@ def lock_text(**changes: object) -> str:
     ],
 )
 def test_broken_lock_file_is_a_finding_in_it(write: Write, envelope: Find, text: str, line: int) -> None:
-    schema = load_protos(settings(write({"motor.proto": PROTO, LOCK_NAME: text})))
-    (finding,) = check_lock(schema, envelope(schema))
+    schema = load_protos(*settings(write({"motor.proto": PROTO, LOCK_NAME: text})))
+    (finding,) = findings(schema, envelope)
     assert (finding.code, finding.span.file, finding.span.line) == (Code.BAD_FILE, LOCK_NAME, line)
     with pytest.raises(TableError):
-        extended_lock(schema, envelope(schema))
+        LockComparison(schema, envelope(schema)).extended()
 
 
 def test_lock_file_has_one_line_for_each_number(write: Write, envelope: Find) -> None:
@@ -505,7 +509,7 @@ def test_lock_file_has_one_line_for_each_number(write: Write, envelope: Find) ->
 
 
 def test_rovers_protos_are_locked(rover_schema: ProtoSchema, rover_envelope: Envelope) -> None:
-    assert check_lock(rover_schema, rover_envelope) == []
+    assert LockComparison(rover_schema, rover_envelope).findings() == []
 
 
 names = st.from_regex(r"[a-z_]{1,8}", fullmatch=True)

@@ -10,8 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from router.types.model import Bool, Float, Int, String, Type
-from router.types.msg_text import PRIMITIVES, MsgError, MsgField, NamedType, Shape, parse_msg
-from router.types.msg_values import is_zero
+from router.types.msg import PRIMITIVES, MsgError, MsgField, NamedType, Shape, is_zero, parse_msg
 
 U8 = Int(8, False)
 

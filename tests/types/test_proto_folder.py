@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError
-from router.table.model import EnvelopeSettings
 from router.types.protobuf import load_protos
 from tests.types.conftest import settings
 
@@ -19,21 +18,21 @@ Refused = Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]
 def test_missing_folder_is_blamed_on_whoever_names_it(tmp_path: Path) -> None:
     blame = SourceSpan("table.yaml", 3, 11, 20)
     with pytest.raises(TableError) as caught:
-        load_protos(EnvelopeSettings(Located(tmp_path / "nowhere", blame), Located("A", blame), Located("b", blame)))
+        load_protos(Located(tmp_path / "nowhere", blame), Located("A", blame))
     (finding,) = caught.value.diagnostics
     assert (finding.code, finding.span) == (Code.BAD_FILE, blame)
 
 
 def test_folder_without_protos_is_a_finding(write: Write) -> None:
     with pytest.raises(TableError, match=r"holds no \.proto file"):
-        load_protos(settings(write({"readme.txt": "nothing here"})))
+        load_protos(*settings(write({"readme.txt": "nothing here"})))
 
 
 def test_unreadable_proto_that_is_imported_is_a_finding_at_that_file(write: Write) -> None:
     root = write({"a.proto": 'syntax = "proto3"; import "b.proto"; message Envelope {}'})
     (root / "b.proto").symlink_to("nowhere.proto")
     with pytest.raises(TableError) as caught:
-        load_protos(settings(root))
+        load_protos(*settings(root))
     assert [(finding.code, finding.span.file) for finding in caught.value.diagnostics] == [(Code.BAD_FILE, "b.proto")]
 
 
@@ -41,7 +40,7 @@ def test_proto_that_is_not_utf8_is_a_finding_at_that_line(write: Write) -> None:
     root = write({"a.proto": ""})
     (root / "a.proto").write_bytes(b'syntax = "proto3";\n// gr\xf6sse\nmessage Envelope {}')
     with pytest.raises(TableError) as caught:
-        load_protos(settings(root))
+        load_protos(*settings(root))
     assert [str(finding) for finding in caught.value.diagnostics] == [
         "a.proto:2:1: error[bad-file]: the file is not UTF-8"
     ]
@@ -55,7 +54,7 @@ def test_hidden_files_of_editors_and_archives_are_left_alone(write: Write) -> No
             ".git/b.proto": "message Envelope {}",
         }
     )
-    assert load_protos(settings(root)).files == ("a.proto",)
+    assert load_protos(*settings(root)).files == ("a.proto",)
 
 
 @pytest.mark.parametrize("name", ['a"b.proto', "a\\b.proto", "gr\u00f6\u00dfe.proto", "a\nb.proto"])

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
-from router.types.lock import extended_lock
+from router.types.lock import LockComparison
 from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
-from tests.types.conftest import settings
+from tests.types.conftest import ONEOF, settings
 
 Write = Callable[[Mapping[str, str]], Path]
 Load = Callable[[Mapping[str, str]], ProtoSchema]
@@ -52,7 +53,7 @@ def test_hash_changes_with_content_and_name_of_protos_and_options(load: Load) ->
 
 def test_message_class_has_a_pool_of_its_own(write: Write) -> None:
     root = write({"a.proto": ENVELOPE})
-    first, second = load_protos(settings(root)), load_protos(settings(root))
+    first, second = load_protos(*settings(root)), load_protos(*settings(root))
     message = first.message_class("Imu")(x=1.5)
     assert second.message_class("Imu").FromString(message.SerializeToString()) != message
     assert second.message_class("Imu") is not first.message_class("Imu")
@@ -77,7 +78,7 @@ def test_span_finds_messages_fields_enums_and_values(load: Load) -> None:
 
 
 def test_envelope_cases_have_number_type_class_and_size(load: Load) -> None:
-    found = find_envelope(load({"a.proto": ENVELOPE}), settings(Path()))
+    found = find_envelope(load({"a.proto": ENVELOPE}), ONEOF)
     imu, note = found.cases["imu"], found.cases["note"]
     assert (imu.number, imu.type.name, imu.max_size) == (13, "Imu", 5)
     assert (note.number, note.type.name, note.max_size) == (2, "Note", None)
@@ -87,13 +88,13 @@ def test_envelope_cases_have_number_type_class_and_size(load: Load) -> None:
 
 def test_envelope_size_counts_what_stands_beside_the_oneof(load: Load) -> None:
     text = ENVELOPE.replace("  oneof", "  uint32 timeout = 30;\n  repeated int32 more = 31;\n  oneof")
-    assert find_envelope(load({"a.proto": text}), settings(Path())).max_size == 7 + 2 + 5
+    assert find_envelope(load({"a.proto": text}), ONEOF).max_size == 7 + 2 + 5
 
 
 def test_envelope_in_a_package_is_found_by_short_name(write: Write) -> None:
     root = write({"a.proto": ENVELOPE.replace("message Imu", "package rover;\nmessage Imu")})
-    assert load_protos(settings(root)).envelope == "rover.Envelope"
-    assert load_protos(settings(root, "rover.Envelope")).envelope == "rover.Envelope"
+    assert load_protos(*settings(root)).envelope == "rover.Envelope"
+    assert load_protos(*settings(root, "rover.Envelope")).envelope == "rover.Envelope"
 
 
 @pytest.mark.parametrize(
@@ -111,16 +112,16 @@ def test_envelope_in_a_package_is_found_by_short_name(write: Write) -> None:
     ],
 )  # fmt: skip
 def test_wrong_name_in_the_table_is_a_finding_there(write: Write, message: str, oneof: str, finding: str) -> None:
-    named = settings(write({"a.proto": ENVELOPE}), message, oneof)
+    named = settings(write({"a.proto": ENVELOPE}), message)
     with pytest.raises(TableError) as caught:
-        find_envelope(load_protos(named), named)
+        find_envelope(load_protos(*named), replace(ONEOF, value=oneof))
     assert [str(found) for found in caught.value.diagnostics] == [finding]
 
 
 def test_payload_case_that_is_no_message_is_a_finding_in_the_proto(load: Load) -> None:
     schema = load({"a.proto": ENVELOPE.replace("Note note = 2", "uint32 timeout = 2")})
     with pytest.raises(TableError) as caught:
-        find_envelope(schema, settings(Path()))
+        find_envelope(schema, ONEOF)
     (finding,) = caught.value.diagnostics
     assert (finding.code, finding.span) == (Code.BAD_PROTO, SourceSpan("a.proto", 7, 12, 19))
 
@@ -157,7 +158,7 @@ STRAY = {
 
 @pytest.mark.parametrize(("stray", "warning"), STRAY.values(), ids=STRAY.keys())
 def test_file_that_the_envelope_does_not_import_is_a_warning(write: Write, stray: str, warning: str) -> None:
-    schema = load_protos(settings(write({"a.proto": ENVELOPE, "b.proto": f'syntax = "proto3";\n{stray}'})))
+    schema = load_protos(*settings(write({"a.proto": ENVELOPE, "b.proto": f'syntax = "proto3";\n{stray}'})))
     said = "the envelope does not use this file, and it is left out"
     assert [str(found) for found in schema.warnings] == [warning.format(said)]
     assert schema.files == ("a.proto",)
@@ -170,7 +171,7 @@ def test_stray_files_that_cannot_be_read_and_their_options_are_warnings(write: W
     )
     (root / "c.proto").write_bytes(b'syntax = "proto3"; // gr\xf6sse')
     (root / "d.proto").symlink_to("nowhere.proto")
-    warnings = load_protos(settings(root)).warnings
+    warnings = load_protos(*settings(root)).warnings
     assert {(found.span.file, found.code) for found in warnings} == {
         (name, Code.UNUSED_PROTO) for name in ("b.proto", "b.options", "c.proto", "d.proto", "table.yaml")
     }
@@ -178,17 +179,17 @@ def test_stray_files_that_cannot_be_read_and_their_options_are_warnings(write: W
 
 def test_enum_of_the_envelopes_name_is_none(write: Write) -> None:
     enum = 'syntax = "proto3";\nenum Envelope {\n  E_NONE = 0;\n}\n'
-    schema = load_protos(settings(write({"a.proto": ENVELOPE, "b.proto": enum})))
+    schema = load_protos(*settings(write({"a.proto": ENVELOPE, "b.proto": enum})))
     assert [(found.span.file, found.code) for found in schema.warnings] == [("b.proto", Code.UNUSED_PROTO)]
     with pytest.raises(TableError) as caught:
-        load_protos(settings(write({"a.proto": enum, "b.proto": 'syntax = "proto3"; message Imu {}'})))
+        load_protos(*settings(write({"a.proto": enum, "b.proto": 'syntax = "proto3"; message Imu {}'})))
     assert caught.value.diagnostics[0].message == "no .proto file declares a message 'Envelope'"
 
 
 def test_file_name_that_is_not_utf8_is_a_warning(write: Write) -> None:
     root = write({"a.proto": ENVELOPE})
     Path(os.fsdecode(os.fsencode(root) + b"/caf\xe9.proto")).write_text('syntax = "proto3";')
-    schema = load_protos(settings(root))
+    schema = load_protos(*settings(root))
     assert [found.code for found in schema.warnings] == [Code.UNUSED_PROTO]
     assert len(schema.sha256) == 64
 
@@ -197,7 +198,7 @@ def test_file_name_that_is_not_utf8_is_a_warning(write: Write) -> None:
     "first", ["\ufeffsyntax", "/* licence\n */ syntax", "// licence\n\n  syntax", "/* a */\n/* syntax = */\tsyntax"]
 )
 def test_syntax_may_stand_after_comments(write: Write, first: str) -> None:
-    assert load_protos(settings(write({"a.proto": ENVELOPE.replace("syntax", first, 1)}))).warnings == ()
+    assert load_protos(*settings(write({"a.proto": ENVELOPE.replace("syntax", first, 1)}))).warnings == ()
 
 
 @pytest.mark.parametrize("linked", ["linked", ".hidden"])
@@ -210,7 +211,7 @@ def test_imported_files_are_the_folders_own_wherever_they_are(write: Write, tmp_
     root = write(files) / "rover"
     (root / linked).symlink_to(tmp_path / "other")
     (root / "again").symlink_to(root)
-    schema = load_protos(settings(root))
+    schema = load_protos(*settings(root))
     assert schema.files == (f"{linked}/imu.proto", "a.proto")
     assert schema.span("Imu").file == f"rover/{linked}/imu.proto"
 
@@ -223,12 +224,12 @@ def test_merge_of_two_envelopes_in_one_file_is_said_to_be_one(refused: Refused) 
 def test_enum_values_that_are_named_as_messages_are_blamed(write: Write) -> None:
     root = write({"z.proto": ENVELOPE})
     named = settings(root)
-    schema = load_protos(named)
-    write_lock(root / LOCK_NAME, extended_lock(schema, find_envelope(schema, named)))
+    schema = load_protos(*named)
+    write_lock(root / LOCK_NAME, LockComparison(schema, find_envelope(schema, ONEOF)).extended())
     types = 'syntax = "proto3";\nenum Types {\n  NONE = 0;\n  Imu = 1;\n}\n'
     write({"a.proto": types, "z.proto": ENVELOPE.replace("message Imu", 'import "a.proto";\nmessage Imu')})
     with pytest.raises(TableError) as caught:
-        load_protos(named)
+        load_protos(*named)
     assert [(found.span.file, found.span.line) for found in caught.value.diagnostics] == [("a.proto", 4)]
 
 
@@ -239,7 +240,7 @@ def test_stray_file_without_a_fault_can_be_compiled_too(write: Write) -> None:
         "c.proto": 'syntax = "proto3"; import "d.proto"; message C {}',
         "d.proto": "message D",
     }
-    schema = load_protos(settings(write(files)), with_others=True)
+    schema = load_protos(*settings(write(files)), with_others=True)
     assert set(schema.messages) == {"Imu", "Note", "Envelope", "B"}
     assert [found.span.file for found in schema.warnings] == ["d.proto"]
 
@@ -262,11 +263,11 @@ def test_of_two_files_that_declare_the_envelope_the_locked_one_counts(
         declared = Declaration(lock, frozenset())
         write_lock(root / LOCK_NAME, Lock("Envelope", "payload", 7, {"Envelope": declared}, {}))
     if chosen is not None:
-        schema = load_protos(settings(root, message))
+        schema = load_protos(*settings(root, message))
         assert schema.sources.file(schema.envelope) == chosen
         return
     with pytest.raises(TableError) as caught:
-        load_protos(settings(root, message))
+        load_protos(*settings(root, message))
     (finding,) = caught.value.diagnostics
     assert str(finding) == (
         "table.yaml:3:12: error[duplicate-message]: several files declare a message 'Envelope': a.proto and b.proto; "
@@ -292,11 +293,11 @@ DEEP = {
 def test_wrong_folder_of_protos_is_said_to_be_it(write: Write, folder: str, said: str) -> None:
     root = write({f"protos/{name}": text for name, text in DEEP.items()})
     with pytest.raises(TableError) as caught:
-        load_protos(settings(root / folder))
+        load_protos(*settings(root / folder))
     (finding,) = caught.value.diagnostics
     assert (finding.code, finding.span.line) == (Code.BAD_VALUE, 2)
     assert f"{finding.message}; {finding.hint}".startswith(f"{said} protos, to which imports are relative")
-    load_protos(settings(root / "protos"))
+    load_protos(*settings(root / "protos"))
 
 
 def test_folder_whose_imports_are_elsewhere_in_it_is_the_right_one(refused: Refused) -> None:

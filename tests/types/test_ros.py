@@ -12,8 +12,15 @@ import pytest
 
 from router.errors import Code, SourceSpan, TableError
 from router.types.model import Float, Int, List, MessageType
-from router.types.ros import RosInterfaces, definition, ros_interfaces
-from router.types.ros_sources import DEFAULTS_MISSING_IN_ROSBAGS, MsgFiles, RosbagsDefinitions, msg_files
+from router.types.ros import (
+    DEFAULTS_MISSING_IN_ROSBAGS,
+    MsgFiles,
+    RosbagsDefinitions,
+    RosInterfaces,
+    definition,
+    msg_files,
+    ros_interfaces,
+)
 
 Write = Callable[[Mapping[str, str]], Path]
 Interfaces = Callable[[Mapping[str, str]], RosInterfaces]

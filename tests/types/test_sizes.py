@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from router.types.boards import largest_encoding
 from router.types.protobuf import Envelope, ProtoSchema, load_protos
-from router.types.sizes import largest_encoding
 from tests.tables import PROTOS
 from tests.types.conftest import settings, with_envelope
 
@@ -98,7 +98,7 @@ def test_every_kind_of_field_is_as_large_as_nanopb_says(write: Write, tmp_path: 
             "*.last_name max_length:30 long_names:false\n",
         }
     )
-    assert our_sizes(load_protos(settings(with_envelope(root)))) == nanopb_sizes(root, tmp_path / "out")
+    assert our_sizes(load_protos(*settings(with_envelope(root)))) == nanopb_sizes(root, tmp_path / "out")
 
 
 def test_message_inside_itself_has_no_largest_encoding(load: Callable[[Mapping[str, str]], ProtoSchema]) -> None:

@@ -1,0 +1,254 @@
+"""The files of a folder of `.proto` files: their texts, faults that protoc has no good message for, and the envelope.
+
+What a text declares and imports is found without a compiler, also where the file does not compile.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, shown_path
+from router.types.lock_file import Lock
+
+PROTO = ".proto"
+OPTIONS = ".options"
+
+_HIDDEN = re.compile(r"(^|/)\.")
+_FILE_NAME = re.compile(r"[\w ./+,@-]+", re.ASCII)
+_SYNTAX = re.compile(rb"^(?:\xef\xbb\xbf|\s|/\*.*?\*/)*(?:syntax|edition)\s*=", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Folder:
+    """`files` has the bytes of all readable files by name relative to `root`, with `/`, sorted.
+
+    `faults` are the findings of a file, readable or not, by the same names.
+    """
+
+    root: Path
+    files: Mapping[str, bytes]
+    faults: Mapping[str, Sequence[Diagnostic]]
+
+    @property
+    def protos(self) -> Mapping[str, bytes]:
+        return {name: content for name, content in self.files.items() if name.endswith(PROTO)}
+
+    @cached_property
+    def sha256(self) -> str:
+        """Over names and contents."""
+        digest = hashlib.sha256()
+        for name, content in self.files.items():
+            digest.update(os.fsencode(f"{name}\0{len(content)}\0"))
+            digest.update(content)
+        return digest.hexdigest()
+
+
+def read_folder(root: Path, blame: SourceSpan) -> Folder:
+    """The `.proto` and `.options` files below `root`; hidden ones are left alone.
+
+    What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder.
+    """
+    if not root.is_dir():
+        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {shown_path(root)}")])
+    found = {
+        name: path
+        for path in walk(root)
+        if path.suffix in (PROTO, OPTIONS) and not _HIDDEN.search(name := path.relative_to(root).as_posix())
+    }
+    if not any(name.endswith(PROTO) for name in found):
+        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"{shown_path(root)} holds no .proto file")])
+    files = {}
+    faults: dict[str, Sequence[Diagnostic]] = {}
+    for name, path in sorted(found.items()):
+        if not _FILE_NAME.fullmatch(name):
+            hint = "take letters, digits, '_', '-' and '.'"
+            faults[name] = [Diagnostic(blame, Code.BAD_FILE, f"protoc cannot import a file named {name!a}", hint)]
+        try:
+            files[name] = path.read_bytes()
+        except OSError as error:
+            message = f"cannot be read: {error.strerror}"
+            faults[name] = [Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message)]
+        else:
+            if complaints := list(_text_findings(path, files[name])):
+                faults[name] = [*faults.get(name, ()), *complaints]
+    return Folder(root, files, faults)
+
+
+def walk(root: Path) -> Iterator[Path]:
+    """All files and folders below a folder, through links to other folders as well, each folder once."""
+    seen = set()
+    for folder, inner, files in os.walk(root, followlinks=True):
+        seen.add(os.path.realpath(folder))
+        inner[:] = [name for name in inner if os.path.realpath(Path(folder, name)) not in seen]
+        yield from (Path(folder, name) for name in (*inner, *files))
+
+
+def _text_findings(path: Path, content: bytes) -> Iterator[Diagnostic]:
+    try:
+        content.decode()
+    except UnicodeDecodeError as error:  # protoc lets it pass in comments
+        line = content.count(b"\n", 0, error.start) + 1
+        yield Diagnostic(SourceSpan(shown_path(path), line), Code.BAD_FILE, "the file is not UTF-8")
+    if path.suffix == PROTO and not _SYNTAX.search(content):  # protoc would take it for proto2
+        hint = 'begin it with `syntax = "proto3";`'
+        yield Diagnostic(SourceSpan(shown_path(path)), Code.BAD_PROTO, "the file does not say its syntax", hint)
+
+
+_TOKEN = re.compile(
+    rb"""(?P<skipped>//[^\n]*|/\*.*?(?:\*/|\Z)|^(?:<{7}|\|{7}|>{7})[^\n]*)"""
+    rb"""|"(?:\\.|[^"\\\n])*"?|'(?:\\.|[^'\\\n])*'?|[\w.]+|[{};]""",
+    re.DOTALL | re.MULTILINE,
+)
+"""Comments and the marks of an unresolved merge are skipped."""
+_SIGNS = frozenset("{;}")
+
+
+@dataclass(frozen=True, slots=True)
+class Scanned:
+    """`names` are the full names of all messages and enums, nested ones as well; `messages` those of messages."""
+
+    package: str
+    names: tuple[str, ...]
+    messages: frozenset[str]
+    imports: tuple[str, ...]
+
+    def is_top_level(self, name: str) -> bool:
+        return "." not in name.removeprefix(f"{self.package}." if self.package else "")
+
+
+def scan(content: bytes) -> Scanned:
+    """The declarations and imports of a file, in order."""
+    package = ""
+    names: list[str] = []
+    messages: set[str] = set()
+    imports: list[str] = []
+    blocks: list[str] = []  # for each open brace the full name of the message, or that of the one around
+    for statement, opens in _statements(content):
+        match statement:
+            case ["package", name]:
+                package = name
+            case ["import", *_, name]:
+                imports.append(name.strip("\"'"))
+            case [*_, ("message" | "enum") as kind, name] if opens:  # `export` or `local` may stand before it
+                around = blocks[-1] if blocks else package
+                names.append(f"{around}.{name}" if around else name)
+                if kind == "message":
+                    messages.add(names[-1])
+                blocks.append(names[-1])
+                continue
+            case ["}"]:
+                del blocks[-1:]
+        if opens:
+            blocks.append(blocks[-1] if blocks else package)
+    return Scanned(package, tuple(names), frozenset(messages), tuple(imports))
+
+
+def _statements(content: bytes) -> Iterator[tuple[list[str], bool]]:
+    """The words before each `;` or brace, and whether a block begins there. A `}` is a statement of its own."""
+    words: list[str] = []
+    for match in _TOKEN.finditer(content):
+        if match["skipped"]:
+            continue
+        word = match[0].decode(errors="replace")
+        if word not in _SIGNS:
+            words.append(word)
+            continue
+        yield words, word == "{"
+        words = []
+        if word == "}":
+            yield ["}"], False
+
+
+def declaring(name: str, files: Mapping[str, bytes]) -> list[tuple[str, str]]:
+    """The files that declare a message or an enum of this full or short name, each with the full name."""
+    short = re.compile(rb"\b" + re.escape(name.rpartition(".")[2].encode()) + rb"\b")
+    return [
+        (file, full)
+        for file, content in files.items()
+        if short.search(content)
+        for full in scan(content).names
+        if full == name or full.endswith(f".{name}")
+    ]
+
+
+def reached(start: str, files: Mapping[str, bytes]) -> set[str]:
+    """The file and all that it imports, directly or not, whether they exist or not."""
+    found: set[str] = set()
+    waiting: Iterable[str] = [start]
+    while waiting:
+        found.update(waiting)
+        waiting = {name for file in waiting for name in scan(files.get(file, b"")).imports} - found
+    return found
+
+
+_FURTHER_UP = 4
+_OF_PROTOBUF = "google/protobuf/"
+
+
+def envelope_file(folder: Folder, protos: Located[Path], message: Located[str], locked: Lock | None) -> tuple[str, str]:
+    """The file that declares the envelope, and its full name there. Of several, the one that the lock has goes first.
+
+    Raises TableError when there is none or more than one, and when `protos` is the wrong folder.
+    """
+    wanted = message.value
+    declared = declaring(wanted, folder.protos)
+    found = [(file, name) for file, name in declared if name in scan(folder.files[file]).messages]
+    if not found:
+        raise TableError(_missing(folder, protos, message))
+    envelope = locked.messages.get(locked.message) if locked is not None else None
+
+    def rank(each: tuple[str, str]) -> tuple[bool, bool, bool]:
+        file, name = each
+        is_locked = envelope is not None and file == envelope.file
+        return is_locked, name == wanted, scan(folder.files[file]).is_top_level(name)
+
+    best = max(map(rank, found))
+    found = [*dict.fromkeys(each for each in found if rank(each) == best)]
+    if len(found) > 1:
+        files = " and ".join(file for file, _ in found)
+        what = f"several files declare a message '{wanted}': {files}"
+        hint = "remove all but one, or give its full name if they have packages"
+        raise TableError([Diagnostic(message.span, Code.DUPLICATE_MESSAGE, what, hint)])
+    file, name = found[0]
+    if (above := _folder_above(folder, file)) is not None:
+        raise TableError([_too_deep(folder, protos, above, file)])
+    return file, name
+
+
+def _missing(folder: Folder, protos: Located[Path], wanted: Located[str]) -> list[Diagnostic]:
+    """What is wrong when no file declares the envelope: perhaps it is in one that cannot be read."""
+    for file in folder.protos:
+        if (above := _folder_above(folder, file)) is not None:
+            return [_too_deep(folder, protos, above, file)]
+    hint = did_you_mean(wanted.value, [name for content in folder.protos.values() for name in scan(content).messages])
+    message = f"no .proto file declares a message '{wanted.value}'"
+    faults = [each for found in folder.faults.values() for each in found]
+    return [Diagnostic(wanted.span, Code.BAD_VALUE, message, hint), *faults]
+
+
+def _imports(content: bytes) -> list[str]:
+    return [name for name in scan(content).imports if not name.startswith(_OF_PROTOBUF)]
+
+
+def _folder_above(folder: Folder, file: str) -> Path | None:
+    """The folder above this one that the imports of a file are relative to, if they are."""
+    imports = _imports(folder.files[file])
+    if not imports or any(name in folder.files or name in folder.faults for name in imports):
+        return None
+    above = folder.root.parents[:_FURTHER_UP]
+    return next((each for each in above if all((each / name).is_file() for name in imports)), None)
+
+
+def _too_deep(folder: Folder, protos: Located[Path], right: Path, file: str) -> Diagnostic:
+    steps = len(folder.root.relative_to(right).parts)
+    count = {1: "one folder", 2: "two folders"}.get(steps, f"{steps} folders")
+    message = f"`protos` is {count} too deep: {file} imports '{_imports(folder.files[file])[0]}'"
+    table = Path(protos.span.file)
+    shown = os.path.relpath(right, table.absolute().parent) if table.is_file() else shown_path(right)
+    return Diagnostic(protos.span, Code.BAD_VALUE, message, f"take {shown}, to which imports are relative")
