@@ -278,6 +278,7 @@ class Recorder:
     def _write_ring(self, reason: str) -> Path:
         """What is received meanwhile is written as ever."""
         assert self._ring is not None  # noqa: S101 - `save` and `deadman_tripped` look before
+        self._write()
         chunks = self._ring.chunks()
         coming = sum(chunk.size_in_file for chunk in chunks)
         writing = self._continuous.path if self._continuous is not None else None
