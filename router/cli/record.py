@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rich.progress import ProgressColumn
 
-    from router.tools.recording_tap import TapRecording
+    from router.tools.recordings import TapRecording
 
 FAILED = 1
 
@@ -57,7 +57,7 @@ def _record(args: argparse.Namespace) -> int:
     from router.engine.wire import wire_of_table
     from router.table import read_table
     from router.threads import background_threads
-    from router.tools.recording_tap import TapRecording
+    from router.tools.recordings import TapRecording
     from router.tools.running_router import tap
 
     table = read_table(args.table)
@@ -70,19 +70,19 @@ def _record(args: argparse.Namespace) -> int:
         )
         print(f"recording the router at {url} to {recording.path}; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
-            with progress(_columns) as tell:
+            with progress(_columns) as update:
                 for batch in batches:
                     recording.take(batch)
-                    tell(description=_told(recording))
+                    update(description=_summary(recording))
         except KeyboardInterrupt:
             pass
         finally:
             recording.close()
-            print(_told(recording))
+            print(_summary(recording))
     return OK
 
 
-def _told(recording: TapRecording) -> str:
+def _summary(recording: TapRecording) -> str:
     missed = f", {recording.missed} missed" if recording.missed else ""
     return f"{recording.path}: {recording.datagrams} datagrams{missed}, {recording.size / 1e6:.2f} MB"
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from router.compiler import Checked
     from router.compiler.lookup import Definitions
     from router.recording.reader import Recording
-    from router.tools.replaying import Resent
+    from router.tools.recordings import Resent
 
 DIFFERENT = 1
 
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 def _send(args: argparse.Namespace, recording: Recording) -> int:
     from router.table import read_table
     from router.tools import places
-    from router.tools.replaying import Replayer, on_time, parse_rate
+    from router.tools.recordings import Replayer, on_time, parse_rate
 
     rate = parse_rate(args.rate or "1x")
     path = args.table or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
@@ -78,10 +78,10 @@ def _send(args: argparse.Namespace, recording: Recording) -> int:
     origin = places.origin(args.origin, table) if args.origin else None
     replayer = Replayer(table, to, origin)
     try:
-        with closing(replayer), _progress(recording, "sending") as tell:
+        with closing(replayer), _progress(recording, "sending") as update:
             for found in on_time(recording, rate):
                 replayer.send(found)
-                tell(completed=recording.position)
+                update(completed=recording.position)
     except KeyboardInterrupt:
         pass
     print(f"sent {replayer.resent.datagrams} datagrams")
@@ -112,10 +112,10 @@ def _compare(args: argparse.Namespace, recording: Recording) -> int:
     old, new = (_checked(path, definitions) for path in (args.table or DEFAULT_TABLE, args.against))
     assert old.program is not None and new.program is not None  # noqa: S101, PT018 - they have no errors
     against = Against(old.program, new.program)
-    with _progress(recording, "comparing") as tell:
+    with _progress(recording, "comparing") as update:
         for found in recording.datagrams():
             against.take(found)
-            tell(completed=recording.position)
+            update(completed=recording.position)
     for line in Report(old, new).lines(against):
         print(line)
     return DIFFERENT if against.differs else OK

@@ -1,6 +1,6 @@
-"""The live view: each payload that arrives, for Foxglove, which decodes it by the descriptor that it is told.
+"""The live view in Foxglove: a WebSocket server with a channel for each payload case, named as in recordings.
 
-Has a channel for each payload case, named as in recordings. While nobody has subscribed to one, nothing is looked at.
+Foxglove decodes payloads by the descriptors that the channels carry. The mirror is attached while a client subscribes.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from router.threads import background_threads
 from router.types.protobuf import PayloadCase
 
 LOOK_SECONDS = 1.0
-"""For how long a reload may go unnoticed."""
+"""The longest time until a reload is noticed."""
 
 _OS_ERROR = re.compile(r"\(os error (\d+)\)")
 
 
-class _Kind(NamedTuple):
+class _ChannelKey(NamedTuple):
     """What makes a channel: a payload case, the full name of its message, and a FileDescriptorSet."""
 
     case: str
@@ -41,32 +41,32 @@ class _Kind(NamedTuple):
     descriptors: bytes
 
 
-def _kind(case: PayloadCase) -> _Kind:
+def _key(case: PayloadCase) -> _ChannelKey:
     payload: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
-    return _Kind(case.name, payload.full_name, descriptor_set(payload))
+    return _ChannelKey(case.name, payload.full_name, descriptor_set(payload))
 
 
 class _View(NamedTuple):
-    """What is shown of which program. `channels` by payload case."""
+    """The channels of a program, by payload case."""
 
     program: Program
-    known: Classifier
+    classifier: Classifier
     channels: Mapping[str, Channel]
 
 
 class FoxgloveServer(ServerListener):
     """Serves at `address` until it is closed. Clients cannot send anything. Opening raises StartError.
 
-    The library's threads tell who subscribes, and are not kept waiting: the thread `foxglove` acts on it.
+    The library's threads report subscriptions; the thread `foxglove` acts on them.
     """
 
     def __init__(self, address: Located[Address], running: Running) -> None:
         self._running = running
         self._context = Context()
-        self._open: dict[_Kind, Channel] = {}
+        self._open: dict[_ChannelKey, Channel] = {}
         self._subscribed: set[tuple[int, int]] = set()  # client and channel
         self._detach: Callable[[], None] | None = None
-        self._stirred, self._is_closing = threading.Event(), False
+        self._changed, self._is_closing = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="foxglove")
         with background_threads():
             self._server = _started(address, running.program.table.node.name, self._context, self)
@@ -76,76 +76,72 @@ class FoxgloveServer(ServerListener):
 
     def close(self) -> None:
         self._is_closing = True
-        self._stirred.set()
+        self._changed.set()
         self._thread.join()
         self._server.stop()
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         self._subscribed.add((client.id, channel.id))
-        self._stirred.set()
+        self._changed.set()
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
-        """Also where the client has left, or the channel was closed."""
+        """Also called when the client has left, or the channel was closed."""
         self._subscribed.discard((client.id, channel.id))
-        self._stirred.set()
+        self._changed.set()
 
     def _run(self) -> None:
         is_well = True
         while not self._is_closing:
-            self._stirred.wait(LOOK_SECONDS)
-            self._stirred.clear()
+            self._changed.wait(LOOK_SECONDS)
+            self._changed.clear()
             try:
-                self._follow_program()
-                self._follow_clients()
-            except Exception as error:  # noqa: BLE001 a fault of the router, told loudly; it may be over at the next look
+                self._update_channels()
+                self._attach_while_subscribed()
+            except Exception as error:  # noqa: BLE001 a fault of the router, reported once; it may be over next time
                 if is_well:
                     logger.critical("a fault in the view for Foxglove; please report it", exc_info=error)
                 is_well = False
             else:
                 is_well = True
-        self._ignore()
+        self._detach_from_mirror()
 
-    def _follow_clients(self) -> None:
+    def _attach_while_subscribed(self) -> None:
         if not self._subscribed:
-            self._ignore()
+            self._detach_from_mirror()
         elif self._detach is None:
-            self._detach = self._running.mirror.attach(self._show)
+            self._detach = self._running.mirror.attach(self._send)
 
-    def _ignore(self) -> None:
+    def _detach_from_mirror(self) -> None:
         if self._detach is not None:
             self._detach()
             self._detach = None
 
-    def _follow_program(self) -> None:
-        """Channels that are as they were stay, with who subscribed; others go when nothing is shown there any more."""
+    def _update_channels(self) -> None:
+        """After a reload, keep unchanged channels with their subscriptions, add new ones and close the others."""
         program = self._running.program
         if program is self._view.program:
             return
         self._view = self._view_of(program)
-        stay = set(map(_kind, program.envelope.cases.values()))
-        for kind in self._open.keys() - stay:
-            self._open.pop(kind).close()
+        for key in self._open.keys() - set(map(_key, program.envelope.cases.values())):
+            self._open.pop(key).close()
 
     def _view_of(self, program: Program) -> _View:
-        kinds = {name: _kind(case) for name, case in program.envelope.cases.items()}
-        for kind in kinds.values():
-            if kind not in self._open:
-                self._open[kind] = self._channel(kind)
-        channels = {name: self._open[kind] for name, kind in kinds.items()}
+        keys = {name: _key(case) for name, case in program.envelope.cases.items()}
+        for key in keys.values():
+            if key not in self._open:
+                schema = Schema(name=key.message, encoding="protobuf", data=key.descriptors)
+                self._open[key] = Channel(key.case, message_encoding="protobuf", schema=schema, context=self._context)
+        channels = {name: self._open[key] for name, key in keys.items()}
         return _View(program, Classifier(program.envelope, program.table), channels)
 
-    def _channel(self, kind: _Kind) -> Channel:
-        schema = Schema(name=kind.message, encoding="protobuf", data=kind.descriptors)
-        return Channel(kind.case, message_encoding="protobuf", schema=schema, context=self._context)
-
-    def _show(self, batch: Sequence[Mirrored]) -> None:
-        """Called by the mirror's thread. What is no payload for the router is not shown."""
-        program, known, channels = self._view
+    def _send(self, batch: Sequence[Mirrored]) -> None:
+        """Log the payloads of subscribed channels. Called by the mirror's thread."""
+        program, classifier, channels = self._view
         wanted = {case.number for name, case in program.envelope.cases.items() if channels[name].has_sinks()}
         for at, listener, _, data in batch:
-            if first_field(data) in wanted and (found := known.payload(listener, data)) is not None:
+            if first_field(data) in wanted and (found := classifier.encoded_payload(listener, data)) is not None:
                 case, payload = found
-                channels[case.name].log(payload.SerializeToString(), log_time=at)
+                channels[case.name].log(payload, log_time=at)
 
 
 def _started(address: Located[Address], name: str, context: Context, listener: ServerListener) -> WebSocketServer:
@@ -166,10 +162,10 @@ def _started(address: Located[Address], name: str, context: Context, listener: S
 
 class _DebugLog(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        logger.debug("foxglove says", what=record.getMessage())
+        logger.debug("message of foxglove-sdk", message=record.getMessage())
 
 
 _LOG = logging.getLogger("foxglove")
-"""Where the library tells who broke the rules of websockets or was too slow: seldom of use to an operator."""
+"""Where the library reports clients that broke the protocol or were too slow: seldom of use to an operator."""
 _LOG.propagate = False
 _LOG.addHandler(_DebugLog())

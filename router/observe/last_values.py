@@ -1,6 +1,6 @@
-"""The newest datagram of each payload case, while somebody looks: for a page, not for a record.
+"""The newest value of each payload case, for the status page.
 
-Knows the mirror and the envelope. Decodes when it is asked, and only what has come since.
+The mirror is attached while a page asks, and datagrams are decoded when it does.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from router.observe.running import Running
 from router.recording.mirror import Classifier, Mirrored, first_field
 
 LOOKED_AT_SECONDS = 5.0
-"""For so long after it was asked last it watches on; a page asks every second."""
+"""How long the mirror stays attached after a request; a page asks every second."""
 
 MOST_ELEMENTS = 24
 MOST_CHARACTERS = 200
@@ -26,31 +26,31 @@ Value = dict[str, Any]
 
 
 class LastValues:
-    """Costs nothing while nobody asks."""
+    """The newest datagram of each payload case since the first of requests that follow one another."""
 
     def __init__(self, running: Running) -> None:
         self._running = running
-        self._fresh: dict[int, Mirrored] = {}
+        self._newest: dict[int, Mirrored] = {}  # by the number of the first field
         self._values: dict[str, Value] = {}
         self._detach: Callable[[], None] | None = None
         self._until = 0.0
         self._lock = threading.Lock()
-        self._taking = threading.Lock()
+        self._newest_lock = threading.Lock()
         self._closing = threading.Event()
 
     def of(self, program: Program) -> Mapping[str, Value]:
-        """By payload case: `at` (s), `source`, `bytes`, and its `fields`. Nothing comes before it was asked once."""
+        """Return by payload case: `at` (s), `source`, `bytes`, and its `fields`. The first request returns nothing."""
         with self._lock:
             self._until = monotonic() + LOOKED_AT_SECONDS
             if self._detach is None and not self._closing.is_set():
                 self._values = {}
                 self._detach = self._running.mirror.attach(self._take)
                 threading.Thread(target=self._end_when_idle, name="last values", daemon=True).start()
-            with self._taking:
-                fresh, self._fresh = self._fresh, {}
-            known = Classifier(program.envelope, program.table)
-            for shown in fresh.values():
-                self._keep(shown, known)
+            with self._newest_lock:
+                newest, self._newest = self._newest, {}
+            classifier = Classifier(program.envelope, program.table)
+            for datagram in newest.values():
+                self._decode(datagram, classifier)
             return dict(self._values)
 
     def close(self) -> None:
@@ -60,20 +60,20 @@ class LastValues:
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
         """Called by the mirror's thread."""
-        with self._taking:
-            for shown in batch:
-                _, _, _, data = shown
-                self._fresh[first_field(data)] = shown
+        with self._newest_lock:
+            for datagram in batch:
+                _, _, _, data = datagram
+                self._newest[first_field(data)] = datagram
 
-    def _keep(self, shown: Mirrored, known: Classifier) -> None:
-        at, listener, (host, port), data = shown
-        if (found := known.payload(listener, data)) is None:
+    def _decode(self, datagram: Mirrored, classifier: Classifier) -> None:
+        at, listener, peer, data = datagram
+        if (found := classifier.payload(listener, data)) is None:
             return  # the page shows it among what was rejected
         case, payload = found
         fields = MessageToDict(payload, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
         self._values[case.name] = {
             "at": at / 1e9,
-            "source": known.sender(listener, (host, port)) or f"{host}:{port}",
+            "source": classifier.sender(listener, peer) or f"{peer[0]}:{peer[1]}",
             "bytes": len(data),
             "fields": shortened(fields),
         }
@@ -92,7 +92,7 @@ class LastValues:
 
 
 def shortened(value: Any) -> Any:
-    """Without what nobody reads on a page: the rest of long lists and of long texts."""
+    """Return the value with long lists and long texts cut."""
     if isinstance(value, dict):
         return {key: shortened(inner) for key, inner in value.items()}
     if isinstance(value, list):

@@ -289,12 +289,10 @@ class Recorder:
                 file.write(chunk)
                 if monotonic_ns() >= self._due and not self._closing:
                     self._write()
-        except OSError:
-            if file.is_empty:
-                file.path.unlink(missing_ok=True)
+        except Exception:
+            file.abandon()
             raise
-        finally:
-            file.close()
+        file.close()
         return file.path
 
     def _about(self, reason: str) -> dict[str, str]:

@@ -11,6 +11,7 @@ import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
@@ -79,11 +80,6 @@ class RecordingFile:
         except OSError:
             return True
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether there is no chunk in it."""
-        return not self._indexes
-
     def write(self, chunk: Chunk) -> None:
         """Append a chunk. What could not be written whole is cut off again."""
         new = sorted(chunk.messages.keys() - self._messages.keys())
@@ -124,6 +120,13 @@ class RecordingFile:
             self.sync()
         finally:
             os.close(self._descriptor)
+
+    def abandon(self) -> None:
+        """Close a file that could not be written further; remove it where there is no chunk in it."""
+        if not self._indexes:
+            self.path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.close()
 
     def _end(self) -> bytes:
         """Return data end, summary and footer."""
@@ -324,4 +327,6 @@ class ContinuousWriter:
             remedy = "make room, or give `record` a smaller `keep`"
             logger.error("cannot record; trying again every 10 s", where=where, problem=error.strerror, remedy=remedy)
         self._retry_at = now + _RETRY
-        self.close()
+        if self._file is not None:
+            self._file.abandon()
+            self._file = None

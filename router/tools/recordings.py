@@ -1,29 +1,90 @@
-"""A recording sent again, datagram by datagram, when and from where it came as far as that can be had.
-
-Knows sockets and the table's addresses, no payloads.
-"""
+"""Recordings that tools make of a running router's tap, and recordings that they send again."""
 
 from __future__ import annotations
 
 import re
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic_ns, time_ns
 
 from router.errors import TransportError, UsageError, did_you_mean
+from router.observe.tap import Lost
+from router.recording.channels import Channels
+from router.recording.encoder import Encoder
+from router.recording.mirror import Classifier, MirroredDatagram
 from router.recording.reader import Recorded, Recording
+from router.recording.recorder import PERIOD
+from router.recording.writer import RecordingFile
 from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools import places
+from router.types.protobuf import Envelope
 
 MOST_SOCKETS = 256
 
 _RATE = re.compile(r"([0-9]*\.?[0-9]+)x?")
 
 
+class TapRecording:
+    """One file, complete once it is closed; `datagrams` and `missed` count. Raises UsageError where it cannot write."""
+
+    def __init__(self, path: Path, envelope: Envelope, table: RouteTable) -> None:
+        self.path = path
+        self.datagrams = self.missed = 0
+        channels = Channels()
+        self._encoder = Encoder(channels)
+        self._classifier = Classifier(envelope, table)
+        self._written_at = monotonic_ns()
+        try:
+            self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})
+        except FileExistsError:
+            raise UsageError(f"{path} exists; choose another name") from None
+        except OSError as error:
+            raise UsageError(f"cannot write {path}: {error.strerror}") from error
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file so far."""
+        return self._file.size
+
+    def take(self, batch: Iterable[MirroredDatagram | Lost]) -> None:
+        """Batches have to come once a second, be they empty, so that what came before is written."""
+        datagrams: list[MirroredDatagram] = []
+        for each in batch:
+            if isinstance(each, Lost):
+                self.missed += each.number
+            else:
+                datagrams.append(each)
+        self.datagrams += len(datagrams)
+        self._encoder.add(datagrams, self._classifier, time_ns(), monotonic_ns())
+        if monotonic_ns() - self._written_at >= PERIOD:
+            self._write()
+
+    def close(self) -> None:
+        """Write what is left, and what readers seek by."""
+        self._write()
+        try:
+            self._file.close()
+        except OSError as error:
+            raise UsageError(f"{self.path} could not be finished: {error.strerror}") from error
+
+    def _write(self) -> None:
+        self._written_at = monotonic_ns()
+        chunk = self._encoder.take()
+        if chunk is None:
+            return
+        try:
+            self._file.write(chunk)
+            self._file.sync()
+        except OSError as error:
+            raise UsageError(f"cannot go on writing {self.path}: {error.strerror}") from error
+
+
 def parse_rate(text: str) -> float | None:
-    """`2x`, `0.5x`; None for `max`. Raises UsageError."""
+    """Parse `2x` or `0.5x`; return None for `max`. Raises UsageError."""
     if text == "max":
         return None
     found = _RATE.fullmatch(text)
@@ -33,7 +94,10 @@ def parse_rate(text: str) -> float | None:
 
 
 def on_time(recording: Recording, rate: float | None) -> Iterator[Recorded]:
-    """Each datagram when it is due; None is without waiting. A clock that was set meanwhile changes nothing."""
+    """Yield each datagram when it is due; without waiting where `rate` is None.
+
+    A clock that was set during the recording changes nothing.
+    """
     start, first = 0.0, None
     for found in recording.datagrams():
         if first is None:
@@ -47,9 +111,9 @@ def on_time(recording: Recording, rate: float | None) -> Iterator[Recorded]:
 
 @dataclass(slots=True)
 class Resent:
-    """What was sent. `refused` are answers that nobody listens there.
+    """What was sent. `refused` counts answers that nobody listens at the destination.
 
-    `elsewhere` are the senders whose address this computer does not have, with that address.
+    `elsewhere` has the senders whose address this computer does not have, with that address.
     """
 
     datagrams: int = 0
@@ -58,10 +122,10 @@ class Resent:
 
 
 class Replayer:
-    """Sends to `to`, or where `table` has the listener; from `origin`, or from where it came.
+    """Sends to `to`, or to the listener's address in `table`; from `origin`, or from the sender's address.
 
-    Where it came from is the address that `table` has for the endpoint, else the recorded one. What this computer
-    cannot send from is sent from any address, and noted in `resent`.
+    The sender's address is that of the endpoint in `table`, else the recorded one. Where this computer does not have
+    it, any address is used, and `resent` says so.
     """
 
     def __init__(self, table: RouteTable | None, to: Address | None, origin: Address | None) -> None:
@@ -82,7 +146,7 @@ class Replayer:
         try:
             try:
                 sender.send(found.data)
-            except ConnectionRefusedError:  # told of an earlier one, in place of sending this one
+            except ConnectionRefusedError:  # the answer to an earlier datagram; this one was not sent
                 self.resent.refused += 1
                 sender.send(found.data)
         except OSError as error:

@@ -1,21 +1,25 @@
-"""`router replay FILE` as it is typed: what is sent, from where, in which order, and what is said when it cannot be."""
+"""`router record` beside a router, and `router replay`: what is in the file, what is sent, what is said otherwise."""
 
 from __future__ import annotations
 
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from router.cli import main
 from router.errors import UsageError
+from router.observe.tap import Lost
 from router.recording.reader import Recorded, Recording
-from router.tools.replaying import on_time, parse_rate
+from router.tools import recordings
+from router.tools.recordings import TapRecording, on_time, parse_rate
 from tests.ports import free_port
-from tests.recording.recorder_rig import MILLISECOND, START, imu, recorded, seen
-from tests.tables import PROTOS
+from tests.recording.recorder_rig import MILLISECOND, START, again, imu, read, recorded, seen, wire
+from tests.recording.recorder_rig import table as rig_table
+from tests.tables import PROTOS, RIG
 
 BOARD, STRANGER = ("127.0.6.30", 40001), ("127.0.6.99", 40002)
 ELSEWHERE = ("198.51.100.7", 5000)
@@ -24,6 +28,7 @@ BATCHES = (
     seen(imu(3), b"", imu(4), at=START + 50 * MILLISECOND, peer=STRANGER),
 )
 SENT = [each.data for batch in BATCHES for each in batch]
+TAPPED = seen(imu(1), b"bad", imu(2))
 
 TABLE = """\
 version: 1
@@ -166,3 +171,51 @@ def test_rates(text: str, rate: float | None) -> None:
 def test_what_is_no_rate_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is no rate"):
         parse_rate(text)
+
+
+def recording(path: Path) -> TapRecording:
+    return TapRecording(path, wire().envelope, rig_table())
+
+
+def test_what_the_tap_shows_is_in_the_file_and_what_it_lost_is_counted(tmp_path: Path) -> None:
+    with closing(recording(tmp_path / "it.mcap")) as made:
+        made.take(TAPPED[:1])
+        made.take([Lost(7), *TAPPED[1:]])
+        made.take([])
+    assert (made.datagrams, made.missed) == (3, 7)
+    assert [again(each) for each in read(tmp_path / "it.mcap")] == TAPPED
+    assert made.size == (tmp_path / "it.mcap").stat().st_size
+
+
+def test_what_came_is_written_before_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recordings, "PERIOD", 0)
+    with closing(recording(tmp_path / "it.mcap")) as made:
+        made.take(TAPPED)
+        assert [again(each) for each in read(tmp_path / "it.mcap")] == TAPPED
+
+
+def test_a_file_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "it.mcap").write_text("mine")
+    with pytest.raises(UsageError, match="exists; choose another name"):
+        recording(tmp_path / "it.mcap")
+    assert (tmp_path / "it.mcap").read_text() == "mine"
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"cannot write .*: No such file or directory"):
+        recording(tmp_path / "nowhere" / "it.mcap")
+
+
+@pytest.mark.parametrize("words", [[], ["--last"]])
+def test_a_router_that_does_not_run_is_told(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(RIG)
+    url = f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
+    assert main(["record", *words, "--url", url]) == 1
+    assert f"router record: no router answers at {url}" in capsys.readouterr().err
+
+
+def test_the_last_minute_goes_where_the_router_says(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["record", "--last", "-o", "it.mcap"]) == 2
+    assert "--last writes to the directory of the table's 'record'" in capsys.readouterr().err
