@@ -176,9 +176,11 @@ class Recorder:
         if self._thread.is_alive():
             event = "the disk is too slow to finish the recordings; they can be read as far as they were written"
             logger.error(event, directory=str(self._directory.path))
+        else:
+            self._wake_up.close()
 
     def _wake(self) -> None:
-        with suppress(ValueError):  # it has ended
+        with suppress(ValueError):  # it is closed
             self._wake_up.set()
 
     def _take(self, batch: Sequence[Mirrored]) -> None:
@@ -201,7 +203,6 @@ class Recorder:
         self._save_requested()
         if self._trips:
             self._save_trips()
-        self._wake_up.close()
 
     def _write(self) -> None:
         """Encode and write all that is queued. What a fault loses is counted, and the rest goes on."""

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+from hypothesis import strategies as st
+
 from router.compiler.program import Program
 from router.engine.wire import Wire, wire_of_protos
 from router.errors import Located, SourceSpan
@@ -38,6 +40,27 @@ def wire() -> Wire:
 def imu(accel_x: float = 1.5) -> bytes:
     case = wire().case("imu_info")
     return wire().encode(case, case.message_class(accel_x=accel_x, accel_z=9.81))
+
+
+@st.composite
+def datagrams(draw: st.DrawFn) -> bytes:
+    """What boards send, what is left of it, and what nobody sends."""
+    kind = draw(st.sampled_from(["bytes", "payload", "cut", "changed", "padded", "long length"]))
+    if kind == "bytes":
+        return draw(st.binary(max_size=300))
+    case = draw(st.sampled_from(list(wire().envelope.cases.values())))
+    if kind == "long length":
+        return bytes([case.number << 3 & 0x7F | 2, 0x80, 0]) if case.number < 16 else b"\x82\x01\x80\x00"
+    exact = wire().encode(case, case.message_class())
+    if kind == "payload":
+        return exact
+    whole = draw(st.sampled_from([exact, imu(draw(st.floats(width=32, allow_nan=False)))]))
+    if kind == "cut":
+        return whole[: draw(st.integers(0, len(whole)))]
+    if kind == "padded":
+        return whole + bytes(draw(st.integers(1, 40)))
+    position = draw(st.integers(0, len(whole) - 1))
+    return whole[:position] + bytes([draw(st.integers(0, 255))]) + whole[position + 1 :]
 
 
 def endpoints() -> dict[str, Endpoint]:

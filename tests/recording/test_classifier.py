@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import given
 
 from router.compiler import check_table
 from router.engine import MAX_DATAGRAM
 from router.recording.mirror import Classifier, first_field
 from router.types.protobuf import PayloadCase
 from tests.observe.fake_running import sim_program
+from tests.recording.recorder_rig import classifier, datagrams
 from tests.tables import ROUTES
 
 PROGRAM = sim_program()
@@ -34,6 +36,17 @@ def test_the_first_field_of_a_datagram_is_its_case(case: PayloadCase) -> None:
 def test_what_begins_with_no_short_tag_has_no_first_field_and_no_payload(data: bytes) -> None:
     assert first_field(data) == 0
     assert case_in(data) is None
+
+
+@given(datagrams())
+def test_an_encoded_payload_is_the_payload(data: bytes) -> None:
+    known = classifier()
+    decoded, encoded = known.payload("rover", data), known.encoded_payload("rover", data)
+    assert (decoded is None) == (encoded is None)
+    if decoded is not None and encoded is not None:
+        case, payload = encoded
+        assert case is decoded[0]
+        assert case.message_class.FromString(payload).SerializeToString() == decoded[1].SerializeToString()
 
 
 def test_what_is_longer_than_the_router_takes_has_no_payload() -> None:

@@ -21,6 +21,7 @@ from tests.recording.recorder_rig import (
     STRANGER,
     again,
     classifier,
+    datagrams,
     encoded,
     imu,
     read,
@@ -32,27 +33,6 @@ from tests.recording.recorder_rig import (
 )
 
 PEERS = st.sampled_from([SENSOR_BOARD, STRANGER, ("0.0.0.0", 0), ("255.255.255.255", 65535)])
-
-
-@st.composite
-def datagrams(draw: st.DrawFn) -> bytes:
-    """What boards send, what is left of it, and what nobody sends."""
-    kind = draw(st.sampled_from(["bytes", "payload", "cut", "changed", "padded", "long length"]))
-    if kind == "bytes":
-        return draw(st.binary(max_size=300))
-    case = draw(st.sampled_from(list(wire().envelope.cases.values())))
-    if kind == "long length":
-        return bytes([case.number << 3 & 0x7F | 2, 0x80, 0]) if case.number < 16 else b"\x82\x01\x80\x00"
-    exact = wire().encode(case, case.message_class())
-    if kind == "payload":
-        return exact
-    whole = draw(st.sampled_from([exact, imu(draw(st.floats(width=32, allow_nan=False)))]))
-    if kind == "cut":
-        return whole[: draw(st.integers(0, len(whole)))]
-    if kind == "padded":
-        return whole + bytes(draw(st.integers(1, 40)))
-    position = draw(st.integers(0, len(whole) - 1))
-    return whole[:position] + bytes([draw(st.integers(0, 255))]) + whole[position + 1 :]
 
 
 @given(st.lists(st.lists(st.builds(lambda data, peer: (data, peer), datagrams(), PEERS), min_size=1), min_size=1))

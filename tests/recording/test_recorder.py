@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Event, Thread
@@ -236,17 +236,25 @@ def test_a_disk_that_is_full_from_the_start_gets_no_empty_files(
     assert files(tmp_path) == []
 
 
+def test_a_disk_with_room_for_the_head_of_a_file_only_gets_no_empty_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_module, "_RETRY", 1)
+    with running_recorder(tmp_path) as (made, mirror):
+        monkeypatch.setattr(os, "write", _full_after_the_head)
+        show(made, mirror, now(imu(1)))
+        show(made, mirror, now(imu(2)))
+        assert files(tmp_path) == []
+        monkeypatch.undo()
+
+
 def test_what_cannot_be_saved_leaves_no_empty_file_and_can_be_saved_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = os.write
-
-    def full_after_the_head(descriptor: int, data: bytes) -> int:
-        return real(descriptor, data) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
-
     with running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
         mirror.show(batch := now(imu(1), imu(2)))
-        monkeypatch.setattr(os, "write", full_after_the_head)
+        monkeypatch.setattr(os, "write", _full_after_the_head)
         with pytest.raises(RecordError, match="No space left"):
             made.save("http")
         assert files(tmp_path) == []
@@ -284,6 +292,10 @@ def test_what_comes_after_the_end_is_refused(tmp_path: Path) -> None:
 
 def _full(descriptor: int, data: bytes) -> int:
     raise OSError(28, "No space left on device")
+
+
+def _full_after_the_head(descriptor: int, data: bytes, real: Callable[[int, bytes], int] = os.write) -> int:
+    return real(descriptor, data) if bytes(data[:1]) == b"\x89" else _full(descriptor, data)
 
 
 def test_what_a_slow_disk_has_no_room_for_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -363,7 +375,8 @@ def test_trips_that_came_too_soon_are_saved_at_the_end(tmp_path: Path) -> None:
             sleep(0.01)
         made.save("first")  # one thread saves: it has finished that one before
         made.deadman_tripped("drive_motor")  # too soon: kept for the end
-    assert len(files(tmp_path)) == 3
+        mirror.show(now(imu(2), b"bad"))
+    assert [len(read(path)) for path in files(tmp_path)] == [1, 1, 3]
 
 
 def test_a_disk_that_hangs_holds_up_a_stop_for_a_moment_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
