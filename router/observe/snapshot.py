@@ -32,6 +32,10 @@ SERIES: Mapping[str, Labels] = {metric.name: metric.labels for metric in METRICS
 }
 """Labels by the name of the metric, as a snapshot has it: without prefix and `_total`."""
 
+_EXPORTED = {PREFIX + name: name for name in SERIES} | {
+    f"{PREFIX}{metric.name}_total": metric.name for metric in METRICS if metric.kind == "counter"
+}
+
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
@@ -76,10 +80,10 @@ def snapshot(families: Iterable[Family], at: float, metrics: Collection[str] | N
         if metrics is not None and family.name.removeprefix(PREFIX) not in metrics:
             continue
         for sample in family.samples:
-            name = sample.name.removeprefix(PREFIX).removesuffix("_total")
-            if name in SERIES:
-                values[name][tuple(sample.labels[label] for label in SERIES[name])] = sample.value
-            elif name == "build_info":
+            if (name := _EXPORTED.get(sample.name)) is not None:
+                labels = sample.labels
+                values[name][tuple([labels[label] for label in SERIES[name]])] = sample.value
+            elif sample.name == f"{PREFIX}build_info":
                 table_sha256 = sample.labels.get("table_sha256", "")
     return Snapshot(at, values, table_sha256)
 
