@@ -26,7 +26,7 @@ OK, WARN, ERROR, STALE = (bytes([level]) for level in range(4))
 TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 
 
-Told = Mapping[str, Any]
+Reported = Mapping[str, Any]
 """The newest status of everything, by name without the node's."""
 
 
@@ -37,19 +37,19 @@ class Monitor:
         self._listener = listener
         self.stamps: list[float] = []
 
-    def until(self, condition: Callable[[Told], bool], meanwhile: Callable[[], None] = lambda: None) -> Told:
-        """What was told when it became true."""
+    def until(self, condition: Callable[[Reported], bool], meanwhile: Callable[[], None] = lambda: None) -> Reported:
+        """What was reported when it became true."""
         deadline = monotonic() + PATIENCE
-        told: Told = {}
+        reported: Reported = {}
         while monotonic() < deadline:
             meanwhile()
             for cdr, _ in self._listener.take(0.1):
                 message = self._listener.message(cdr)
                 self.stamps.append(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
-                told = {status.name.removeprefix("rover_router: "): status for status in message.status}
-                if condition(told):
-                    return told
-        raise AssertionError(str(told))
+                reported = {status.name.removeprefix("rover_router: "): status for status in message.status}
+                if condition(reported):
+                    return reported
+        raise AssertionError(str(reported))
 
 
 @contextmanager
@@ -62,9 +62,9 @@ def monitored(folder: Path) -> Iterator[tuple[Site, Monitor]]:
             yield place, Monitor(listener)
 
 
-def levels(*expected: bytes) -> Callable[[Told], bool]:
+def levels(*expected: bytes) -> Callable[[Reported], bool]:
     """Of the sensor board, and of a route from it."""
-    return lambda told: (told["endpoint/sensor_board"].level, told["route/imu_info"].level) == expected
+    return lambda reported: (reported["endpoint/sensor_board"].level, reported["route/imu_info"].level) == expected
 
 
 def test_a_monitor_sees_boards_come_and_go_and_what_is_refused(tmp_path: Path) -> None:
@@ -73,18 +73,18 @@ def test_a_monitor_sees_boards_come_and_go_and_what_is_refused(tmp_path: Path) -
         def send() -> None:
             place.send(FLOWS["imu_info"].source, next(generated("imu_info")).datagram)
 
-        told = monitor.until(levels(OK, OK), send)
-        assert told["router"].level == OK
-        told = monitor.until(levels(STALE, STALE))
-        assert "sensor_board is silent for" in told["route/imu_info"].message
+        reported = monitor.until(levels(OK, OK), send)
+        assert reported["router"].level == OK
+        reported = monitor.until(levels(STALE, STALE))
+        assert "sensor_board is silent for" in reported["route/imu_info"].message
         monitor.until(levels(OK, OK), send)
 
         place.send("sensor_board", b"\xff" * 30)
-        told = monitor.until(lambda told: told["listener/rover"].level == WARN)
-        assert "rejected 1: malformed" in told["listener/rover"].message
+        reported = monitor.until(lambda reported: reported["listener/rover"].level == WARN)
+        assert "rejected 1: malformed" in reported["listener/rover"].message
 
         place.endpoints["basestation"].close()
-        told = monitor.until(levels(OK, ERROR), send)
-        assert "basestation: send_error" in told["route/imu_info"].message
-        assert told["endpoint/basestation"].level == ERROR
+        reported = monitor.until(levels(OK, ERROR), send)
+        assert "basestation: send_error" in reported["route/imu_info"].message
+        assert reported["endpoint/basestation"].level == ERROR
         assert all(later > earlier for earlier, later in pairwise(monitor.stamps))

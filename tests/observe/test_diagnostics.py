@@ -115,16 +115,16 @@ def test_all_is_well_while_nothing_goes_wrong(router: Counting) -> None:
 
 def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Counting) -> None:
     router.hear("sensor_board")
-    told = router.after(3)
-    assert told["endpoint/sensor_board"].level == told["route/imu_info"].level == Level.OK
-    told = router.after(0.1)
-    assert told["endpoint/sensor_board"].level == told["route/imu_info"].level == Level.STALE
-    assert told["route/imu_info"].message == "sensor_board is silent for 3.1 s"
-    assert told["route/drive_diag"].level == Level.OK  # another board, with more patience
+    reported = router.after(3)
+    assert reported["endpoint/sensor_board"].level == reported["route/imu_info"].level == Level.OK
+    reported = router.after(0.1)
+    assert reported["endpoint/sensor_board"].level == reported["route/imu_info"].level == Level.STALE
+    assert reported["route/imu_info"].message == "sensor_board is silent for 3.1 s"
+    assert reported["route/drive_diag"].level == Level.OK  # another board, with more patience
     router.hear("sensor_board")
-    told = router.after(1)
-    assert told["endpoint/sensor_board"].level == told["route/imu_info"].level == Level.OK
-    assert ("silent for", "1.0 s") in told["endpoint/sensor_board"].values
+    reported = router.after(1)
+    assert reported["endpoint/sensor_board"].level == reported["route/imu_info"].level == Level.OK
+    assert ("silent for", "1.0 s") in reported["endpoint/sensor_board"].values
 
 
 def test_an_endpoint_that_was_never_heard_is_silent_since_the_start(router: Counting) -> None:
@@ -156,44 +156,44 @@ def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Countin
 def test_drops_are_told_with_their_reasons_for_as_long_as_anybody_may_need_to_look(router: Counting) -> None:
     router.add(7, "messages_dropped", "imu_info", "imu/mag", "mapping_error")
     for _ in range(SNAPSHOTS - 1):
-        told = router.after(1)["route/imu_info"]
-        assert (told.level, told.message) == (Level.WARN, "dropped 7 for imu/mag: mapping_error")
+        reported = router.after(1)["route/imu_info"]
+        assert (reported.level, reported.message) == (Level.WARN, "dropped 7 for imu/mag: mapping_error")
         router.hear("sensor_board")
-    told = router.after(1)["route/imu_info"]
-    assert told.level == Level.OK
-    assert ("dropped for imu/mag: mapping_error", "7") in told.values
+    reported = router.after(1)["route/imu_info"]
+    assert reported.level == Level.OK
+    assert ("dropped for imu/mag: mapping_error", "7") in reported.values
 
 
 def test_what_the_network_refuses_is_an_error_of_the_route_and_of_the_endpoint(router: Counting) -> None:
     for route in ("imu_info", "gps_info"):
         router.add(2, "messages_dropped", route, "basestation", "send_error")
-    told = router.after(1)
-    assert told["route/imu_info"].level == told["route/gps_info"].level == Level.ERROR
-    assert told["endpoint/basestation"].message == "dropped 4 for basestation: send_error"
-    assert told["endpoint/basestation"].level == Level.ERROR
-    assert ("dropped: send_error", "4") in told["endpoint/basestation"].values
-    assert told["endpoint/sensor_board"].level == Level.OK
+    reported = router.after(1)
+    assert reported["route/imu_info"].level == reported["route/gps_info"].level == Level.ERROR
+    assert reported["endpoint/basestation"].message == "dropped 4 for basestation: send_error"
+    assert reported["endpoint/basestation"].level == Level.ERROR
+    assert ("dropped: send_error", "4") in reported["endpoint/basestation"].values
+    assert reported["endpoint/sensor_board"].level == Level.OK
 
 
 def test_what_the_table_asks_for_is_no_warning(router: Counting) -> None:
     router.add(9, "messages_dropped", "dashboard", "/cmd_vel", "rate_limited")
     router.add(9, "datagrams_rejected", "rover", "ignored")
-    told = router.after(1)
-    assert told["gateway/dashboard"].level == told["listener/rover"].level == Level.OK
+    reported = router.after(1)
+    assert reported["gateway/dashboard"].level == reported["listener/rover"].level == Level.OK
 
 
 def test_a_deadman_that_acts_is_an_error_before_all_else(router: Counting) -> None:
     router.set_to(1, "deadman_active", "manual_drive")
     router.add(3, "deadman_send_errors", "manual_drive", "driving_board")
-    told = router.after(6)
-    assert told["route/manual_drive"].level == Level.ERROR
-    assert told["route/manual_drive"].message == (
+    reported = router.after(6)
+    assert reported["route/manual_drive"].level == Level.ERROR
+    assert reported["route/manual_drive"].message == (
         "the deadman could not send 3 to driving_board; "
         "commands stopped coming: the deadman sends in their place; "
         "basestation is silent for 6.0 s, since the router started"
     )
-    assert told["endpoint/driving_board"].level == Level.ERROR
-    assert told["route/manual_arm"].level == Level.STALE
+    assert reported["endpoint/driving_board"].level == Level.ERROR
+    assert reported["route/manual_arm"].level == Level.STALE
 
 
 def test_a_deadman_of_what_clients_send_is_the_gateways(router: Counting) -> None:
@@ -204,8 +204,8 @@ def test_a_deadman_of_what_clients_send_is_the_gateways(router: Counting) -> Non
 def test_listeners_tell_what_was_rejected_and_what_the_kernel_dropped(router: Counting) -> None:
     router.add(4, "datagrams_rejected", "rover", "malformed")
     router.kernel_drops = 2
-    told = router.after(1)["listener/rover"]
-    assert (told.level, told.message) == (Level.WARN, "the kernel dropped 2; rejected 4: malformed")
+    reported = router.after(1)["listener/rover"]
+    assert (reported.level, reported.message) == (Level.WARN, "the kernel dropped 2; rejected 4: malformed")
 
 
 def test_a_failed_reload_is_told(router: Counting) -> None:
@@ -220,9 +220,9 @@ def test_rates_are_of_the_last_seconds(router: Counting) -> None:
 
 
 def test_hardware_is_the_endpoints_address_and_else_this_computer(router: Counting) -> None:
-    told = router.after(1)
-    assert told["endpoint/sensor_board"].hardware_id == "192.168.0.30:8"
-    assert told["route/imu_info"].hardware_id == told["router"].hardware_id != ""
+    reported = router.after(1)
+    assert reported["endpoint/sensor_board"].hardware_id == "192.168.0.30:8"
+    assert reported["route/imu_info"].hardware_id == reported["router"].hardware_id != ""
 
 
 # ---- bytes ------------------------------------------------------------------------------------------------------
@@ -239,8 +239,8 @@ STATUSES = st.builds(
 
 
 @given(st.integers(0, 2**31 * SECOND - 1), TEXTS, st.lists(STATUSES, max_size=4))
-def test_rclpy_reads_the_bytes_as_what_was_told(stamp: int, node: str, told: list[Status]) -> None:
-    data = diagnostic_array(stamp, node, told)
+def test_rclpy_reads_the_bytes_as_what_was_told(stamp: int, node: str, reported: list[Status]) -> None:
+    data = diagnostic_array(stamp, node, reported)
     message = deserialize_message(data, DiagnosticArray)
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(stamp, SECOND)
     assert [
@@ -252,7 +252,7 @@ def test_rclpy_reads_the_bytes_as_what_was_told(stamp: int, node: str, told: lis
             tuple((value.key, value.value) for value in status.values),
         )
         for status in message.status
-    ] == [status._replace(name=f"{node}: {status.name}") for status in told]
+    ] == [status._replace(name=f"{node}: {status.name}") for status in reported]
 
 
 def test_levels_are_those_of_the_message() -> None:
