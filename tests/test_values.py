@@ -20,7 +20,7 @@ from router.errors import UsageError
 from router.types.protobuf import PayloadCase
 from router.values import compact, float_text, protobuf_tree, rate_text, ros_json, ros_tree, set_fields, words
 
-PROTOS = Path(__file__).parents[1] / "protos"
+PROTOS = Path(__file__).parent / "protos"
 
 
 @pytest.fixture(scope="module")
