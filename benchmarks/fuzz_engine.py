@@ -175,7 +175,7 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
 
     outlets = plain_outlets(
         program.counters,
-        {plan.endpoint: send for plan in program.senders},
+        {plan.name: send for plan in program.senders},
         {plan.label: publish for plan in program.publishers},
         _forget,
         counts=counts,

@@ -197,6 +197,6 @@ def test_the_client_that_sends_sends_what_the_simulated_rover_lets_in(tmp_path: 
             sent = gateway.received.get(timeout=PATIENCE)
     finally:
         gateway.close()
-    assert (sent["op"], sent["topic"]) == ("publish", inbound.topic)
+    assert (sent["op"], sent["topic"]) == ("publish", inbound.label)
     assert isinstance(sent["time"], float)
     assert cdr_builder(inbound.type, Style.PLAIN)(sent["data"])

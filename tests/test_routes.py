@@ -168,7 +168,7 @@ def published(rover: Program) -> Publish:
         topics = [plan.label for plan in rover.publishers]
         outlets = plain_outlets(
             rover.counters,
-            send={sender.endpoint: len for sender in rover.senders},
+            send={sender.name: len for sender in rover.senders},
             publish={topic: partial(sent.__setitem__, topic) for topic in topics},
             report=reports.append,
             wall_ns=WALL_NS,

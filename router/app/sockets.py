@@ -67,22 +67,21 @@ class Sockets:
 
     def prepare(self, program: Program) -> SocketChange:
         """Open the sockets of `program` that are not open yet. Raises StartError, with nothing changed."""
-        table = program.table
         with ExitStack() as opening:
             listeners = {}
             for plan in program.listeners:
                 listener = self._bound.get(plan.bound_to)
                 if listener is None or is_replaceable(listener):
-                    listener = Listener(plan, table.listeners[plan.name].address.span)
+                    listener = Listener(plan)
                     opening.callback(listener.close)
                 listeners[plan.name] = listener
             senders = {}
             for to in program.senders:
-                address, sender = self._senders.get(to.endpoint, (None, None))
-                if sender is None or address != to.address:
-                    sender = Sender(to, table.endpoints[to.endpoint].address.span)
+                address, sender = self._senders.get(to.name, (None, None))
+                if sender is None or address != to.address.value:
+                    sender = Sender(to)
                     opening.callback(sender.close)
-                senders[to.endpoint] = sender
+                senders[to.name] = sender
             return SocketChange(program, listeners, senders, opening.pop_all())
 
     def left(self, change: SocketChange) -> list[Listener]:
@@ -102,7 +101,7 @@ class Sockets:
             listener.follow(plans[name])
         self.listeners = change.listeners
         self._bound = {plans[name].bound_to: listener for name, listener in change.listeners.items()}
-        self._senders = {to.endpoint: (to.address, change.senders[to.endpoint]) for to in change.program.senders}
+        self._senders = {to.name: (to.address.value, change.senders[to.name]) for to in change.program.senders}
 
     def close_listeners(self) -> None:
         for listener in self.listeners.values():

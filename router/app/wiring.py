@@ -215,12 +215,12 @@ def _log_start(route: str, sent_to: Sequence[str]) -> None:
 
 def _pacers(program: Program, pacing: TimerThread, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
     pacers = {}
-    for plan in program.senders:
-        if plan.budget:
-            sending, budget = send[plan.endpoint], plan.budget
-            pacer = state.keep(("pacer", plan.endpoint, budget, sending), partial(Pacer, budget, sending))
+    for endpoint in program.senders:
+        if endpoint.budget:
+            sending, budget = send[endpoint.name], endpoint.budget
+            pacer = state.keep(("pacer", endpoint.name, budget, sending), partial(Pacer, budget, sending))
             pacing.add(pacer)  # before the timers that pass on to it, as they have to end first
-            pacers[plan.endpoint] = pacer
+            pacers[endpoint.name] = pacer
     return pacers
 
 

@@ -8,49 +8,50 @@ from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.errors import SourceSpan
-from router.table.model import Gateway, Inbound, Keep, Priority, Route, Topic
+from router.table.model import Deadman, Destination, Endpoint, Gateway, Inbound, Keep, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
-    """A destination or a topic. `name` is its label in the counters. Without a `plan` the datagram is forwarded.
+class CheckedTarget:
+    """A target of a route, as the table declares it, with what its check has found.
 
-    `reads` makes the variables of its expressions; None where they are made once for all targets of the route.
-    `deadmen` are the routes whose deadmen hear of each command to it.
+    `endpoint` is that of a destination, `type` that of a topic which is published. Without a `plan` the datagram is
+    forwarded unchanged; `rows` show the mapping that the plan was made of. `reads` makes the variables of the
+    expressions; None where they are made once for all targets of the route. `deadmen` are the routes whose deadmen
+    are fed or disarmed by each command to it.
     """
 
-    name: str
-    span: SourceSpan
-    is_topic: bool
-    reads: Reads | None
+    declared: Destination | Topic
+    endpoint: Endpoint | None = None
+    type: MessageType | None = None
+    reads: Reads | None = None
     when: Typed | None = None
-    max_rate: float | None = None
-    keep: Keep = Keep.FIRST
-    priority: Priority = Priority.TELEMETRY
-    has_budget: bool = False
-    trim: bool = False
     plan: Record | None = None
+    rows: tuple[Row, ...] = ()
+    priority: Priority = Priority.TELEMETRY
     deadmen: tuple[str, ...] = ()
+
+    @property
+    def topic(self) -> Topic | None:
+        return self.declared if isinstance(self.declared, Topic) else None
+
+    @property
+    def label(self) -> str:
+        """Its name in metrics: that of the endpoint or of the topic."""
+        declared = self.declared
+        return declared.topic.value if isinstance(declared, Topic) else declared.endpoint.value
+
+    @property
+    def span(self) -> SourceSpan:
+        return self.declared.span
 
     @property
     def is_deferred(self) -> bool:
         """Whether it may be served later, and by another thread."""
-        return self.has_budget or self.keep is Keep.LATEST
-
-
-@dataclass(frozen=True, slots=True)
-class CheckedTarget:
-    """A target with what its mapping came to, for `explain`.
-
-    `topic` and `type` are those of a ROS topic that is published. `rows` are empty for unchanged forwarding.
-    """
-
-    target: Target
-    topic: Topic | None = None
-    type: MessageType | None = None
-    rows: tuple[Row, ...] = ()
+        has_budget = self.endpoint is not None and self.endpoint.budget is not None
+        return has_budget or self.declared.keep is Keep.LATEST
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,19 +85,14 @@ class CheckedCollect:
 
 @dataclass(frozen=True, slots=True)
 class CheckedDeadman:
-    """What is sent when commands stop coming: the envelope, with its zeros, of a `case`.
+    """The deadman of a route. `datagram` is the envelope that it sends, with its zeros.
 
-    `to` are endpoint names, `timeout` and `repeat` in ns. `hands_over_to` are routes, not the cases of the table.
-    `at_start` as in the table's Deadman.
+    `hands_over_to` are the names of routes, not the payload cases of the table.
     """
 
-    timeout: int
-    repeat: int
-    case: PayloadCase
+    settings: Deadman
     datagram: bytes
-    to: tuple[str, ...]
     hands_over_to: tuple[str, ...]
-    at_start: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,10 +112,13 @@ class CheckedRoute:
 
 @dataclass(frozen=True, slots=True)
 class CheckedInbound:
-    """A topic that clients may publish on, with its absolute name. `stop` are the CDR bytes that its deadman sends."""
+    """A topic that clients may publish on; `label` is its absolute name.
 
-    inbound: Inbound
-    topic: str
+    `stop` are the CDR bytes of the message that its deadman sends.
+    """
+
+    settings: Inbound
+    label: str
     type: MessageType
     stop: bytes | None
 

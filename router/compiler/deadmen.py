@@ -16,7 +16,7 @@ from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
 from router.errors import Code, Diagnostic, MappingError, SourceSpan
-from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, Keep, Route
+from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, Keep, Route, RouteTable
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -43,9 +43,7 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
     datagram = _datagram(lookup, deadman, case)
     if datagram is None:
         return None
-    to = tuple(name.value for name in deadman.to)
-    timeout, repeat = deadman.timeout.value, deadman.repeat.value
-    return CheckedDeadman(timeout, repeat, case, datagram, to, hands_over_to, deadman.at_start)
+    return CheckedDeadman(deadman, datagram, hands_over_to)
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
@@ -140,6 +138,13 @@ def constant_plan(
     findings = [finding for finding in mapping.findings if finding.code is not Code.NOTHING_MAPPED]
     lookup.findings += findings
     return None if findings else mapping.plan
+
+
+def deadmen_of(table: RouteTable, route: Route, destination: Destination) -> tuple[str, ...]:
+    """The routes whose deadmen each command to `destination` feeds or disarms: its own route first."""
+    others = [other.name for other in table.routes if takes_over(route, destination.endpoint.value, other)]
+    feeds_own = route.deadman is not None and destination in feeding(route, route.deadman)
+    return (route.name, *others) if feeds_own else tuple(others)
 
 
 def feeding(route: Route, deadman: Deadman) -> list[Destination]:

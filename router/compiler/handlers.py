@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from router.compiler.cdr import write_message
-from router.compiler.checked import CheckedCollect, CheckedFeed, Target
+from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedTarget
 from router.compiler.expressions import Typed
 from router.compiler.metrics import DROP_REASONS, Counters
 from router.compiler.payload import write_envelope
@@ -44,7 +44,7 @@ class HandlerSource:
         """The targets that the function serves."""
         return tuple(self._serving.plans)
 
-    def inbound(self, targets: Sequence[Target], collect: CheckedCollect | None) -> None:
+    def inbound(self, targets: Sequence[CheckedTarget], collect: CheckedCollect | None) -> None:
         """Destinations first: forwarding waits for no mapping. Topics get whole frames where there is a `collect`."""
         named = [self._serving.named(target) for target in targets]
         with self._function("m", "datagram"):
@@ -52,8 +52,8 @@ class HandlerSource:
             if collect is None:
                 self._serving.serve(named)
             else:
-                self._serving.serve([(name, target) for name, target in named if not target.is_topic])
-                topics = [(name, target) for name, target in named if target.is_topic]
+                self._serving.serve([(name, target) for name, target in named if not target.topic])
+                topics = [(name, target) for name, target in named if target.topic]
                 self._collect(collect, topics)
                 self._serving.serve(topics)
             if not targets:
@@ -62,7 +62,7 @@ class HandlerSource:
     def outbound(self, feed: CheckedFeed) -> None:
         """The message is read once for all destinations. With `for_each` each element is a message of its own."""
         span, one_received = feed.topic.span, self._received(feed, "1")
-        named = [self._serving.named(served.target) for served in feed.targets]
+        named = [self._serving.named(target) for target in feed.targets]
         with self._function("cdr"):
             with self.out.block("try:", span):
                 feed.reads.write(self.out, span)
@@ -110,7 +110,7 @@ class HandlerSource:
         """What follows is for whole frames: `items`, of which `m` is the first."""
         span = collect.span
         for _, target in topics:
-            self.counters.index("messages_collected", self.route.name, target.name)
+            self.counters.index("messages_collected", self.route.name, target.label)
         self.out.line("# collect", span)
         with self.out.block("try:", span):
             collect.reads.write(self.out, span)
@@ -122,7 +122,7 @@ class HandlerSource:
         self.out.line("m, count = items[0], len(items)", span)
 
 
-NamedTarget = tuple[str, Target]
+NamedTarget = tuple[str, CheckedTarget]
 """A target with its part of the Python names."""
 
 
@@ -136,22 +136,22 @@ class ServingSource:
     counters: Counters
     plans: list[TargetPlan] = field(default_factory=list)
 
-    def named(self, target: Target) -> NamedTarget:
+    def named(self, target: CheckedTarget) -> NamedTarget:
         """Opens the target's series, which all exist from the start."""
         for reason in DROP_REASONS:
-            self.counters.index("messages_dropped", self.route.name, target.name, reason)
-        self.counters.index("messages_filtered", self.route.name, target.name)
-        delivered = ("messages_published",) if target.is_topic else ("datagrams_sent", "sent_bytes")
+            self.counters.index("messages_dropped", self.route.name, target.label, reason)
+        self.counters.index("messages_filtered", self.route.name, target.label)
+        delivered = ("messages_published",) if target.topic else ("datagrams_sent", "sent_bytes")
         for metric in delivered:
-            self.counters.index(metric, self.route.name, target.name)
-        name = self._unique(namespace_name(target.name))
+            self.counters.index(metric, self.route.name, target.label)
+        name = self._unique(namespace_name(target.label))
         self.plans.append(
             TargetPlan(
                 name=name,
-                target=target.name,
-                is_topic=target.is_topic,
-                max_rate=target.max_rate,
-                keep=target.keep,
+                target=target.label,
+                is_topic=target.topic is not None,
+                max_rate=target.declared.max_rate,
+                keep=target.declared.keep,
                 priority=target.priority,
                 is_deferred=target.is_deferred,
                 deadmen=target.deadmen,
@@ -168,9 +168,9 @@ class ServingSource:
     def serve(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:
         """`when` holds for all of them, beside what each has."""
         for name, target in targets:
-            self.out.line(f"# {'topic' if target.is_topic else 'destination'} {target.name}", target.span)
+            self.out.line(f"# {'topic' if target.topic else 'destination'} {target.label}", target.span)
             conditions = [condition for condition in (when, target.when) if condition is not None]
-            if not target.is_topic:
+            if not target.topic:
                 self._guarded(name, target, conditions, self._deliver if target.is_deferred else self._send)
                 continue
             with self.out.block(f"if wanted_{name}[0]:", target.span):
@@ -188,7 +188,7 @@ class ServingSource:
             self.out.line("return", span)
 
     def _guarded(
-        self, name: str, target: Target, conditions: Sequence[Typed], serve: Callable[[str, Target], None]
+        self, name: str, target: CheckedTarget, conditions: Sequence[Typed], serve: Callable[[str, CheckedTarget], None]
     ) -> None:
         """What fails for one target is counted there and leaves the others alone."""
         with self.out.block("try:", target.span):
@@ -199,7 +199,7 @@ class ServingSource:
             self.out.line(f"lost_{name}(error)", target.span)
 
     def _conditional(
-        self, name: str, target: Target, conditions: Sequence[Typed], serve: Callable[[str, Target], None]
+        self, name: str, target: CheckedTarget, conditions: Sequence[Typed], serve: Callable[[str, CheckedTarget], None]
     ) -> None:
         """Serves the target if each `when` is true, the message is fresh, and its `max_rate` is not used up."""
         word = "if"
@@ -211,7 +211,7 @@ class ServingSource:
             with self.out.block(f"{word} clock_ns() > expires:", self.route.ttl.span):
                 self._count("messages_dropped", target, "stale")
             word = "elif"
-        if target.max_rate is not None and target.keep is Keep.FIRST:
+        if target.declared.max_rate is not None and target.declared.keep is Keep.FIRST:
             with self.out.block(f"{word} not limit_{name}(now):", target.span):
                 self._count("messages_dropped", target, "rate_limited")
             word = "elif"
@@ -221,33 +221,33 @@ class ServingSource:
         with self.out.block("else:", target.span):
             serve(name, target)
 
-    def _count(self, metric: str, target: Target, *reason: str) -> None:
-        index = self.counters.index(metric, self.route.name, target.name, *reason)
+    def _count(self, metric: str, target: CheckedTarget, *reason: str) -> None:
+        index = self.counters.index(metric, self.route.name, target.label, *reason)
         self.out.line(f"counts[{index}] += 1  # {' '.join((metric, *reason))}", target.span)
 
-    def _data(self, name: str, target: Target) -> str:
+    def _data(self, name: str, target: CheckedTarget) -> str:
         """Appends what makes the bytes for a target, and returns the expression that is them."""
         if target.plan is None:
             data = "datagram"
-        elif target.is_topic:
+        elif target.topic:
             return write_message(self.out, target.plan, name)
         else:
             data = write_envelope(self.out, target.plan, self.case, name)
-        return f"{data}.rstrip(ZERO)" if target.trim else data
+        return f"{data}.rstrip(ZERO)" if target.endpoint is not None and target.endpoint.trim_trailing_zeros else data
 
-    def _send(self, name: str, target: Target) -> None:
+    def _send(self, name: str, target: CheckedTarget) -> None:
         data = self._data(name, target)
         if target.deadmen:  # before the command is sent, so that nothing which a deadman sends can follow it
             self.out.line(f"feed_{name}(now)", target.span)
-        index = self.counters.index("sent_bytes", self.route.name, target.name)
+        index = self.counters.index("sent_bytes", self.route.name, target.label)
         self.out.line(f"counts[{index}] += send_{name}({data})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
 
-    def _publish(self, name: str, target: Target) -> None:
+    def _publish(self, name: str, target: CheckedTarget) -> None:
         self.out.line(f"publish_{name}({self._data(name, target)})", target.span)
         self._count("messages_published", target)
 
-    def _deliver(self, name: str, target: Target) -> None:
+    def _deliver(self, name: str, target: CheckedTarget) -> None:
         """Sent or published now or later; counted there, and deadmen are told there."""
         data = self._data(name, target)
         expires = "expires" if self.route.ttl else "None"

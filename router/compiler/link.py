@@ -31,14 +31,12 @@ from router.compiler.program import (
     GatewayPlan,
     Handler,
     InboundPlan,
-    ListenerPlan,
     Program,
-    SenderPlan,
     TopicPlan,
     source_label,
 )
 from router.compiler.topics import qos_of
-from router.table.model import ANY, ROS, Gateway, InboundDeadman, RouteTable, Topic
+from router.table.model import ANY, ROS, Deadman, Gateway, InboundDeadman, RouteTable, Topic
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -70,7 +68,7 @@ def link(
             else:
                 outbound[handler.topic] = (*outbound.get(handler.topic, ()), handler)
     deadmen = tuple(
-        _deadman(checked.route.name, checked.deadman, table, counters) for checked in served if checked.deadman
+        _route_deadman(checked.route.name, checked.deadman, table, counters) for checked in served if checked.deadman
     )
     destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
@@ -78,22 +76,7 @@ def link(
         table=table,
         envelope=envelope,
         counters=counters,
-        listeners=tuple(
-            ListenerPlan(
-                one.name,
-                one.address.value,
-                one.framing,
-                one.receive_buffer,
-                one.coalesce,
-                one.interface,
-            )
-            for one in table.listeners.values()
-        ),
-        senders=tuple(
-            SenderPlan(one.name, one.address.value, one.budget)
-            for one in table.endpoints.values()
-            if one.name in destinations
-        ),
+        senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
         publishers=_topics([*_published(served), *own_topics], _let_in(gateways)),
         subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.feeds),
         inbound=inbound,
@@ -117,7 +100,7 @@ def _let_in(gateways: Iterable[CheckedGateway]) -> Iterator[TopicPlan]:
     """What clients of gateways publish, under absolute names."""
     for gateway in gateways:
         for entry in gateway.inbound:
-            yield _topic(entry.inbound.topic, entry.type, entry.topic)
+            yield _topic(entry.settings.topic, entry.type, entry.label)
 
 
 def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan] = ()) -> tuple[TopicPlan, ...]:
@@ -170,13 +153,13 @@ def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counter
             counters.index("qos_incompatible", route.name, topic.topic.value, policy)
     if not route.is_outbound:
         generator = HandlerSource(route, case, counters)
-        generator.inbound([served.target for served in checked.targets], checked.collect)
+        generator.inbound(checked.targets, checked.collect)
         sources: list[str | None] = [source.value for source in route.sources]
         if ANY in sources:
             sources = [*table.endpoints, STRANGER]
         for source in sources:
             counters.index("messages_received", route.name, source_label(source))
-        spans = [served.target.span for served in checked.targets if served.topic]
+        spans = [target.span for target in checked.targets if target.topic]
         yield _handler(generator, checked, (spans or [route.span])[0].file, frozenset(sources), None)
     for feed in checked.feeds:
         generator = HandlerSource(route, case, counters)
@@ -204,22 +187,26 @@ def _handler(
     )
 
 
-def _deadman(route: str, deadman: CheckedDeadman, table: RouteTable, counters: Counters) -> DeadmanPlan:
-    for metric in ("deadman_active", "deadman_trips"):
-        counters.index(metric, route)
-    for endpoint in deadman.to:
-        for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
-            counters.index(metric, route, endpoint)
-    return DeadmanPlan(
-        route=route,
-        timeout=deadman.timeout,
-        repeat=deadman.repeat,
-        datagrams=tuple(
-            (name, deadman.datagram.rstrip(b"\0") if table.endpoints[name].trim_trailing_zeros else deadman.datagram)
-            for name in deadman.to
-        ),
-        at_start=deadman.at_start,
+def _route_deadman(route: str, checked: CheckedDeadman, table: RouteTable, counters: Counters) -> DeadmanPlan:
+    datagrams = []
+    for to in checked.settings.to:
+        trims = table.endpoints[to.value].trim_trailing_zeros
+        datagrams.append((to.value, checked.datagram.rstrip(b"\0") if trims else checked.datagram))
+    return _deadman(route, checked.settings, datagrams, counters)
+
+
+def _deadman(
+    name: str, settings: Deadman | InboundDeadman, datagrams: Iterable[tuple[str, bytes]], counters: Counters
+) -> DeadmanPlan:
+    plan = DeadmanPlan(
+        name, settings.timeout.value, settings.repeat.value, tuple(datagrams), at_start=settings.at_start
     )
+    for metric in ("deadman_active", "deadman_trips"):
+        counters.index(metric, name)
+    for to, _ in plan.datagrams:
+        for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
+            counters.index(metric, name, to)
+    return plan
 
 
 # gateways
@@ -229,35 +216,20 @@ def link_gateway(checked: CheckedGateway, counters: Counters) -> GatewayPlan:
     """The plan of one gateway; opens its series in the counters."""
     settings = checked.settings
     _open_gateway_counters(counters, settings)
-    return GatewayPlan(settings, {entry.topic: _inbound(entry, settings.name, counters) for entry in checked.inbound})
+    return GatewayPlan(settings, {entry.label: _inbound(entry, settings.name, counters) for entry in checked.inbound})
 
 
 def _inbound(entry: CheckedInbound, gateway: str, counters: Counters) -> InboundPlan:
-    topic, inbound = entry.topic, entry.inbound
+    topic, settings = entry.label, entry.settings
     counters.index("messages_published", gateway, topic)
     for reason in INBOUND_DROP_REASONS:
         counters.index("messages_dropped", gateway, topic, reason)
     for policy in QOS_POLICIES:
         counters.index("qos_incompatible", gateway, topic, policy)
     deadman = None
-    if inbound.deadman is not None and entry.stop is not None:
-        deadman = _client_deadman(f"{gateway}:{topic}", inbound.deadman, topic, entry.stop, counters)
-    return InboundPlan(
-        label=topic,
-        topic=inbound.topic.topic.value,
-        type=entry.type,
-        ttl=inbound.ttl.value if inbound.ttl else None,
-        max_rate=inbound.topic.max_rate,
-        deadman=deadman,
-    )
-
-
-def _client_deadman(name: str, deadman: InboundDeadman, topic: str, stop: bytes, counters: Counters) -> DeadmanPlan:
-    for metric in ("deadman_active", "deadman_trips"):
-        counters.index(metric, name)
-    for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
-        counters.index(metric, name, topic)
-    return DeadmanPlan(name, deadman.timeout.value, deadman.repeat.value, ((topic, stop),), deadman.at_start)
+    if settings.deadman is not None and entry.stop is not None:
+        deadman = _deadman(f"{gateway}:{topic}", settings.deadman, [(topic, entry.stop)], counters)
+    return InboundPlan(settings, topic, entry.type, deadman)
 
 
 def _open_gateway_counters(counters: Counters, gateway: Gateway) -> None:

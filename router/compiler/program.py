@@ -12,8 +12,7 @@ from itertools import chain
 from types import CodeType
 
 from router.compiler.metrics import Counters
-from router.table.addresses import Address
-from router.table.model import Framing, Gateway, Keep, Priority, RouteTable, bound_to
+from router.table.model import Endpoint, Gateway, Inbound, Keep, Listener, Priority, RouteTable
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
@@ -24,35 +23,6 @@ STRANGER = None
 def source_label(source: str | None) -> str:
     """The `source` label of a sender: its name, or `unknown` for a stranger on a route that takes any."""
     return source if source is not None else "unknown"
-
-
-@dataclass(frozen=True, slots=True)
-class ListenerPlan:
-    """A UDP socket to receive from, by one network interface only if `interface` names one.
-
-    `receive_buffer` in bytes, `coalesce` in ns.
-    """
-
-    name: str
-    address: Address
-    framing: Framing
-    receive_buffer: int
-    coalesce: int
-    interface: str | None = None
-
-    @property
-    def bound_to(self) -> str:
-        """What tells the sockets of a program apart."""
-        return bound_to(self.address, self.interface)
-
-
-@dataclass(frozen=True, slots=True)
-class SenderPlan:
-    """A connected UDP socket to one destination endpoint. `budget` in bytes per second, None for no limit."""
-
-    endpoint: str
-    address: Address
-    budget: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,18 +94,14 @@ class DeadmanPlan:
 
 @dataclass(frozen=True, slots=True)
 class InboundPlan:
-    """A topic that a gateway's clients may publish on, with its type. `ttl` in ns, `max_rate` in Hz.
-
-    `label` is the absolute name that clients use, `topic` the name in the table, which ROS resolves.
+    """A topic that a gateway's clients may publish on; `label` is its absolute name, which they use.
 
     The datagrams of its deadman are CDR bytes, and the topic stands where a route's deadman has an endpoint.
     """
 
+    settings: Inbound
     label: str
-    topic: str
     type: MessageType
-    ttl: int | None
-    max_rate: float | None
     deadman: DeadmanPlan | None
 
 
@@ -172,7 +138,7 @@ class Handler:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A compiled table.
+    """A compiled table. `senders` are the endpoints that something is sent to.
 
     `inbound` has the handlers by envelope field number: several where a case has several routes, which differ
     in their sources. `outbound` has them by topic. `ignored` are the numbers of cases that the table ignores.
@@ -181,8 +147,7 @@ class Program:
     table: RouteTable
     envelope: Envelope
     counters: Counters
-    listeners: tuple[ListenerPlan, ...]
-    senders: tuple[SenderPlan, ...]
+    senders: tuple[Endpoint, ...]
     publishers: tuple[TopicPlan, ...]
     subscriptions: tuple[TopicPlan, ...]
     inbound: Mapping[int, tuple[Handler, ...]]
@@ -191,6 +156,10 @@ class Program:
     ignored: frozenset[int]
     protos: ProtoSchema
     gateways: tuple[GatewayPlan, ...] = ()
+
+    @property
+    def listeners(self) -> tuple[Listener, ...]:
+        return tuple(self.table.listeners.values())
 
     @property
     def handlers(self) -> Iterator[Handler]:

@@ -6,13 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from router.compiler.cdr.reading import CdrReads
-from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedRoute, CheckedTarget, Target
-from router.compiler.deadmen import check_deadman, feeding, takes_over
-from router.compiler.expressions import ParsedReads, Reads, Scope, Typed
+from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedRoute, CheckedTarget
+from router.compiler.deadmen import check_deadman, deadmen_of
+from router.compiler.expressions import ParsedReads, Scope, Typed
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
 from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
-from router.compiler.plan import Record
 from router.compiler.source import load
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
@@ -102,35 +101,10 @@ def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[
     return [(each, lookup.recipient(case, each.endpoint, sources)) for each in route.destinations]
 
 
-def target_to(
-    lookup: Lookup,
-    route: Route,
-    destination: Destination,
-    endpoint: Endpoint | None,
-    when: Typed | None,
-    reads: Reads | None = None,
-    plan: Record | None = None,
-) -> Target:
-    """The target that a destination becomes. Whatever goes to a board is a command where the route says nothing."""
+def _priority(route: Route, endpoint: Endpoint | None) -> Priority:
+    """Messages to a board are commands unless the route says something else."""
     to_board = endpoint is not None and endpoint.kind is EndpointKind.BOARD
-    name = destination.endpoint.value
-    deadmen = [other.name for other in lookup.table.routes if takes_over(route, name, other)]
-    if route.deadman is not None and destination in feeding(route, route.deadman):
-        deadmen.insert(0, route.name)
-    return Target(
-        name=name,
-        span=destination.span,
-        is_topic=False,
-        reads=reads,
-        when=when,
-        max_rate=destination.max_rate,
-        keep=destination.keep,
-        priority=route.priority or (Priority.COMMAND if to_board else Priority.TELEMETRY),
-        has_budget=endpoint is not None and endpoint.budget is not None,
-        trim=endpoint is not None and endpoint.trim_trailing_zeros,
-        plan=plan,
-        deadmen=tuple(deadmen),
-    )
+    return route.priority or (Priority.COMMAND if to_board else Priority.TELEMETRY)
 
 
 # from UDP
@@ -152,7 +126,14 @@ def _forward(
 ) -> CheckedTarget:
     reads = ParsedReads()
     when = lookup.when(destination.when, lookup.scope(case.type, reads))
-    return CheckedTarget(target_to(lookup, route, destination, endpoint, when, reads))
+    return CheckedTarget(
+        destination,
+        endpoint=endpoint,
+        reads=reads,
+        when=when,
+        priority=_priority(route, endpoint),
+        deadmen=deadmen_of(lookup.table, route, destination),
+    )
 
 
 def _publish(
@@ -163,9 +144,7 @@ def _publish(
     when = lookup.when(topic.when, scope)
     mapping = build(topic.fields, ros_type, scope, topic.topic.span)
     lookup.findings += mapping.findings
-    name = topic.topic.value
-    target = Target(name, topic.span, True, reads, when, topic.max_rate, topic.keep, plan=mapping.plan)
-    return CheckedTarget(target, topic, ros_type, tuple(mapping.rows))
+    return CheckedTarget(topic, type=ros_type, reads=reads, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
 
 
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Typed]:
@@ -243,8 +222,16 @@ def _feed(
         whole = scope.variable("item", route.span) if for_each else None
         mapping = build(fields, case.type, scope, destination.span if own else route.span, whole)
         lookup.findings += mapping.findings
-        target = target_to(lookup, route, destination, endpoint, condition, plan=mapping.plan)
-        targets.append(CheckedTarget(target, rows=tuple(mapping.rows)))
+        target = CheckedTarget(
+            destination,
+            endpoint=endpoint,
+            when=condition,
+            plan=mapping.plan,
+            rows=tuple(mapping.rows),
+            priority=_priority(route, endpoint),
+            deadmen=deadmen_of(lookup.table, route, destination),
+        )
+        targets.append(target)
     return CheckedFeed(topic, ros_type, reads, when, for_each, stamp, tuple(targets))
 
 

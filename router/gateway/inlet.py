@@ -53,7 +53,9 @@ class _Topic:
         self.plan = plan
         self.most = int(min(longest_text(plan.type, style) + _BESIDES, gateway.max_message))
         self.build = cdr_builder(plan.type, style)
-        self.may_pass = RateLimit(plan.max_rate).may_pass if plan.max_rate is not None else None
+        self.max_rate, ttl = plan.settings.topic.max_rate, plan.settings.ttl
+        self.ttl = ttl.value if ttl else None
+        self.may_pass = RateLimit(self.max_rate).may_pass if self.max_rate is not None else None
         self.published = counters.index("messages_published", gateway.name, plan.label)
         self.dropped = {
             reason: counters.index("messages_dropped", gateway.name, plan.label, reason)
@@ -116,7 +118,7 @@ class Inlet:
     def check(self, request: PublishRequest) -> Checked:
         """Raises RefusedError, which is not counted yet. Any thread may call this."""
         topic = self._allowed(request.topic, request.type_name)
-        if topic.plan.ttl is not None and request.time is None:
+        if topic.ttl is not None and request.time is None:
             raise RefusedError("invalid", f"{request.topic} needs the time at which it was sent", request.topic)
         try:
             return Checked(topic, topic.build(request.data), request.time)
@@ -134,7 +136,7 @@ class Inlet:
         now = self._outlets.clock_ns()
         self._want_fresh(checked, arrived_ns, now)
         if topic.may_pass and not topic.may_pass(now):
-            raise self._lost(topic, "rate_limited", f"more often than {topic.plan.max_rate:g} Hz")
+            raise self._lost(topic, "rate_limited", f"more often than {topic.max_rate:g} Hz")
         if topic.plan.deadman is not None:
             self._outlets.feed_deadman[topic.plan.deadman.route](now)
         try:
@@ -145,7 +147,7 @@ class Inlet:
 
     def _want_fresh(self, checked: Checked, arrived_ns: int, now: int) -> None:
         """Its age counts from when the client says that it was sent, or from its arrival if that is earlier."""
-        ttl = checked.topic.plan.ttl
+        ttl = checked.topic.ttl
         if ttl is None or checked.time is None:
             return
         stamp = round(min(max(checked.time, 0.0), arrived_ns / 1e9) * 1e9)

@@ -60,7 +60,9 @@ class Topics:
         self._counters = counters
         self._tasks = tasks
         self._deliver = deliver
-        self._inbound = context.subscriptions.resolved(each.topic for each in plan.inbound.values())
+        self._inbound = context.subscriptions.resolved(
+            each.settings.topic.topic.value for each in plan.inbound.values()
+        )
         self._selector = TopicSelector(plan.settings, self._inbound)
         self._served: dict[str, ServedTopic] = {}
         self._not_installed: set[str] = set()

@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterable, MutableMapping
 from contextlib import suppress
 from functools import cache
 
-from router.compiler.program import ListenerPlan, SenderPlan
-from router.errors import SourceSpan, StartError
+from router.errors import StartError
 from router.log import logger
 from router.net.kernel import (
     SO_TIMESTAMPNS,
@@ -21,6 +20,7 @@ from router.net.kernel import (
     port_taken,
     receive_buffer,
 )
+from router.table import model
 from router.table.addresses import Address
 from router.table.model import bound_to
 
@@ -94,51 +94,51 @@ class Listener:
     socket wait for the next process, and its kernel drops may be older than this process.
     """
 
-    def __init__(self, plan: ListenerPlan, span: SourceSpan) -> None:
-        self._plan = plan
-        handed_over = inherited().take(plan.bound_to)
+    def __init__(self, settings: model.Listener) -> None:
+        self._settings = settings
+        handed_over = inherited().take(settings.bound_to)
         self.is_inherited = handed_over is not None
         self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             if handed_over is None:
-                if plan.interface is not None:
-                    self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, plan.interface.encode())
+                if settings.interface is not None:
+                    self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, settings.interface.encode())
                 # Never SO_REUSEADDR or SO_REUSEPORT: with either, a second router would steal the port unnoticed.
-                self.socket.bind(plan.address)
-            self._request_receive_buffer(plan)
+                self.socket.bind(settings.address.value)
+            self._request_receive_buffer(settings)
             self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
-            raise StartError(f"{span}: {_bind_problem(plan, error)}") from error
+            raise StartError(f"{settings.address.span}: {_bind_problem(settings, error)}") from error
         self.address = Address(*self.socket.getsockname())
         self._drops_at_close = 0
 
     @property
     def name(self) -> str:
-        return self._plan.name
+        return self._settings.name
 
     @property
     def bound_to(self) -> str:
-        return bound_to(self.address, self._plan.interface)
+        return bound_to(self.address, self._settings.interface)
 
     @property
     def coalesce(self) -> int:
         """The longest pause between two reads, in ns."""
-        return self._plan.coalesce
+        return self._settings.coalesce
 
     @property
     def interface(self) -> str | None:
-        return self._plan.interface
+        return self._settings.interface
 
     def has_lost_interface(self) -> bool:
         """Whether its network interface has gone. It receives nothing then, nor from a later one of the same name."""
-        return self._plan.interface is not None and bound_interface(self.socket) is None
+        return self._settings.interface is not None and bound_interface(self.socket) is None
 
-    def follow(self, plan: ListenerPlan) -> None:
+    def follow(self, settings: model.Listener) -> None:
         """Adopt name and settings of another table's listener with the same address and interface."""
-        if plan.receive_buffer != self._plan.receive_buffer:
-            self._request_receive_buffer(plan)
-        self._plan = plan
+        if settings.receive_buffer != self._settings.receive_buffer:
+            self._request_receive_buffer(settings)
+        self._settings = settings
 
     def kernel_drops(self) -> int:
         """Datagrams that the kernel dropped before they were received, since the socket was opened."""
@@ -166,29 +166,29 @@ class Listener:
         self._drops_at_close = self.kernel_drops()
         self.socket.close()
 
-    def _request_receive_buffer(self, plan: ListenerPlan) -> None:
+    def _request_receive_buffer(self, settings: model.Listener) -> None:
         """An inherited socket may have a larger buffer, for what arrives while no process listens."""
-        if self.is_inherited and receive_buffer(self.socket) >= plan.receive_buffer:
+        if self.is_inherited and receive_buffer(self.socket) >= settings.receive_buffer:
             return
-        if (granted := ask_for_receive_buffer(self.socket, plan.receive_buffer)) >= plan.receive_buffer:
+        if (granted := ask_for_receive_buffer(self.socket, settings.receive_buffer)) >= settings.receive_buffer:
             return
         logger.warning(
             "receive buffer is smaller than the table asks for: bursts may be dropped by the kernel",
-            listener=plan.name,
-            asked=plan.receive_buffer,
+            listener=settings.name,
+            asked=settings.receive_buffer,
             granted=granted,
-            remedy=f"sysctl -w net.core.rmem_max={plan.receive_buffer}",
+            remedy=f"sysctl -w net.core.rmem_max={settings.receive_buffer}",
         )
 
 
-def _bind_problem(plan: ListenerPlan, error: OSError) -> str:
-    what = f"listener '{plan.name}' cannot use {plan.bound_to}"
+def _bind_problem(settings: model.Listener, error: OSError) -> str:
+    what = f"listener '{settings.name}' cannot use {settings.bound_to}"
     if error.errno == errno.ENODEV:
         return f"{what}: there is no such network interface now; `ip link` lists those that there are"
     if error.errno == errno.EPERM:
         return f"{what}: before Linux 5.7 an 'interface' needs a privilege; grant CAP_NET_RAW"
     if error.errno == errno.EADDRINUSE:
-        return f"{what}: {port_taken('udp', plan.address.port)}"
+        return f"{what}: {port_taken('udp', settings.address.value.port)}"
     if error.errno == errno.EADDRNOTAVAIL:
         return f"{what}: no network interface of this computer has that address; 0.0.0.0 listens on all of them"
     if error.errno == errno.EACCES:
@@ -202,19 +202,19 @@ class Sender:
     A destination that is unreachable because the link is not up yet is logged, and tried again with every datagram.
     """
 
-    def __init__(self, plan: SenderPlan, span: SourceSpan) -> None:
-        self.endpoint = plan.endpoint
+    def __init__(self, endpoint: model.Endpoint) -> None:
+        self.endpoint, address = endpoint.name, endpoint.address.value
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
         try:
-            self.socket.connect(plan.address)
+            self.socket.connect(address)
         except OSError as error:
             if error.errno != errno.ENETUNREACH:
                 self.socket.close()
-                what = f"cannot send to endpoint '{plan.endpoint}' at {plan.address}"
-                raise StartError(f"{span}: {what}: {error.strerror}") from error
-            logger.warning("no network leads to this endpoint yet", endpoint=plan.endpoint, address=str(plan.address))
-        self.send = _sending(self.socket, plan.address)
+                what = f"cannot send to endpoint '{self.endpoint}' at {address}"
+                raise StartError(f"{endpoint.address.span}: {what}: {error.strerror}") from error
+            logger.warning("no network leads to this endpoint yet", endpoint=self.endpoint, address=str(address))
+        self.send = _sending(self.socket, address)
 
     def send_checked(self, data: bytes) -> int:
         """As `send`, but raise errors of this datagram that are known at once: no process listens on a local port.

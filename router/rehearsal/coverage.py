@@ -126,9 +126,9 @@ class Coverage:
         for checked in self.routes:
             name = checked.route.name
             served = [*checked.targets, *(target for feed in checked.feeds for target in feed.targets)]
-            found = [((name, each.target.name, False), each.target.span) for each in served]
+            found = [((name, each.label, False), each.span) for each in served]
             if checked.deadman and checked.route.deadman:
-                found += [((name, to, True), checked.route.deadman.span) for to in checked.deadman.to]
+                found += [((name, to.value, True), checked.route.deadman.span) for to in checked.route.deadman.to]
             for key, span in found:
                 if key not in seen:
                     seen.add(key)

@@ -63,7 +63,7 @@ class Names:
     def endpoint(self, name: str, span: SourceSpan) -> Endpoint:
         """One that something is sent to."""
         self._known(name, self._table.endpoints, span, "endpoint", Code.UNKNOWN_ENDPOINT)
-        destinations = [plan.endpoint for plan in self.program.senders]
+        destinations = [endpoint.name for endpoint in self.program.senders]
         self._known(name, destinations, span, "route to the endpoint", Code.UNKNOWN_ENDPOINT)
         return self._table.endpoints[name]
 
@@ -82,7 +82,7 @@ class Names:
 
     def target(self, name: str, span: SourceSpan) -> str:
         """An endpoint or a topic that a route delivers to."""
-        known = [*(plan.endpoint for plan in self.program.senders), *self._published]
+        known = [*(endpoint.name for endpoint in self.program.senders), *self._published]
         self._known(name, known, span, "route to", Code.BAD_VALUE)
         return name
 

@@ -28,11 +28,11 @@ class Places:
         for route in checked.routes:
             served = [*route.targets, *(target for feed in route.feeds for target in feed.targets)]
             for target in served:
-                self._targets.setdefault((route.route.name, target.target.name), []).append(target)
+                self._targets.setdefault((route.route.name, target.label), []).append(target)
 
     def target(self, route: str, target: str, note: str = "the target") -> Place | None:
         found = self._targets.get((route, target))
-        return Place(found[0].target.span, note) if found else None
+        return Place(found[0].span, note) if found else None
 
     def type(self, route: str, topic: str) -> MessageType | None:
         """Of a topic that a route publishes on."""
@@ -48,8 +48,8 @@ class Places:
 
     def condition(self, route: str, target: str) -> Place | None:
         for served in self._targets.get((route, target), ()):
-            if served.target.when is not None:
-                return Place(served.target.when.span, "withheld by this condition")
+            if served.when is not None:
+                return Place(served.when.span, "withheld by this condition")
         return self.target(route, target)
 
     def deadman(self, route: str) -> Place | None:
@@ -59,9 +59,9 @@ class Places:
     def field(self, route: str, target: str, path: Path) -> Place | None:
         """What fills a field, else the target that leaves it at its default."""
         for served in self._targets.get((route, target), ()):
-            plan = served.target.plan
+            plan = served.plan
             if plan is None:
-                return Place(served.target.span, "forwarded here")
+                return Place(served.span, "forwarded here")
             if (span := _filled(plan, path)) is not None:
                 return Place(span, f"what fills {path_text(path)}")
         return self.target(route, target, "nothing here fills it")

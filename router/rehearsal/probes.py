@@ -98,10 +98,9 @@ class _Route:
         )
 
     def _target(self, served: CheckedTarget) -> CheckedTarget:
-        target = served.target
-        plan = self._plan(target.plan, target.name) if target.plan else None
+        plan = self._plan(served.plan, served.label) if served.plan else None
         assert plan is None or isinstance(plan, Record)  # noqa: S101 - it was one before
-        return replace(served, target=replace(target, when=self._condition(target.when), plan=plan))
+        return replace(served, when=self._condition(served.when), plan=plan)
 
     def _feed(self, feed: CheckedFeed) -> CheckedFeed:
         return replace(

@@ -76,12 +76,12 @@ class Rehearsal:
         return self.now if self._arrived_at is None else self._arrived_at
 
     def _context(self, counts: list[int]) -> EngineContext:
-        program, send = self._program, {plan.endpoint: self._take_datagram for plan in self._program.senders}
+        program, send = self._program, {to.name: self._take_datagram for to in self._program.senders}
         deadmen = {
             plan.route: Deadman(plan, program.counters, counts, send, self._explain, self._deadman_changed)
             for plan in program.deadmen
         }
-        pacers = {plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in program.senders if plan.budget}
+        pacers = {to.name: Pacer(to.budget, send[to.name]) for to in program.senders if to.budget}
         self._timers += pacers.values()  # before what hands on to them
         group = TimerGroup(counts, self._locked)
         return EngineContext(

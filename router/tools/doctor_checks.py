@@ -185,7 +185,7 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
     gateways = [(protocol, address, None, what) for protocol, address, what in _gateways(program)]
     wanted += gateways
     if with_listeners:
-        wanted += [("udp", each.address, each.interface, f"listener '{each.name}'") for each in program.listeners]
+        wanted += [("udp", each.address.value, each.interface, f"listener '{each.name}'") for each in program.listeners]
     refused = [finding for each in wanted for finding in _port(*each, waits=each in gateways)]
     free = ", ".join(bound_to(address, interface) for _, address, interface, _ in wanted)
     yield from refused or ([fine("ports", f"free: {free}")] if wanted else [])

@@ -24,7 +24,6 @@ from router.table.model import (
     ANY,
     EACH,
     ROS,
-    Destination,
     Gateway,
     GatewayFormat,
     IgnoredGateway,
@@ -84,9 +83,11 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             f"complete within {duration(collect.timeout.value)}"
         )
     if deadman is not None:
+        settings = deadman.settings
         yield (
-            f"  deadman: {_sent(route)} to {', '.join(deadman.to)} when no command came for "
-            f"{duration(deadman.timeout)}, again every {duration(deadman.repeat)}, {_at_start(deadman.at_start)}"
+            f"  deadman: {_sent(route)} to {', '.join(to.value for to in settings.to)} when no command came for "
+            f"{duration(settings.timeout.value)}, again every {duration(settings.repeat.value)}, "
+            f"{_at_start(settings.at_start)}"
         )
         if deadman.hands_over_to:
             yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
@@ -111,39 +112,36 @@ def _source(name: str, table: RouteTable) -> str:
 
 
 def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:
-    target = served.target
-    endpoint = table.endpoints[target.name]
+    endpoint = table.endpoints[served.label]
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
-    yield f"  destination {target.name} ({endpoint.address.value}): {how}{trimmed}  ({target.span})"
+    yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}  ({served.span})"
     if endpoint.budget is not None:
-        yield f"    {target.priority.value} within a budget of {endpoint.budget} bytes/s"
-    if others := [other for other in target.deadmen if other != route.name]:
+        yield f"    {served.priority.value} within a budget of {endpoint.budget} bytes/s"
+    if others := [other for other in served.deadmen if other != route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
-    named = next(each for each in route.destinations if each.endpoint.value == target.name)
-    yield from _served(served, named)
+    yield from _served(served)
 
 
 def _topic(served: CheckedTarget) -> Iterator[str]:
-    target, topic = served.target, served.topic
+    topic = served.topic
     assert topic is not None  # noqa: S101 - the caller's choice
-    yield f"  topic {target.name}: {topic.type.value}  ({target.span})"
+    yield f"  topic {served.label}: {topic.type.value}  ({served.span})"
     yield _quality(topic)
-    if target.plan is not None:
-        size, exact = message_size(target.plan)
+    if served.plan is not None:
+        size, exact = message_size(served.plan)
         yield f"    CDR: {size} bytes" if exact else f"    CDR: {size} bytes and the contents of strings and sequences"
-    yield from _served(served, topic)
+    yield from _served(served)
 
 
-def _served(served: CheckedTarget, named: Destination | Topic) -> Iterator[str]:
+def _served(served: CheckedTarget) -> Iterator[str]:
     """What a target is served with, and when."""
-    target = served.target
-    words = phrases(named)
+    words = phrases(served.declared)
     if when := words.pop("when", None):
         yield f"    {when}"
     if words:
         yield f"    {', '.join(words.values())}"
     yield from _mapping(served.rows)
-    if target.plan is not None and (unset := list(_unset(target.plan, ""))):
+    if served.plan is not None and (unset := list(_unset(served.plan, ""))):
         yield f"    left at their defaults: {', '.join(unset)}"
 
 
@@ -192,7 +190,7 @@ def explained_gateway(checked: CheckedGateway, topics: Topics) -> Iterator[str]:
     yield f"  {_period(gateway.publish_period)}; {_regularly(gateway)}"
     yield f"  messages of up to {gateway.max_message} bytes{_sizes(gateway)}"
     yield from _patterns(gateway)
-    yield from _matched(TopicSelector(gateway, [entry.topic for entry in checked.inbound]), topics)
+    yield from _matched(TopicSelector(gateway, [entry.label for entry in checked.inbound]), topics)
     for entry in checked.inbound:
         yield ""
         yield from _inbound(entry)
@@ -268,8 +266,8 @@ def _matched(selector: TopicSelector, topics: Topics) -> Iterator[str]:
 
 
 def _inbound(entry: CheckedInbound) -> Iterator[str]:
-    inbound = entry.inbound
-    yield f"  from clients {entry.topic}: {entry.type}  ({inbound.span})"
+    inbound = entry.settings
+    yield f"  from clients {entry.label}: {entry.type}  ({inbound.span})"
     yield _quality(inbound.topic)
     yield from (f"    {words}" for words in phrases(inbound).values())
     if inbound.topic.max_rate is not None:
@@ -281,8 +279,8 @@ def _inbound(entry: CheckedInbound) -> Iterator[str]:
 
 
 def _constants(entry: CheckedInbound) -> str:
-    assert entry.inbound.deadman is not None  # noqa: S101 - the caller's choice
-    entries = entry.inbound.deadman.fields.entries
+    assert entry.settings.deadman is not None  # noqa: S101 - the caller's choice
+    entries = entry.settings.deadman.fields.entries
     return ", ".join(f"{'.'.join(each.path)} {each.value.text}" for each in entries) or "all fields at their defaults"
 
 

@@ -14,10 +14,10 @@ from structlog.testing import capture_logs
 
 from router.app.process import Watchdog, notify, reloading, supervised
 from router.clock import wall_ns
-from router.compiler.program import ListenerPlan
-from router.errors import SourceSpan
+from router.errors import Located, SourceSpan
 from router.net import udp
 from router.net.udp import Inherited, Listener
+from router.table import model
 from router.table.addresses import Address
 from router.table.model import Framing
 
@@ -138,15 +138,17 @@ def held(stack: ExitStack) -> socket.socket:
     return held
 
 
-def plan(held: socket.socket) -> ListenerPlan:
-    return ListenerPlan("rover", Address(*held.getsockname()), Framing.EXACT, 65536, 0)
+def plan(held: socket.socket) -> model.Listener:
+    return model.Listener(
+        "rover", SPAN, Located(Address(*held.getsockname()), SPAN), Framing.EXACT, receive_buffer=65536, coalesce=0
+    )
 
 
 @pytest.fixture
 def listener(held: socket.socket, stack: ExitStack, monkeypatch: pytest.MonkeyPatch) -> Listener:
     ours = Inherited([held.dup()])
     monkeypatch.setattr(udp, "inherited", lambda: ours)
-    return stack.enter_context(closing(Listener(plan(held), SPAN)))
+    return stack.enter_context(closing(Listener(plan(held))))
 
 
 def test_a_listener_takes_the_socket_that_has_its_address(held: socket.socket, listener: Listener) -> None:
@@ -165,7 +167,7 @@ def test_the_next_one_finds_what_the_last_one_left(held: socket.socket, listener
     assert listener.socket.recv(100) == b"first"
     listener.end_input()
     listener.close()
-    with closing(Listener(plan(held), SPAN)) as successor:
+    with closing(Listener(plan(held))) as successor:
         assert successor.socket.recv(100) == b"second"
 
 

@@ -57,7 +57,7 @@ def test_payload_is_known_before_the_start(check_text: CheckText, send: str, env
     (route,) = checked.routes
     assert not checked.has_errors
     assert route.deadman is not None
-    assert route.deadman.to == ("board", "base")
+    assert [to.value for to in route.deadman.settings.to] == ["board", "base"]
     assert route.deadman.datagram.hex() == envelope
 
 
@@ -89,8 +89,8 @@ def test_hand_over_concerns_what_goes_to_the_endpoints_of_the_deadman(check_text
     deadman, (feed,) = routes["manual_drive"].deadman, routes["drive_motor"].feeds
     assert deadman is not None
     assert deadman.hands_over_to == ("drive_motor",)
-    assert [served.target.deadmen for served in routes["manual_drive"].targets] == [("manual_drive",)]
-    assert {served.target.name: served.target.deadmen for served in feed.targets} == {
+    assert [served.deadmen for served in routes["manual_drive"].targets] == [("manual_drive",)]
+    assert {served.label: served.deadmen for served in feed.targets} == {
         "tool": (),
         "board": ("manual_drive",),
     }

@@ -7,7 +7,7 @@ import ast
 import pytest
 
 from router.compiler import Checked
-from router.compiler.checked import CheckedFeed, Target
+from router.compiler.checked import CheckedFeed, CheckedTarget
 from router.compiler.plan import Leaf, Record
 from router.errors import Code, Diagnostic, Severity
 from router.table.model import Keep, Priority
@@ -102,8 +102,8 @@ def source_of(plan: Record, name: str) -> str:
 
 def plan_of(feed: CheckedFeed) -> Record:
     (served,) = feed.targets
-    assert served.target.plan is not None
-    return served.target.plan
+    assert served.plan is not None
+    return served.plan
 
 
 def test_element_index_and_count_are_visible_beside_the_fields_of_the_message(check_text: CheckText) -> None:
@@ -191,7 +191,7 @@ def test_each_topic_feeds_each_destination(check_text: CheckText) -> None:
     checked = check_text(routes)
     assert errors(checked) == []
     (route,) = checked.routes
-    served = [(feed.topic.topic.value, target.target.name) for feed in route.feeds for target in feed.targets]
+    served = [(feed.topic.topic.value, target.label) for feed in route.feeds for target in feed.targets]
     assert served == [("a", "base"), ("a", "board"), ("b", "base"), ("b", "board")]
     assert [len(target.rows) for feed in route.feeds for target in feed.targets] == [1, 1, 1, 1]
 
@@ -221,11 +221,11 @@ routes:
 """
 
 
-def targets(check_text: CheckText, routes: str, priority: str = "") -> tuple[Target, Target]:
+def targets(check_text: CheckText, routes: str, priority: str = "") -> tuple[CheckedTarget, CheckedTarget]:
     said = f"\n    priority: {priority}" if priority else ""
     (route,) = check_text(routes.format(priority=said), endpoints=BOARD_AND_BASE).routes
     board, base = [*route.targets, *(target for feed in route.feeds for target in feed.targets)]
-    return board.target, base.target
+    return board, base
 
 
 @pytest.mark.parametrize("routes", [INBOUND, OUTBOUND], ids=["inbound", "outbound"])
@@ -237,8 +237,12 @@ def test_what_goes_to_a_board_is_a_command_where_the_route_says_nothing(check_te
 @pytest.mark.parametrize("routes", [INBOUND, OUTBOUND], ids=["inbound", "outbound"])
 def test_target_has_what_its_endpoint_and_its_destination_say(check_text: CheckText, routes: str) -> None:
     board, base = targets(check_text, routes)
-    assert (board.trim, board.has_budget, board.max_rate, board.keep) == (True, False, None, Keep.FIRST)
-    assert (base.trim, base.has_budget, base.max_rate, base.keep) == (False, True, 5, Keep.LATEST)
+    assert board.endpoint is not None
+    assert (board.endpoint.trim_trailing_zeros, board.is_deferred) == (True, False)
+    assert (board.declared.max_rate, board.declared.keep) == (None, Keep.FIRST)
+    assert base.endpoint is not None
+    assert (base.endpoint.trim_trailing_zeros, base.endpoint.budget, base.is_deferred) == (False, 1000, True)
+    assert (base.declared.max_rate, base.declared.keep) == (5, Keep.LATEST)
 
 
 def test_payload_is_made_for_ros_and_forwarded_from_udp(check_text: CheckText) -> None:

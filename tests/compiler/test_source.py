@@ -27,7 +27,7 @@ def generated(checked: Checked) -> list[Source]:
     for route in checked.routes:
         generator = HandlerSource(route.route, route.case, Counters())
         if not route.route.is_outbound:
-            generator.inbound([served.target for served in route.targets], route.collect)
+            generator.inbound(route.targets, route.collect)
             made.append(generator.out)
         for feed in route.feeds:
             generator = HandlerSource(route.route, route.case, Counters())

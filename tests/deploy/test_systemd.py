@@ -52,7 +52,9 @@ def test_the_socket_has_the_addresses_of_the_rovers_table() -> None:
     program = check_table(ROUTES / "rover.yaml", {}).program
     assert program is not None
     text = (UNITS / "rover-router.socket").read_text()
-    assert re.findall("^ListenDatagram=(.*)$", text, re.MULTILINE) == [str(each.address) for each in program.listeners]
+    assert re.findall("^ListenDatagram=(.*)$", text, re.MULTILINE) == [
+        str(each.address.value) for each in program.listeners
+    ]
 
 
 @pytest.mark.parametrize("name", ["our rover", "r&d", "a|b", "100%", "it's", "a$b", "a#b"])

@@ -91,8 +91,8 @@ class Rig:
         self.wanted = {plan.label: [plan.label not in unwanted] for plan in made.publishers}
         self.timers: list[Timer] = []
         group = TimerGroup(self.counts, self._locked)
-        send = {plan.endpoint: self._sender(plan.endpoint) for plan in made.senders}
-        pacers = {plan.endpoint: Pacer(plan.budget, send[plan.endpoint]) for plan in made.senders if plan.budget}
+        send = {plan.name: self._sender(plan.name) for plan in made.senders}
+        pacers = {plan.name: Pacer(plan.budget, send[plan.name]) for plan in made.senders if plan.budget}
         deadmen = {
             plan.route: Deadman(plan, made.counters, self.counts, send, self.reports.append, self._changed)
             for plan in made.deadmen

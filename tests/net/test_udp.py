@@ -18,14 +18,14 @@ import pytest
 from structlog.testing import capture_logs
 
 from router.clock import wall_ns
-from router.compiler.program import ListenerPlan, SenderPlan
-from router.errors import SourceSpan, StartError
+from router.errors import Located, SourceSpan, StartError
 from router.net import receiver
 from router.net.kernel import SO_RCVBUFFORCE
 from router.net.receiver import FOR_SOCKETS, SAMPLE, Coalescing, ReceiveThread
 from router.net.udp import Listener, Sender
+from router.table import model
 from router.table.addresses import Address
-from router.table.model import Framing
+from router.table.model import EndpointKind, Framing
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 LIMIT = 1000
@@ -33,8 +33,12 @@ COALESCE = 1_000_000
 Received = "queue.SimpleQueue[tuple[str, bytes, tuple[str, int]]]"
 
 
-def plan(name: str = "rover", host: str = "127.0.0.1", port: int = 0, receive_buffer: int = 65536) -> ListenerPlan:
-    return ListenerPlan(name, Address(host, port), Framing.EXACT, receive_buffer, COALESCE)
+def plan(name: str = "rover", host: str = "127.0.0.1", port: int = 0, receive_buffer: int = 65536) -> model.Listener:
+    return model.Listener(name, SPAN, Located(Address(host, port), SPAN), Framing.EXACT, receive_buffer, COALESCE)
+
+
+def endpoint(name: str, address: Address) -> model.Endpoint:
+    return model.Endpoint(name, SPAN, Located(address, SPAN), EndpointKind.TOOL)
 
 
 @pytest.fixture
@@ -53,7 +57,7 @@ def peer(stack: ExitStack) -> socket.socket:
 
 
 def listen(stack: ExitStack, name: str = "rover") -> Listener:
-    return stack.enter_context(closing(Listener(plan(name, receive_buffer=1 << 20), SPAN)))
+    return stack.enter_context(closing(Listener(plan(name, receive_buffer=1 << 20))))
 
 
 @pytest.fixture
@@ -226,7 +230,7 @@ def test_a_listener_may_come_when_more_than_a_thousand_descriptors_are_open(
 def test_a_listener_that_never_coalesces_takes_each_at_once(
     stack: ExitStack, peer: socket.socket, rests: list[tuple[int, float]], others: int
 ) -> None:
-    never = Listener(replace(plan(receive_buffer=1 << 20), coalesce=0), SPAN)
+    never = Listener(replace(plan(receive_buffer=1 << 20), coalesce=0))
     receiving = Receiving([stack.enter_context(closing(never)), *(listen(stack, "other") for _ in range(others))])
     receiving.thread.start()
     sent = pour(peer, never, 1e9, 10 * SAMPLE)
@@ -270,7 +274,7 @@ def test_nothing_new_gets_in_after_the_end_of_input(stack: ExitStack, peer: sock
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "127.255.255.255"], ids=["all interfaces", "a broadcast address"])
 def test_a_listener_on_more_than_one_address_ends_too(stack: ExitStack, host: str) -> None:
-    listener = stack.enter_context(closing(Listener(plan(host=host), SPAN)))
+    listener = stack.enter_context(closing(Listener(plan(host=host))))
     receiving = Receiving([listener])
     receiving.thread.start()
     receiving.thread.stop()
@@ -354,7 +358,7 @@ def test_a_datagram_without_a_stamp_counts_as_just_arrived(stack: ExitStack, pee
 
 
 def test_datagrams_that_the_kernel_drops_are_known(stack: ExitStack, peer: socket.socket) -> None:
-    listener = stack.enter_context(closing(Listener(plan(receive_buffer=4096), SPAN)))
+    listener = stack.enter_context(closing(Listener(plan(receive_buffer=4096))))
     assert listener.kernel_drops() == 0
     for _ in range(500):
         peer.sendto(b"x" * 100, listener.address)
@@ -378,7 +382,7 @@ def _drain(nonblocking: socket.socket) -> int:
 def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
     taken = listen(stack).address
     with pytest.raises(StartError) as refused:
-        Listener(plan(port=taken.port), SPAN)
+        Listener(plan(port=taken.port))
     assert str(refused.value) == (
         f"routes/rover.yaml:12:20: listener 'rover' cannot use {taken}: "
         f"the router itself (pid {os.getpid()}) has the port; restart it, or choose another port"
@@ -387,11 +391,11 @@ def test_a_port_in_use_is_refused_with_who_has_it(stack: ExitStack) -> None:
 
 def test_an_address_of_another_computer_is_refused() -> None:
     with pytest.raises(StartError, match=r"rover.yaml:12:20: .*192\.0\.2\.77.*no network interface of this computer"):
-        Listener(plan(host="192.0.2.77"), SPAN)
+        Listener(plan(host="192.0.2.77"))
 
 
 def test_a_listener_takes_only_what_comes_by_its_interface(stack: ExitStack, peer: socket.socket) -> None:
-    listener = stack.enter_context(closing(Listener(replace(plan(host="0.0.0.0"), interface="lo"), SPAN)))
+    listener = stack.enter_context(closing(Listener(replace(plan(host="0.0.0.0"), interface="lo"))))
     peer.sendto(b"hello", ("127.0.0.1", listener.address.port))
     assert listener.socket.recv(100) == b"hello"
     assert listener.bound_to == f"0.0.0.0:{listener.address.port} on lo"
@@ -400,19 +404,19 @@ def test_a_listener_takes_only_what_comes_by_its_interface(stack: ExitStack, pee
 
 def test_an_interface_that_is_not_there_is_refused() -> None:
     with pytest.raises(StartError, match=r"rover.yaml:12:20: listener 'rover' cannot use .* on nowhere0: there is no"):
-        Listener(replace(plan(), interface="nowhere0"), SPAN)
+        Listener(replace(plan(), interface="nowhere0"))
 
 
 def test_a_receive_buffer_is_as_large_as_asked_or_warned_about(stack: ExitStack) -> None:
     asked = 8 * int(Path("/proc/sys/net/core/rmem_max").read_text())
     with capture_logs() as logged:
-        listener = stack.enter_context(closing(Listener(plan(receive_buffer=asked), SPAN)))
+        listener = stack.enter_context(closing(Listener(plan(receive_buffer=asked))))
     granted = listener.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     assert (granted < asked) == any(f"net.core.rmem_max={asked}" in entry.get("remedy", "") for entry in logged)
 
 
 def send_to(stack: ExitStack, address: Address) -> Sender:
-    return stack.enter_context(closing(Sender(SenderPlan("basestation", address), SPAN)))
+    return stack.enter_context(closing(Sender(endpoint("basestation", address))))
 
 
 def test_a_sender_sends_bytes_unchanged(stack: ExitStack, peer: socket.socket) -> None:
@@ -440,7 +444,7 @@ def test_who_looks_hears_of_his_own_loss_and_the_next_datagram_of_none(stack: Ex
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
         closed.bind(("127.0.0.1", 0))
         address = Address(*closed.getsockname())
-    sender = stack.enter_context(closing(Sender(SenderPlan("board", address), SPAN)))
+    sender = stack.enter_context(closing(Sender(endpoint("board", address))))
     with pytest.raises(ConnectionRefusedError):
         sender.send_checked(b"brake")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
@@ -497,4 +501,4 @@ def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, pe
 
 def test_a_broadcast_destination_is_refused_at_the_start() -> None:
     with pytest.raises(StartError, match=r"rover.yaml:12:20: cannot send .* 'basestation' at 127.255.255.255:9"):
-        Sender(SenderPlan("basestation", Address("127.255.255.255", 9)), SPAN)
+        Sender(endpoint("basestation", Address("127.255.255.255", 9)))

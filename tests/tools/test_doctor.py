@@ -91,10 +91,10 @@ def test_what_is_wrong_with_the_table_is_told_with_its_place(table: Path, look: 
 def test_a_port_that_somebody_has_is_told_with_his_name(table: Path) -> None:
     program = compiled(table)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(program.listeners[0].address)
+        taken.bind(program.listeners[0].address.value)
         [found] = ports(program, running=False)
         assert found.grade is Grade.PROBLEM
-        assert f"(pid {os.getpid()}) has udp port {program.listeners[0].address.port}" in found.text
+        assert f"(pid {os.getpid()}) has udp port {program.listeners[0].address.value.port}" in found.text
         assert [each.grade for each in ports(program, running=False, with_listeners=False)] == [Grade.FINE]
     assert [each.grade for each in ports(program, running=False)] == [Grade.FINE]
 
@@ -141,7 +141,7 @@ def test_a_port_that_systemd_keeps_is_the_services(table: Path, monkeypatch: pyt
     program = compiled(table)
     monkeypatch.setattr(doctor_checks, "port_holder", lambda *_: "systemd (pid 1)")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(program.listeners[0].address)
+        taken.bind(program.listeners[0].address.value)
         [found] = ports(program, running=False)
     assert found.grade is Grade.FINE
     assert "systemctl start rover-router" in found.text
