@@ -27,8 +27,8 @@ from router.threads import background_threads
 
 if TYPE_CHECKING:
     from router.gateway.thread import GatewayChange, GatewayThread
-    from router.ros.change import RosChange
-    from router.ros.node_and_publishers import RosEdge
+    from router.ros.endpoints import RosChange
+    from router.ros.router_node import RouterNode
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class Runtime:
         self._context = context
         self._ros_args = ros_args
         self._tee = tee
-        self._ros: RosEdge | None = None
+        self._ros: RouterNode | None = None
         self._receiving = ReceiveThread([], {}, MAX_DATAGRAM, self._coalescing_target, context.reporter.failed)
 
     @property
@@ -244,14 +244,14 @@ def _open_ros(
     ros_args: Sequence[str],
     incompatible: Callable[[str, str, int], None],
     subscriber_joined: Callable[[str], None],
-) -> RosEdge:
+) -> RouterNode:
     """Open a node without any topic. Raises StartError."""
     try:
-        from router.ros.node_and_publishers import RosEdge
+        from router.ros.router_node import RouterNode
     except ImportError as error:
         what = f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}"
         raise StartError(f"{what}; {ros_remedy()}") from error
-    return RosEdge(program.table.node, (), (), {}, ros_args, incompatible, subscriber_joined)
+    return RouterNode(program.table.node, (), (), {}, ros_args, incompatible, subscriber_joined)
 
 
 def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:

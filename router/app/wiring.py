@@ -27,8 +27,8 @@ from router.log import logger
 from router.observe.reports import Reporter
 
 if TYPE_CHECKING:
-    from router.ros.change import RosChange
-    from router.ros.node_and_publishers import RosEdge
+    from router.ros.endpoints import RosChange
+    from router.ros.router_node import RouterNode
 
 Send = Callable[[bytes], int]
 
@@ -136,7 +136,7 @@ def wire(
     program: Program,
     context: RouterContext,
     sockets: SocketChange,
-    ros: RosEdge | None,
+    ros: RouterNode | None,
     topics: RosChange | None,
     state: State,
 ) -> Wiring:
@@ -177,7 +177,7 @@ def wire(
 
 
 def _deadmen(
-    program: Program, context: RouterContext, send: Mapping[str, Send], ros: RosEdge | None, state: State
+    program: Program, context: RouterContext, send: Mapping[str, Send], ros: RouterNode | None, state: State
 ) -> dict[str, Deadman]:
     """The deadmen by route; those behind gateways send to topics."""
     inbound = _inbound_deadmen(program)
@@ -224,7 +224,7 @@ def _pacers(program: Program, pacing: TimerThread, send: Mapping[str, Send], sta
     return pacers
 
 
-def _sender_to(ros: RosEdge, topic: str) -> Send:
+def _sender_to(ros: RouterNode, topic: str) -> Send:
     """Return a function that publishes with the interface of a socket's `send`."""
 
     def send(message: bytes) -> int:

@@ -155,7 +155,7 @@ def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Ite
 def _topic(args: argparse.Namespace) -> Iterator[Iterator[TappedMessage]]:
     try:
         check_environment(os.environ)
-        from router.ros.listen import TopicListener
+        from router.ros.topics import TopicListener
     except StartError as error:
         raise UsageError(str(error)) from error
     except ImportError as error:

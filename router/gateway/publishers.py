@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:  # which imports rclpy
-    from router.ros.topics import SeenPublisher
+    from router.ros.topics import DiscoveredPublisher
 
 
 class Selection(NamedTuple):
@@ -23,7 +23,7 @@ class Selection(NamedTuple):
     is_ours: bool = False
 
 
-def select(publishers: Sequence[SeenPublisher], *, is_inbound: bool) -> Selection | None:
+def select(publishers: Sequence[DiscoveredPublisher], *, is_inbound: bool) -> Selection | None:
     """Return the type that most publishers have (of several the first by name), and a QoS compatible with all of them.
 
     On an inbound topic this router's publishers do not count: clients would get back what they sent. None where no

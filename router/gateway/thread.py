@@ -35,7 +35,7 @@ from router.threads import DaemonThread
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy
-    from router.ros.node_and_publishers import RosEdge
+    from router.ros.router_node import RouterNode
 
 T = TypeVar("T")
 
@@ -64,7 +64,7 @@ class GatewayThread:
 
     def __init__(
         self,
-        ros: RosEdge,
+        ros: RouterNode,
         counts: list[int],
         report: Callable[[Report], None],
         failed: Callable[[Exception], None],
@@ -236,7 +236,7 @@ def _exclude_each_other(one: Gateway, other: Gateway) -> bool:
     return one.name == other.name or any(where.value in wanted for where in (one.address, one.receive) if where)
 
 
-def _outlets(program: Program, ros: RosEdge, feed: FeedMaker, report: Callable[[Report], None]) -> InletOutlets:
+def _outlets(program: Program, ros: RouterNode, feed: FeedMaker, report: Callable[[Report], None]) -> InletOutlets:
     inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
     guarded = [each.deadman.route for each in inbound if each.deadman]
     return InletOutlets(

@@ -1,1 +1,1 @@
-"""The ROS node: publishers, subscriptions, QoS events, installed types. rclpy is imported here alone."""
+"""ROS 2: the router's node, its publishers and subscriptions, discovered topics, installed types."""

@@ -1,6 +1,6 @@
-"""What in this process's environment keeps ROS 2 from being loaded. Imports nothing of ROS: that could end the process.
+"""Checks of the environment before ROS 2 is imported, which may end the process otherwise.
 
-A full /dev/shm is a SIGBUS without a word, an unknown middleware an exit with 102, a domain above 232 one with 1.
+A full /dev/shm ends it by SIGBUS, an unknown middleware with exit code 102, a domain above 232 with 1.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from router.assets import asset, is_installed
 from router.errors import StartError
 
 LAST_DOMAIN = 232
-"""DDS makes port numbers of domains, and has none left for a higher one."""
+"""The highest domain for which DDS has port numbers."""
 
-SHM = Path("/dev/shm")  # noqa: S108 - the place where Linux has shared memory, and nothing is written there
+SHM = Path("/dev/shm")  # noqa: S108 - Linux's shared memory; the router writes nothing there
 _TRACING = 8 << 10
 """Bytes there that the tracing library of ROS writes to while it is loaded."""
 _FAST_DDS = 1 << 20
@@ -29,13 +29,13 @@ ADDRESS_SPACE = 1 << 30
 
 
 def check_environment(environ: Mapping[str, str]) -> None:
-    """Raises StartError for what would end the process when ROS is imported or a node is opened."""
+    """Raise StartError for what would end the process when ROS is imported or a node is opened."""
     for what, remedy in obstacles(environ):
         raise StartError(f"{what}; {remedy}")
 
 
 def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str, str]]:
-    """What keeps ROS from being loaded here, and what to do about each."""
+    """Yield each problem that keeps ROS from being loaded, with its remedy."""
     domain = environ.get("ROS_DOMAIN_ID") or "0"
     if not re.fullmatch("[0-9]{1,9}", domain) or int(domain) > LAST_DOMAIN:
         yield f"ROS_DOMAIN_ID is '{domain}'", f"set it to a number from 0 to {LAST_DOMAIN}"
@@ -56,13 +56,13 @@ def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str
 
 
 def ros_remedy() -> str:
-    """What to do where ROS 2 cannot be loaded."""
+    """The remedy if ROS 2 cannot be loaded."""
     install = "`pip install 'rover-router[ros]'`" if is_installed(asset("schemas")) else "'make setup'"
     return f"run {install}, or source the setup.sh of an installed ROS 2 Jazzy"
 
 
 def ros_package_remedy(package: str) -> str:
-    """What to do where a ROS package is missing, or is not as the table was compiled for."""
+    """The remedy if a ROS package is missing, or differs from what the table was compiled for."""
     ours = asset("schemas")
     if not is_installed(ours):
         return f"run 'make setup', or install the ROS package '{package}'"
@@ -79,17 +79,17 @@ def ros_package_remedy(package: str) -> str:
 
 
 def shared_memory(environ: Mapping[str, str], folder: Path = SHM) -> tuple[int, int]:
-    """Bytes of shared memory that ROS needs in `folder`, and those that are free there."""
+    """Bytes of shared memory that ROS needs in `folder`, and bytes that are free there."""
     needed = _TRACING + (_FAST_DDS if uses_shared_memory(environ) else 0)
     try:
         room = os.statvfs(folder)
-    except OSError:  # then there is no shared memory, and ROS does without
+    except OSError:  # ROS works without shared memory
         return 0, 0
     return needed, room.f_bavail * room.f_frsize
 
 
 def uses_shared_memory(environ: Mapping[str, str]) -> bool:
-    """Whether Fast DDS opens its shared memory transport, as it does unless it is told something else."""
+    """Whether Fast DDS opens its shared memory transport, which is its default."""
     transports = environ.get("FASTDDS_BUILTIN_TRANSPORTS") or "DEFAULT"
     is_fast_dds = (environ.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp").startswith("rmw_fastrtps")
     return is_fast_dds and not transports.startswith(("UDP", "TCP", "NONE"))
@@ -102,7 +102,7 @@ def address_space() -> int | None:
 
 
 def _middlewares(environ: Mapping[str, str]) -> set[str]:
-    """Those that the sourced workspaces and this Python have registered; none where nothing is registered."""
+    """The middlewares that the sourced workspaces and this Python have registered."""
     prefixes = [*filter(None, environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     folders = [Path(prefix, "share", "ament_index", "resource_index", "rmw_typesupport") for prefix in prefixes]
     return {each.name for folder in folders for each in folder.glob("*")} - {"rmw_implementation"}

@@ -1,4 +1,4 @@
-"""A ROS node in a context of its own, and the transports that Fast DDS uses for it."""
+"""Opening a ROS node in a context of its own, with the transports that the environment asks for."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.utilities import get_rmw_implementation_identifier
 
 from router.errors import StartError
 from router.log import logger
 
 RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
-"""What rclpy raises for bad arguments, names and settings: its own errors derive from RuntimeError."""
+"""What rclpy raises for invalid arguments, names and settings; its own errors derive from RuntimeError."""
 
 RCL = ctypes.CDLL(rclpy_implementation.__file__)
-"""rcl, which rclpy's library has loaded. Calls through it release the interpreter lock; those of rclpy hold it."""
+"""rcl, as loaded by rclpy. Calls through ctypes release the interpreter lock; those of rclpy hold it."""
 
 UDP_ON_LOCALHOST = Path(__file__).with_name("fastdds_udp_localhost.xml")
 """A profile of Fast DDS: UDP as its only transport, discovery on this computer only."""
@@ -31,12 +32,12 @@ _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 
 
 def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> Node:
-    """Raises StartError. Signals are left alone, and rclpy's global context as well; close it with `close_node`."""
+    """Open a node without signal handlers or rclpy's global context, for `close_node` to close. Raises StartError."""
     context = Context()
     try:
         with _environment(_transport_variables(os.environ)):
-            # The router has a log of its own: no log file of ROS, no /rosout. Nor parameter services:
-            # parameters fill the table's variables at start, so a service that sets them would pretend.
+            # The router has its own log: no log file of ROS, no /rosout. No parameter services either: parameters
+            # fill the table's variables at start, so that setting them later would have no effect.
             context.init(list(ros_args), initialize_logging=False)
             node = Node(name, namespace=namespace, context=context, enable_rosout=False, start_parameter_services=False)
         _ignore_sim_time(node)
@@ -62,10 +63,10 @@ def close_node(node: Node) -> None:
 
 
 def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
-    """What to set for the node, so that FASTDDS_BUILTIN_TRANSPORTS=UDPv4 holds with a discovery range of LOCALHOST too.
+    """Variables that make FASTDDS_BUILTIN_TRANSPORTS=UDPv4 effective with a discovery range of LOCALHOST.
 
-    For that range rmw_fastrtps opens shared memory and UDP, whatever the variable says. Our profile does the rest of
-    what the range does, and the range SUBNET leaves the profile alone.
+    For that range rmw_fastrtps opens shared memory and UDP, whatever the variable says. Our profile has the other
+    effects of the range, and the range SUBNET does not change the profile.
     """
     wanted = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
     is_local = any(variables.get(name) == value for name, value in wanted.items())
@@ -86,7 +87,7 @@ def _transport_variables(variables: Mapping[str, str]) -> dict[str, str]:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Sets variables of the process meanwhile: the middleware reads them from there."""
+    """Set variables of the process temporarily, as the middleware reads them from there."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -97,3 +98,12 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def middleware() -> str:
+    """The name of the middleware, such as `rmw_fastrtps_cpp`. Raises StartError if it cannot be loaded."""
+    try:
+        name: str = get_rmw_implementation_identifier()
+    except RuntimeError as error:
+        raise StartError(f"the middleware of ROS cannot be loaded: {error}") from error
+    return name

@@ -1,34 +1,34 @@
-"""The topics that a node has discovered, and taps on them, for whoever follows topics that no table names.
-
-Which topics those are, and what their bytes mean, is not known here.
-"""
+"""Topics that no table names: discovery, taps for gateways, and a listener for `router tap`."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from itertools import islice
+from time import sleep
 from typing import Any, NamedTuple
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.type_support import check_is_valid_msg_type
+from rclpy.serialization import deserialize_message
 
 from router.errors import StartError
-from router.ros.arrivals import RawSubscription
-from router.ros.definitions import installed_type
-from router.ros.node import RCL_ERRORS
-from router.ros.types import Definition, matching_class
+from router.ros.node import RCL_ERRORS, close_node, open_node
+from router.ros.receiving import Arrivals, RawSubscription
+from router.ros.types import Definition, installed_class, installed_type, usable_class
 from router.types.model import MessageType
 
+DEPTH = 100
+"""Messages that are kept between two calls of `take`; older ones are lost."""
 
-class SeenPublisher(NamedTuple):
-    """A publisher that was discovered. `keeps` says that it keeps messages for those who join late.
+_DISCOVERY_INTERVAL = 0.05
 
-    `is_ours` says that it belongs to the node that looks.
-    """
+
+class DiscoveredPublisher(NamedTuple):
+    """A publisher. `keeps`: it keeps messages for late joiners. `is_ours`: it belongs to the discovering node."""
 
     type_name: str
     is_reliable: bool
@@ -37,7 +37,7 @@ class SeenPublisher(NamedTuple):
 
 
 class RosTopics:
-    """What `node` knows of all topics. Names are absolute ones."""
+    """The topics that `node` has discovered. Names are absolute."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -45,111 +45,156 @@ class RosTopics:
         self._name = node.get_name(), node.get_namespace()
 
     def names(self) -> list[str]:
-        """Topics that somebody publishes or subscribes to."""
+        """The topics with publishers or subscribers."""
         return [name for name, _ in self._node.get_topic_names_and_types()]
 
-    def publishers(self, topic: str) -> list[SeenPublisher]:
-        """Those of `topic`, whatever their types."""
+    def publishers(self, topic: str) -> list[DiscoveredPublisher]:
+        """The publishers of `topic`, of all types."""
         return [
-            SeenPublisher(
+            DiscoveredPublisher(
                 type_name=seen["topic_type"],
                 is_reliable=seen["qos_profile"]["reliability"] == ReliabilityPolicy.RELIABLE,
                 keeps=seen["qos_profile"]["durability"] == DurabilityPolicy.TRANSIENT_LOCAL,
                 is_ours=self._is_ours(seen),
             )
-            for seen in self._ask(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic)
+            for seen in self._query(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic)
         ]
 
     def resolved(self, name: str) -> str:
-        """The absolute name that ROS makes of one: by the node's namespace, and then by its remaps."""
+        """The absolute name of a topic, by the node's namespace and remaps."""
         return str(self._node.resolve_topic_name(name))
 
-    def _ask(self, question: Callable[[Any, str, bool], list[dict[str, Any]]], topic: str) -> list[dict[str, Any]]:
-        """As rclpy's Node does, which makes an object of each QoS and takes three times as long."""
+    def _query(self, function: Callable[[Any, str, bool], list[dict[str, Any]]], topic: str) -> list[dict[str, Any]]:
+        """As rclpy's Node, which takes three times as long because it makes an object of each QoS."""
         with self._handle:
-            return question(self._handle, topic, False)
+            return function(self._handle, topic, False)
 
     def _is_ours(self, seen: Mapping[str, Any]) -> bool:
         return (seen["node_name"], seen["node_namespace"]) == self._name
 
     def installed_type(self, type_name: str) -> MessageType:
-        """As its class describes it. Raises StartError. Takes as long as `load`; any thread may call this."""
+        """As `types.installed_type`. Takes as long as `load`; thread-safe."""
         return installed_type(type_name)
 
     def load(self, type_name: str, definitions: Mapping[str, Definition]) -> Any:
-        """The class of a message, for `tap`, if it is installed as `definitions` say. Raises StartError.
-
-        The first of a package reads files for some 10 ms; any thread may call this.
-        """
-        message_class = matching_class(type_name, definitions)
-        try:
-            check_is_valid_msg_type(message_class)
-        except Exception as error:
-            raise StartError(f"{type_name} cannot be received: {error}") from error
-        return message_class
+        """As `types.usable_class`, for `tap`. Thread-safe."""
+        return usable_class(type_name, definitions)
 
     def tap(self, topic: str, message_class: Any, *, is_reliable: bool, keeps: bool, depth: int) -> TopicTap:
-        """Subscribes to `topic`. Raises StartError, also where our node has the topic with another type.
+        """Subscribe to `topic`. Raises StartError, also if our node has the topic with another type.
 
-        And where a remap of our node leads from it to another one, whose messages would pass for its.
+        And if a remap of our node changes the topic, because messages of another topic would be taken for its.
         """
         type_name = "/".join((*message_class.__module__.split(".")[:2], message_class.__name__))
         try:
             others = self._our_types(topic) - {type_name}
             if (renamed := self.resolved(topic)) != topic:
                 raise StartError(f"a remap of this router makes '{renamed}' of '{topic}'; remap relative names instead")
-            if others:  # DDS has one for a topic in a process; it would say so in other words
+            if others:  # DDS has one type for a topic in a process
                 raise StartError(f"topic '{topic}' is {others.pop()} in this router, and cannot be {type_name} too")
             return TopicTap(
-                self._node, topic, message_class, hearing(is_reliable=is_reliable, keeps=keeps, depth=depth)
+                self._node, topic, message_class, tap_qos(is_reliable=is_reliable, keeps=keeps, depth=depth)
             )
         except (*RCL_ERRORS, OSError) as error:
             raise StartError(f"topic '{topic}' cannot be subscribed to: {error}") from error
 
     def _our_types(self, topic: str) -> set[str]:
-        """With which our node publishes or subscribes to it."""
+        """The types with which our node publishes or subscribes to the topic."""
         seen = [
-            *self._ask(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic),
-            *self._ask(rclpy_implementation.rclpy_get_subscriptions_info_by_topic, topic),
+            *self._query(rclpy_implementation.rclpy_get_publishers_info_by_topic, topic),
+            *self._query(rclpy_implementation.rclpy_get_subscriptions_info_by_topic, topic),
         ]
         return {endpoint["topic_type"] for endpoint in seen if self._is_ours(endpoint)}
 
 
 class TopicTap:
-    """A subscription that is asked instead of telling: what nobody takes costs no Python at all. Close it.
+    """A subscription that is polled: messages that are not taken cost no Python. To be closed.
 
     `fd` is readable while messages have come that `arrived` has not counted.
     """
 
     def __init__(self, node: Node, topic: str, message_class: Any, qos: QoSProfile) -> None:
-        """Raises one of `ros_node.RCL_ERRORS`, or OSError where no more files may be open."""
+        """Raises one of `RCL_ERRORS`, or OSError if too many files are open."""
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         with ExitStack() as opening:
             self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
             opening.callback(os.close, self.fd)
             subscription = RawSubscription(node, message_class, topic, qos, silent)
             opening.callback(subscription.close)
-            subscription.announce_to(self.fd)  # what has come already is announced at once
+            subscription.announce_to(self.fd)  # at once for what has come already
             opening.callback(subscription.announce_to, None)
             self._open = opening.pop_all()
         self.take = subscription.take
 
     def arrived(self) -> int:
-        """How many messages have come since this was asked last, taken or not. Does not wait."""
+        """The number of messages that have come since the last call, taken or not. Does not wait."""
         try:
             return os.eventfd_read(self.fd)
         except BlockingIOError:
             return 0
 
     def close(self) -> None:
-        """Nobody may `take` any more."""
         self._open.close()
 
 
-def hearing(*, is_reliable: bool, keeps: bool, depth: int) -> QoSProfile:
-    """The newest `depth` messages. Best effort hears every publisher; only reliable ones give what they have kept."""
+def tap_qos(*, is_reliable: bool, keeps: bool, depth: int) -> QoSProfile:
+    """For the newest `depth` messages. Best effort matches every publisher; kept messages need a reliable one."""
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if keeps else DurabilityPolicy.VOLATILE,
     )
+
+
+class TopicListener:
+    """A subscription to `topic` with a node of its own. Raises StartError; to be closed.
+
+    Without a `type_name`, opening waits for the first publisher. If all publishers keep messages for late joiners,
+    `take` returns these as well.
+    """
+
+    def __init__(self, topic: str, type_name: str | None = None, ros_args: Sequence[str] = ()) -> None:
+        if type_name is not None and type_name.count("/") != 2:
+            raise StartError(f"'{type_name}' is no message type; they are written like std_msgs/msg/String")
+        with ExitStack() as opening:
+            node = open_node("router_tap", ros_args=ros_args)
+            opening.callback(close_node, node)
+            try:
+                publishers = _publishers(node, topic, wait=type_name is None)
+                self.type_name = type_name or publishers[0].type_name
+                self._message_class = installed_class(self.type_name)
+                self._subscription = RawSubscription(node, self._message_class, topic, _qos(publishers))
+                self._arrivals = Arrivals([self._subscription])
+            except (*RCL_ERRORS, ValueError) as error:
+                raise StartError(f"topic '{topic}' cannot be listened to: {error}") from error
+            opening.callback(self._arrivals.close)
+            self._open = opening.pop_all()
+
+    def take(self, timeout: float) -> list[tuple[bytes, int]]:
+        """Wait up to `timeout` seconds; return each message's CDR bytes, and the wall clock ns at which it set out.
+
+        Ctrl-C is handled when the wait is over.
+        """
+        self._arrivals.wait(timeout)
+        return list(islice(iter(self._subscription.take, None), DEPTH))
+
+    def message(self, cdr: bytes) -> Any:
+        """Deserialise a message."""
+        return deserialize_message(cdr, self._message_class)
+
+    def close(self) -> None:
+        self._open.close()
+
+
+def _publishers(node: Node, topic: str, *, wait: bool) -> Sequence[DiscoveredPublisher]:
+    """The publishers discovered so far; with `wait`, at least one."""
+    topics, name = RosTopics(node), node.resolve_topic_name(topic)
+    while not (publishers := topics.publishers(name)) and wait:
+        sleep(_DISCOVERY_INTERVAL)
+    return publishers
+
+
+def _qos(publishers: Sequence[DiscoveredPublisher]) -> QoSProfile:
+    """Best effort matches every publisher and delays none; kept messages need a reliable subscription."""
+    keeps = bool(publishers) and all(publisher.is_reliable and publisher.keeps for publisher in publishers)
+    return tap_qos(is_reliable=keeps, keeps=keeps, depth=DEPTH)

@@ -1,4 +1,4 @@
-"""The installed Python classes of ROS messages, which must be laid out as the table was compiled for."""
+"""Installed ROS message types: their Python classes, checked against the table's definitions, and their fields."""
 
 from __future__ import annotations
 
@@ -10,20 +10,35 @@ from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
 
+from rclpy.type_support import check_is_valid_msg_type
+from rosidl_parser.definition import (  # type: ignore[import-untyped]
+    AbstractGenericString,
+    AbstractNestedType,
+    AbstractWString,
+    Array,
+    NamespacedType,
+)
+
 from router.errors import SourceSpan, StartError
 from router.ros.environment import ros_package_remedy
+from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 
 _NAME = re.compile(r"(?P<package>[A-Za-z]\w*)/(?P<kind>msg|srv|action)/(?P<short>[A-Z]\w*)", re.ASCII)
 
 Definition = tuple[tuple[str, str], ...]
 """The fields of a type, each as its name and its type in rclpy's spelling."""
 
+_BASIC: dict[str, Type] = {
+    "boolean": Bool(),
+    "octet": Int(8, signed=False, octet=True),
+    "float": Float(32),
+    "double": Float(64),
+    **{str(it): it for it in (Int(bits, signed) for bits in (8, 16, 32, 64) for signed in (False, True))},
+}
+
 
 def checked_class(name: str, definitions: Mapping[str, Definition], span: SourceSpan) -> Any:
-    """The class `name` if it and all types in it are installed as `definitions` say.
-
-    Raises StartError that blames `span`.
-    """
+    """As `matching_class`; the StartError has the position `span`."""
     try:
         return matching_class(name, definitions)
     except StartError as error:
@@ -31,7 +46,7 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
 
 
 def matching_class(name: str, definitions: Mapping[str, Definition]) -> Any:
-    """The same where no table names the type. Raises StartError."""
+    """Return the class `name` if it and all types in it are installed as in `definitions`. Raises StartError."""
     for part, compiled in definitions.items():
         installed = tuple(installed_class(part).get_fields_and_field_types().items())
         if installed != compiled:
@@ -43,10 +58,10 @@ def matching_class(name: str, definitions: Mapping[str, Definition]) -> Any:
 
 
 def installed_class(name: str) -> Any:
-    """The class of `std_msgs/msg/String`, `std_srvs/srv/Empty_Event`, `nav2_msgs/action/Wait_FeedbackMessage`.
+    """Return the class of `std_msgs/msg/String`, `std_srvs/srv/Empty_Event`, `nav2_msgs/action/Wait_FeedbackMessage`.
 
-    The name may come from anybody: of Python's packages only those are imported that have a part `msg`, `srv` or
-    `action`. Raises StartError.
+    The name may come from a client: only Python packages with a part `msg`, `srv` or `action` are imported. Raises
+    StartError.
     """
     parts = _NAME.fullmatch(name)
     if parts is None:
@@ -56,7 +71,7 @@ def installed_class(name: str) -> Any:
         raise StartError(f"{name} is not installed (there is no Python package '{package}.{kind}'); {_remedy(name)}")
     try:
         found = _member(importlib.import_module(f"{package}.{kind}"), short)
-    except Exception as error:  # what is in the package can be anything
+    except Exception as error:  # a package may raise anything
         raise StartError(f"{name} cannot be loaded: {error}") from error
     if not hasattr(found, "get_fields_and_field_types"):
         raise StartError(f"{name} is not installed ('{package}.{kind}' has no such message); {_remedy(name)}")
@@ -64,13 +79,13 @@ def installed_class(name: str) -> Any:
 
 
 def _has_part(package: str, kind: str) -> bool:
-    """Looks at folders only."""
+    """Whether the package is there, without importing it."""
     found = PathFinder.find_spec(package)
     return bool(found and PathFinder.find_spec(f"{package}.{kind}", found.submodule_search_locations or []))
 
 
 def _member(module: ModuleType, name: str) -> Any:
-    """None if there is none. Of an action's messages a package shows some only; all are beside the action's class."""
+    """The member or None. A package exports only some messages of an action; all are beside the action's class."""
     interface = getattr(module, name.partition("_")[0], None)
     home = module if interface is None else sys.modules[interface.__module__]
     return getattr(module, name, None) or getattr(home, name, None)
@@ -82,3 +97,47 @@ def _remedy(name: str) -> str:
 
 def _fields(definition: Definition) -> str:
     return ", ".join(f"{kind} {name}" for name, kind in definition)
+
+
+def usable_class(type_name: str, definitions: Mapping[str, Definition]) -> Any:
+    """As `matching_class`, with the type support loaded, which reads files for some 10 ms. Raises StartError."""
+    message_class = matching_class(type_name, definitions)
+    try:
+        check_is_valid_msg_type(message_class)
+    except Exception as error:  # a library that cannot be loaded, or anything else
+        raise StartError(f"{type_name} cannot be used: {error}") from error
+    return message_class
+
+
+def installed_type(name: str) -> MessageType:
+    """Return a type with all types nested in it, as its Python class describes it: without defaults and constants.
+
+    For types without a `.msg` file: those of services and actions, and those written in IDL. Raises StartError if one
+    of them cannot be loaded, or has a field that no `.msg` file could declare.
+    """
+    return _message(name, {})
+
+
+def _message(name: str, known: dict[str, MessageType]) -> MessageType:
+    if name not in known:
+        found = installed_class(name)
+        slots = zip(found.get_fields_and_field_types(), found.SLOT_TYPES, strict=True)
+        known[name] = MessageType(
+            name, tuple(Field(field, _type(slot, f"{name}.{field}", known)) for field, slot in slots)
+        )
+    return known[name]
+
+
+def _type(slot: Any, place: str, known: dict[str, MessageType]) -> Type:
+    if isinstance(slot, AbstractNestedType):
+        element = _type(slot.value_type, place, known)
+        if isinstance(slot, Array):
+            return List(element, length=slot.size)
+        return List(element, bound=getattr(slot, "maximum_size", None))
+    if isinstance(slot, NamespacedType):
+        return _message("/".join(slot.namespaced_name()), known)
+    if isinstance(slot, AbstractGenericString):
+        return String(getattr(slot, "maximum_size", None), wide=isinstance(slot, AbstractWString))
+    if (basic := _BASIC.get(slot.typename)) is None:
+        raise StartError(f"{place} is a {slot.typename}, which the router cannot read")
+    return basic

@@ -340,7 +340,8 @@ def ros(program: Program) -> Iterator[CheckResult]:
     if found:  # to load it would end this process
         return
     try:
-        from router.ros.installation import middleware, usable_class
+        from router.ros.node import middleware
+        from router.ros.types import usable_class
     except ImportError as error:
         yield problem("ROS", f"the table has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
         return

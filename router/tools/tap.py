@@ -20,7 +20,7 @@ from router.tools.conditions import Condition
 from router.values import compact, one_line, ros_json, ros_tree, words
 
 if TYPE_CHECKING:
-    from router.ros.listen import TopicListener
+    from router.ros.topics import TopicListener
 
 PATIENCE = 0.2
 """Seconds after which Ctrl-C is noticed at the latest, while no message comes."""

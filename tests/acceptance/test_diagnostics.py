@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from router.ros.listen import TopicListener
+from router.ros.topics import TopicListener
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import FLOWS

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import connect
 
-from router.ros.listen import TopicListener
+from router.ros.topics import TopicListener
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.ros_talker import RosTalker
 from tests.acceptance.site import ROOT, RouterProcess, Site, key, udp, wait_until

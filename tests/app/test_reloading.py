@@ -563,7 +563,7 @@ def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    from router.ros.threads import MessageThread
+    from router.ros.receiving import MessageThread
 
     go_on, do_tasks = threading.Event(), MessageThread._do_tasks
 

@@ -24,7 +24,7 @@ from router.gateway.service import GatewayService
 from router.gateway.style import Style
 from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Client, Events, Frame
-from router.ros.topics import RosTopics, SeenPublisher
+from router.ros.topics import DiscoveredPublisher, RosTopics
 from router.table.addresses import Address
 from router.types.model import MessageType
 from router.types.ros import ros_interfaces
@@ -92,8 +92,8 @@ class Graph:
             raise fault
         return [*self.types]
 
-    def publishers(self, topic: str) -> list[SeenPublisher]:
-        return [SeenPublisher(self.types[topic], is_reliable=True, keeps=False, is_ours=False)]
+    def publishers(self, topic: str) -> list[DiscoveredPublisher]:
+        return [DiscoveredPublisher(self.types[topic], is_reliable=True, keeps=False, is_ours=False)]
 
     def installed_type(self, type_name: str) -> MessageType:
         raise StartError(f"{type_name} is not installed")

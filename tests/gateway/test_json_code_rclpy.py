@@ -22,7 +22,7 @@ from tests.oracles.reference_json import reference_text
 
 pytest.importorskip("rclpy")
 
-from router.ros.definitions import installed_type
+from router.ros.types import installed_type
 from tests.compiler.comparing import without_nul
 from tests.compiler.ros_objects import serialized
 

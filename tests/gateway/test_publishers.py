@@ -10,16 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.gateway.publishers import Selection, select
-from router.ros.topics import SeenPublisher
+from router.ros.topics import DiscoveredPublisher
 
-RELIABLE = SeenPublisher("a/msg/A", is_reliable=True, keeps=False, is_ours=False)
+RELIABLE = DiscoveredPublisher("a/msg/A", is_reliable=True, keeps=False, is_ours=False)
 LATCHED = RELIABLE._replace(keeps=True)
 LOSSY = RELIABLE._replace(is_reliable=False)
 LOSSY_LATCHED = LATCHED._replace(is_reliable=False)
 OTHER = RELIABLE._replace(type_name="b/msg/B")
 THIRD = RELIABLE._replace(type_name="c/msg/C")
 
-seen = st.builds(SeenPublisher, st.sampled_from("abc"), st.booleans(), st.booleans(), st.booleans())
+seen = st.builds(DiscoveredPublisher, st.sampled_from("abc"), st.booleans(), st.booleans(), st.booleans())
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ seen = st.builds(SeenPublisher, st.sampled_from("abc"), st.booleans(), st.boolea
     ],
 )
 def test_quality_is_what_every_publisher_of_the_type_offers(
-    publishers: list[SeenPublisher], is_reliable: bool, keeps: bool
+    publishers: list[DiscoveredPublisher], is_reliable: bool, keeps: bool
 ) -> None:
     chosen = select(publishers, is_inbound=False)
     assert chosen
@@ -53,7 +53,7 @@ def test_quality_is_what_every_publisher_of_the_type_offers(
     ],
 )
 def test_the_type_of_most_publishers_is_served(
-    publishers: list[SeenPublisher], type_name: str, others: tuple[str, ...]
+    publishers: list[DiscoveredPublisher], type_name: str, others: tuple[str, ...]
 ) -> None:
     assert select(publishers, is_inbound=False) == Selection(type_name, is_reliable=True, keeps=False, others=others)
 
@@ -73,6 +73,6 @@ def test_our_own_publishers_count_unless_the_topic_is_let_in() -> None:
 
 @given(st.lists(seen), st.booleans())
 def test_the_order_in_which_publishers_were_found_does_not_matter(
-    publishers: list[SeenPublisher], is_let_in: bool
+    publishers: list[DiscoveredPublisher], is_let_in: bool
 ) -> None:
     assert select(publishers, is_inbound=is_let_in) == select(sorted(publishers), is_inbound=is_let_in)

@@ -9,7 +9,7 @@ from std_msgs.msg import String
 
 from router.compiler.program import QosPlan, TopicPlan
 from router.errors import SourceSpan
-from router.ros.node_and_publishers import RosEdge
+from router.ros.router_node import RouterNode
 from router.table.model import NodeSettings
 
 STRING = "std_msgs/msg/String"
@@ -39,6 +39,6 @@ def open_ros(
     subscriptions: Sequence[TopicPlan] = (),
     args: Sequence[str] = (),
     incompatible: Callable[[str, str, int], None] = lambda *_: None,
-) -> RosEdge:
+) -> RouterNode:
     spans = {plan.label: SPAN for plan in (*plans, *subscriptions)}
-    return RosEdge(NodeSettings("router_test", "/"), plans, subscriptions, spans, args, incompatible)
+    return RouterNode(NodeSettings("router_test", "/"), plans, subscriptions, spans, args, incompatible)

@@ -23,8 +23,8 @@ from structlog.testing import capture_logs
 
 from router.compiler.program import QosPlan, TopicPlan
 from router.errors import StartError
-from router.ros.node_and_publishers import RosEdge
-from router.ros.qos import OpenQos, incompatible_policies
+from router.ros.qos import ActualQos, incompatible_policies
+from router.ros.router_node import RouterNode
 from router.types.ros import definition, ros_interfaces
 from tests.ros.ros_opening import HELLO, RELIABLE, SPAN, STRING, open_ros, string_topic
 from tests.ros.ros_publisher import Publisher
@@ -170,7 +170,7 @@ def test_policies_keep_apart_as_rclpy_says(
     assert bool(policies) == (verdict == QoSCompatibility.ERROR), why
 
 
-def _profile(qos: OpenQos) -> QoSProfile:
+def _profile(qos: ActualQos) -> QoSProfile:
     return QoSProfile(
         depth=1,
         reliability=qos.reliability,
@@ -297,7 +297,7 @@ def test_an_impossible_name_is_refused_and_nothing_stays_open() -> None:
 
 
 @pytest.fixture
-def blocked() -> Iterator[RosEdge]:
+def blocked() -> Iterator[RouterNode]:
     """A topic whose next `publish` blocks: it keeps all, and is full of what a stopped subscriber has not taken."""
     with closing(open_ros(string_topic(QosPlan("reliable", "volatile", "keep_all", 1)))) as ros:
         peer = Subscriber("greeting", "std_msgs/msg/String")
@@ -313,7 +313,7 @@ def blocked() -> Iterator[RosEdge]:
             peer.kill()
 
 
-def test_python_goes_on_while_the_middleware_blocks_a_publisher(blocked: RosEdge) -> None:
+def test_python_goes_on_while_the_middleware_blocks_a_publisher(blocked: RouterNode) -> None:
     ran_at: list[float] = []
     ended = threading.Event()
 
@@ -333,7 +333,7 @@ def test_python_goes_on_while_the_middleware_blocks_a_publisher(blocked: RosEdge
     assert any(lasted / 4 < at - begun < lasted * 3 / 4 for at in ran_at)
 
 
-def test_a_publisher_closes_when_nobody_is_in_it_and_refuses_after_that(blocked: RosEdge) -> None:
+def test_a_publisher_closes_when_nobody_is_in_it_and_refuses_after_that(blocked: RouterNode) -> None:
     publish, refusals, calls = blocked.publish["greeting"], [], blocked._publications["greeting"]._calls
 
     def try_to_publish() -> None:

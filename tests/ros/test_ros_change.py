@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.errors import StartError
-from router.ros.arrivals import RawSubscription
-from router.ros.node_and_publishers import RosEdge
+from router.ros.receiving import RawSubscription
+from router.ros.router_node import RouterNode
 from tests.ros.ros_opening import RELIABLE, SPAN, cdr, open_ros, string_topic
 
 DEEP = replace(RELIABLE, depth=1000)
@@ -30,12 +30,12 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture
-def speaker() -> Iterator[RosEdge]:
+def speaker() -> Iterator[RouterNode]:
     with closing(open_ros(string_topic(DEEP))) as edge:
         yield edge
 
 
-def change(ros: RosEdge, receive: dict[str, Take], *plans: object, published: object = ()) -> None:
+def change(ros: RouterNode, receive: dict[str, Take], *plans: object, published: object = ()) -> None:
     made = ros.prepare(published, plans, SPANS)  # type: ignore[arg-type]
     with ros.paused():
         ros.apply(made, receive)
@@ -43,7 +43,7 @@ def change(ros: RosEdge, receive: dict[str, Take], *plans: object, published: ob
 
 
 @pytest.mark.parametrize("depths", [(1000, 1000), (1000, 2000)], ids=["kept", "opened anew"])
-def test_each_message_is_taken_once_and_in_order(speaker: RosEdge, depths: tuple[int, int]) -> None:
+def test_each_message_is_taken_once_and_in_order(speaker: RouterNode, depths: tuple[int, int]) -> None:
     got: list[bytes] = []
     ended = threading.Event()
     sent: list[bytes] = []
@@ -81,7 +81,7 @@ def test_what_is_the_same_stays_open_and_what_is_not_wanted_closes() -> None:
         wait_until(lambda: not ros.topics.publishers("/greeting"))
 
 
-def test_a_topic_keeps_its_type(speaker: RosEdge) -> None:
+def test_a_topic_keeps_its_type(speaker: RouterNode) -> None:
     other = replace(
         string_topic(), type_name="std_msgs/msg/Bool", definitions={"std_msgs/msg/Bool": (("data", "boolean"),)}
     )
@@ -90,7 +90,7 @@ def test_a_topic_keeps_its_type(speaker: RosEdge) -> None:
     assert list(speaker.publish) == ["greeting"]
 
 
-def test_what_was_prepared_can_be_abandoned(speaker: RosEdge) -> None:
+def test_what_was_prepared_can_be_abandoned(speaker: RouterNode) -> None:
     made = speaker.prepare([string_topic(DEEP), string_topic(topic="farewell")], [], SPANS)
     speaker.abandon(made)
     assert list(speaker.publish) == ["greeting"]
@@ -98,7 +98,7 @@ def test_what_was_prepared_can_be_abandoned(speaker: RosEdge) -> None:
 
 
 def test_a_change_that_fails_at_last_leaves_the_topics_as_they_were(
-    speaker: RosEdge, monkeypatch: pytest.MonkeyPatch
+    speaker: RouterNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     got: list[bytes] = []
     receive: dict[str, Take] = {"greeting": lambda data, _: got.append(data), "farewell": lambda *_: None}

@@ -23,9 +23,8 @@ from rosidl_parser.definition import (  # type: ignore[import-untyped]
 
 from router.compiler.lookup import layout
 from router.errors import StartError
-from router.ros import definitions as ros_definitions
-from router.ros.definitions import installed_type
-from router.ros.types import installed_class, matching_class
+from router.ros import types as ros_types
+from router.ros.types import installed_class, installed_type, matching_class
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from router.types.ros import RosInterfaces, ros_interfaces
 
@@ -106,7 +105,7 @@ def test_a_request_without_fields_has_none() -> None:
     ],
 )
 def test_every_kind_of_slot_is_known(monkeypatch: pytest.MonkeyPatch, index: object, expected: Type) -> None:
-    monkeypatch.setattr(ros_definitions, "installed_class", lambda _: generated(it=index))
+    monkeypatch.setattr(ros_types, "installed_class", lambda _: generated(it=index))
     assert shape(installed_type("made_msgs/msg/Made")) == ("made_msgs/msg/Made", [("it", shape(expected))])
 
 
@@ -116,7 +115,7 @@ def test_types_in_an_action_keep_their_namespace_and_are_one_each(monkeypatch: p
         "made_msgs/action/Wait_FeedbackMessage": generated(one=inner, many=UnboundedSequence(inner)),
         "made_msgs/action/Wait_Feedback": generated(left=BasicType("float")),
     }
-    monkeypatch.setattr(ros_definitions, "installed_class", classes.__getitem__)
+    monkeypatch.setattr(ros_types, "installed_class", classes.__getitem__)
     one, many = installed_type("made_msgs/action/Wait_FeedbackMessage").fields
     assert shape(one.type) == ("made_msgs/action/Wait_Feedback", [("left", Float(32))])
     assert isinstance(many.type, List)
@@ -126,7 +125,7 @@ def test_types_in_an_action_keep_their_namespace_and_are_one_each(monkeypatch: p
 @pytest.mark.parametrize("unknown", ["wchar", "long double", "char"])
 def test_a_type_that_only_idl_has_is_refused_with_its_place(monkeypatch: pytest.MonkeyPatch, unknown: str) -> None:
     index = UnboundedSequence(BasicType(unknown))
-    monkeypatch.setattr(ros_definitions, "installed_class", lambda _: generated(it=index))
+    monkeypatch.setattr(ros_types, "installed_class", lambda _: generated(it=index))
     with pytest.raises(StartError, match=f"^made_msgs/msg/Made.it is a {unknown}, which the router cannot read"):
         installed_type("made_msgs/msg/Made")
 

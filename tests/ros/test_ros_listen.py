@@ -13,7 +13,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
 from router.errors import StartError
-from router.ros.listen import TopicListener
+from router.ros.topics import TopicListener
 from tests.ros.ros_publisher import Publisher
 
 HELLO, WORLD = (bytes(serialize_message(String(data=text))) for text in ("hello, rover...", "hello, world..."))

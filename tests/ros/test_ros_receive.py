@@ -20,10 +20,9 @@ from structlog.testing import capture_logs
 from router.clock import wall_ns
 from router.compiler.program import QosPlan, TopicPlan
 from router.errors import StartError
-from router.ros.arrivals import RawSubscription
+from router.ros.events import WaitSet
 from router.ros.node import close_node, open_node
-from router.ros.threads import TURN
-from router.ros.wait import WaitSet
+from router.ros.receiving import TURN, RawSubscription
 from tests.ros.ros_opening import HELLO, RELIABLE, STRING, cdr, open_ros, string_topic
 from tests.ros.ros_publisher import Publisher
 from tests.ros.ros_subscriber import wait_until
@@ -276,7 +275,7 @@ def test_ros_arguments_rename_subscribed_topics(publisher: Publish) -> None:
 
 
 def test_a_middleware_that_does_not_tell_of_new_messages_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("router.ros.arrivals._set_callback", lambda *_: 1)
+    monkeypatch.setattr("router.ros.receiving._set_callback", lambda *_: 1)
     with (
         closing(open_ros(subscriptions=[string_topic()])) as ros,
         pytest.raises(StartError, match=r"ROS messages cannot be received: .* does not tell of new messages"),

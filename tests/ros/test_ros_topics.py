@@ -13,8 +13,8 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 
 from router.clock import wall_ns
 from router.errors import StartError
-from router.ros.node_and_publishers import RosEdge
-from router.ros.topics import SeenPublisher, TopicTap
+from router.ros.router_node import RouterNode
+from router.ros.topics import DiscoveredPublisher, TopicTap
 from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, string_topic
 from tests.ros.ros_publisher import Publisher
 from tests.ros.ros_subscriber import wait_until
@@ -33,32 +33,32 @@ def publisher() -> Iterator[Publish]:
 
 
 @pytest.fixture
-def ros() -> Iterator[RosEdge]:
+def ros() -> Iterator[RouterNode]:
     """Without topics of its own."""
     with closing(open_ros()) as edge:
         yield edge
 
 
-def tapped(ros: RosEdge, type_name: str = STRING, topic: str = "/greeting", **qos: Any) -> TopicTap:
+def tapped(ros: RouterNode, type_name: str = STRING, topic: str = "/greeting", **qos: Any) -> TopicTap:
     qos = {"is_reliable": True, "keeps": False, "depth": 1} | qos
     definition = {type_name: (("data", "string" if type_name == STRING else "int32"),)}
     return ros.topics.tap(topic, ros.topics.load(type_name, definition), **qos)
 
 
-def test_publishers_are_seen_with_type_and_qos(ros: RosEdge, publisher: Publish) -> None:
+def test_publishers_are_seen_with_type_and_qos(ros: RouterNode, publisher: Publish) -> None:
     publisher(STRING)
     publisher(STRING, "--transient-local")
     publisher(STRING, "--best-effort")
     wait_until(lambda: len(ros.topics.publishers("/greeting")) == 3)
     assert sorted(ros.topics.publishers("/greeting")) == [
-        SeenPublisher(STRING, is_reliable=False, keeps=False, is_ours=False),
-        SeenPublisher(STRING, is_reliable=True, keeps=False, is_ours=False),
-        SeenPublisher(STRING, is_reliable=True, keeps=True, is_ours=False),
+        DiscoveredPublisher(STRING, is_reliable=False, keeps=False, is_ours=False),
+        DiscoveredPublisher(STRING, is_reliable=True, keeps=False, is_ours=False),
+        DiscoveredPublisher(STRING, is_reliable=True, keeps=True, is_ours=False),
     ]
     assert "/greeting" in ros.topics.names()
 
 
-def test_publishers_of_several_types_are_all_seen(ros: RosEdge, publisher: Publish) -> None:
+def test_publishers_of_several_types_are_all_seen(ros: RouterNode, publisher: Publish) -> None:
     publisher(STRING)
     publisher(INT32)
     wait_until(lambda: len(ros.topics.publishers("/greeting")) == 2)
@@ -71,19 +71,19 @@ def test_our_own_publishers_are_known_as_ours() -> None:
         assert [seen.is_ours for seen in ros.topics.publishers("/greeting")] == [True]
 
 
-def test_a_publisher_that_leaves_is_not_seen_any_more(ros: RosEdge) -> None:
+def test_a_publisher_that_leaves_is_not_seen_any_more(ros: RouterNode) -> None:
     with closing(Publisher("greeting", STRING)):
         wait_until(lambda: bool(ros.topics.publishers("/greeting")))
     wait_until(lambda: not ros.topics.publishers("/greeting"))
 
 
-def test_nobody_publishes_on_an_unknown_topic(ros: RosEdge) -> None:
+def test_nobody_publishes_on_an_unknown_topic(ros: RouterNode) -> None:
     assert ros.topics.publishers("/nobody") == []
 
 
 @pytest.mark.parametrize("options", [(), ("--best-effort",)])
 def test_a_tap_counts_what_came_and_gives_the_newest(
-    ros: RosEdge, publisher: Publish, options: tuple[str, ...]
+    ros: RouterNode, publisher: Publish, options: tuple[str, ...]
 ) -> None:
     with closing(tapped(ros, is_reliable=not options)) as tap:
         peer = publisher(STRING, *options)
@@ -108,7 +108,7 @@ def test_a_tap_counts_what_came_and_gives_the_newest(
         assert tap.arrived() == 0
 
 
-def test_a_deep_tap_gives_each_in_order_and_is_readable_until_it_counted(ros: RosEdge, publisher: Publish) -> None:
+def test_a_deep_tap_gives_each_in_order_and_is_readable_until_it_counted(ros: RouterNode, publisher: Publish) -> None:
     texts = [cdr(str(number)) for number in range(50)]
     with closing(tapped(ros, depth=100)) as tap:
         peer = publisher(STRING)
@@ -122,7 +122,7 @@ def test_a_deep_tap_gives_each_in_order_and_is_readable_until_it_counted(ros: Ro
         assert select.select([tap.fd], [], [], 0)[0] == []
 
 
-def test_what_was_kept_is_given_to_a_late_tap(ros: RosEdge, publisher: Publish) -> None:
+def test_what_was_kept_is_given_to_a_late_tap(ros: RouterNode, publisher: Publish) -> None:
     publisher(STRING, "--transient-local").publish([HELLO])
     with closing(tapped(ros, keeps=True)) as tap:
         wait_until(lambda: tap.arrived() == 1)
@@ -131,7 +131,9 @@ def test_what_was_kept_is_given_to_a_late_tap(ros: RosEdge, publisher: Publish) 
         assert taken[0] == HELLO
 
 
-def test_a_topic_can_be_tapped_with_another_type_once_the_first_tap_is_closed(ros: RosEdge, publisher: Publish) -> None:
+def test_a_topic_can_be_tapped_with_another_type_once_the_first_tap_is_closed(
+    ros: RouterNode, publisher: Publish
+) -> None:
     with closing(tapped(ros)), pytest.raises(StartError, match="'/greeting' is std_msgs/msg/String in this router"):
         tapped(ros, INT32)
     with closing(tapped(ros, INT32)) as tap:
@@ -144,7 +146,7 @@ def test_a_topic_can_be_tapped_with_another_type_once_the_first_tap_is_closed(ro
         assert taken[0] == FIVE
 
 
-def test_a_closed_tap_leaves_nothing_open(ros: RosEdge) -> None:
+def test_a_closed_tap_leaves_nothing_open(ros: RouterNode) -> None:
     tap = tapped(ros, topic="/nobody")
     assert "/nobody" in ros.topics.names()
     tap.close()
@@ -162,12 +164,12 @@ def test_a_closed_tap_leaves_nothing_open(ros: RosEdge) -> None:
     ],
 )
 def test_a_type_that_is_not_installed_like_that_is_refused(
-    ros: RosEdge, type_name: str, definition: dict[str, tuple[tuple[str, str], ...]], complaint: str
+    ros: RouterNode, type_name: str, definition: dict[str, tuple[tuple[str, str], ...]], complaint: str
 ) -> None:
     with pytest.raises(StartError, match=complaint):
         ros.topics.load(type_name, definition)
 
 
-def test_a_name_that_is_none_is_refused(ros: RosEdge) -> None:
+def test_a_name_that_is_none_is_refused(ros: RouterNode) -> None:
     with pytest.raises(StartError, match="topic '/2bad' cannot be subscribed to"):
         tapped(ros, topic="/2bad")

@@ -1,7 +1,4 @@
-"""ROS 2: one node with the program's publishers and subscriptions. Together with `ros_*` the only importer of rclpy.
-
-Knows bytes and topics; what the bytes mean and why they are published is the engine's business.
-"""
+"""The router's ROS node with the publishers, subscriptions and threads of the running program."""
 
 from __future__ import annotations
 
@@ -13,27 +10,27 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from router.compiler.program import TopicPlan
 from router.errors import SourceSpan, StartError
-from router.ros.change import RosChange, hand_over, left_by, opened_beside
+from router.ros.endpoints import Publication, RosChange, Subscription, hand_over, left_by, opened_beside
+from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined
 from router.ros.node import RCL_ERRORS, close_node, open_node
-from router.ros.opened import Publication, Subscription
-from router.ros.qos import Incompatible, Met, PeerEvents
-from router.ros.threads import EventThread, MessageThread, Receive
+from router.ros.receiving import MessageThread, Receive
 from router.ros.topics import RosTopics
 from router.table.model import NodeSettings
 
 
-class RosEdge:
+class RouterNode:
     """The node, its publishers and subscriptions, and the threads that serve them. Opening raises StartError.
 
-    `publish[topic]` takes CDR bytes. `wanted[topic]` is one boolean in a list, kept up to date in place: whether
-    anybody listens, or may want it later. `subscribed` has the topics with a subscriber now.
-    `incompatible(topic, policy, peers)` is called by a thread of events, from opening on: peers whose QoS does not go
-    with ours, now. It is called once per second for a topic that has such peers, and for some seconds after that.
-    `met(topic)` is called there too, when somebody new subscribes to it. Nothing is received before `start`. `topics`
-    are those that the node sees, `name` is what ROS made of its namespace and name: `rover1/rover_router`.
+    `publish[topic]` takes CDR bytes. `wanted[topic]`, a list of one boolean that is updated in place, is whether the
+    topic has subscribers or serves late joiners. `subscribed` has the topics with subscribers. `topics` are those that
+    the node has discovered. `name` has the namespace: `rover1/rover_router`.
 
-    What is open can be replaced: `prepare` opens what is new, `apply` has it used, `finish` closes what is not used
-    any more. Or `abandon` closes what was opened.
+    `incompatible(topic, policy, peers)` is called by the thread of events, once per second for a topic that has peers
+    with an incompatible QoS, and for some seconds after that. `subscriber_joined(topic)` is called there too. Nothing
+    is received before `start`.
+
+    Topics are replaced in three steps: `prepare` opens what is new, `apply` uses it, `finish` closes what is no longer
+    used. After `prepare`, `abandon` undoes it.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
@@ -47,7 +44,7 @@ class RosEdge:
         spans: Mapping[str, SourceSpan],
         ros_args: Sequence[str],
         incompatible: Incompatible,
-        met: Met = lambda _: None,
+        subscriber_joined: SubscriberJoined = lambda _: None,
     ) -> None:
         self.publish: dict[str, Callable[[bytes], None]] = {}
         self.wanted: dict[str, list[bool]] = {}
@@ -55,7 +52,7 @@ class RosEdge:
         self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
         self._failed: Callable[[Exception], None] | None = None
-        self._peers = PeerEvents(incompatible, met)
+        self._peers = PeerEvents(incompatible, subscriber_joined)
         self.subscribed: Collection[str] = self._peers.subscribed
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
@@ -71,32 +68,30 @@ class RosEdge:
             self._open = opening.pop_all()
 
     def start(self, receive: Mapping[str, Receive], failed: Callable[[Exception], None]) -> None:
-        """Calls `receive[topic]` with each message's CDR bytes and the wall clock ns at which it set out.
+        """Pass each message to `receive[topic]`, in one thread. `failed` is called with what that raises.
 
-        One thread does that. What it raises goes to `failed`. Raises StartError.
+        Raises StartError.
         """
         self._failed = failed
         self._receive(self._subscriptions, receive)
 
     def stop_receiving(self) -> None:
-        """Lets what has arrived be received, and nothing after that. Publishing goes on."""
+        """Serve what has arrived, and stop receiving. Publishing goes on."""
         if self._messages:
             self._messages.stop()
             self._messages = None
 
     def close(self) -> None:
-        """Nothing may be published any more when this is called."""
+        """To be called when no thread publishes."""
         self.stop_receiving()
         self._open.close()
-
-    # -- another table's topics ----------------------------------------------------------------------------------
 
     def prepare(
         self, publishers: Sequence[TopicPlan], subscriptions: Sequence[TopicPlan], spans: Mapping[str, SourceSpan]
     ) -> RosChange:
-        """Opens what these plans want and what is not open, and nothing else changes. Raises StartError.
+        """Open the endpoints of these plans, beside those that are open. Raises StartError.
 
-        A plan that is the same as before keeps what was opened for it.
+        A plan that is the same as before keeps its endpoint.
         """
         with ExitStack() as opening:
             publications, published = opened_beside(
@@ -111,26 +106,26 @@ class RosEdge:
         for each in published:
             earlier = self._publications.get(each.plan.label)
             if earlier is not None and earlier.wanted[0]:
-                each.meet()
+                each.await_subscribers()
         for subscription in subscribed:
             if subscription.plan.label in self._subscriptions:
-                subscription.meet()
+                subscription.await_publishers()
         return RosChange(publications, kept, [*published, *subscribed])
 
     def abandon(self, change: RosChange) -> None:
-        """Closes what `prepare` opened."""
+        """Close what `prepare` has opened."""
         for opened in change.opened:
             opened.close()
 
     def paused(self) -> AbstractContextManager[None]:
-        """No message is received meanwhile; none is lost. Raises StuckError."""
+        """No message is received inside; none is lost. Raises StuckError."""
         return self._messages.paused() if self._messages else nullcontext()
 
     def apply(self, change: RosChange, receive: Mapping[str, Receive]) -> None:
-        """From now on these are used. To be called while paused; `receive` is as in `start`.
+        """Use the endpoints of the change. To be called while paused; `receive` is as in `start`.
 
-        What has arrived on what is to be closed is received before that, in the way it was until now.
-        Raises StartError, and then the topics are as they were.
+        What has arrived on subscriptions that will be closed is served before, as until now. Raises StartError, with
+        the topics unchanged.
         """
         change.left = [
             *left_by(change.publications, self._publications),
@@ -143,7 +138,7 @@ class RosEdge:
             receive[topic](cdr, sent_at)
 
     def finish(self, change: RosChange) -> None:
-        """Closes what is not used any more: nobody may publish there when this is called."""
+        """Close endpoints that are no longer used; no thread may publish there."""
         for topic in self.publish.keys() - self._publications.keys():
             del self.publish[topic], self.wanted[topic]
         if change.left or change.opened:
@@ -165,7 +160,7 @@ class RosEdge:
             if self._messages:
                 self._messages.serve(served)
             elif served:
-                assert self._failed is not None  # noqa: S101 - it has started
+                assert self._failed is not None  # noqa: S101 - set by `start`
                 self._messages = MessageThread.serving(served, self._failed)
         except (*RCL_ERRORS, OSError) as error:
             raise StartError(f"ROS messages cannot be received: {error}") from error
@@ -175,11 +170,8 @@ class RosEdge:
             self._node,
             [event for each in self._publications.values() for event in each.events],
             [event for each in self._subscriptions.values() for event in each.events],
-            self._look,
+            lambda: self._peers.check(self._node, self._publications, self._subscriptions),
         )
-
-    def _look(self) -> None:
-        self._peers.look(self._node, self._publications, self._subscriptions)
 
     def _stop_events(self) -> None:
         self._events.stop()

@@ -1,0 +1,232 @@
+"""The publishers and subscriptions of a table, and their replacement by those of another table."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from time import sleep
+from typing import TypeVar
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import EventHandler
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+
+from router.compiler.program import TopicPlan
+from router.errors import SourceSpan, StartError
+from router.ros.events import PeerEvents
+from router.ros.node import RCL, RCL_ERRORS
+from router.ros.qos import publisher_qos, qos_profile, subscription_qos
+from router.ros.receiving import MessageThread, RawSubscription
+from router.ros.types import checked_class
+
+_DISCOVERY_S, _POLL_S, _OTHERS_S = 0.5, 0.005, 0.1
+"""The longest wait for peers of a new endpoint, the interval in which they are looked for, and the wait for further
+publishers after the first."""
+
+_IN_TRANSIT_S = 0.005
+"""Time in which the middleware passes a message to the second of two subscriptions."""
+
+
+class _SerializedMessage(ctypes.Structure):
+    """rcutils_uint8_array_t. The allocator stays zero: publishing only reads the bytes."""
+
+    _fields_ = (
+        ("buffer", ctypes.c_char_p),
+        ("buffer_length", ctypes.c_size_t),
+        ("buffer_capacity", ctypes.c_size_t),
+        ("allocator", ctypes.c_void_p * 5),
+    )
+
+
+class _ErrorString(ctypes.Structure):
+    """rcutils_error_string_t."""
+
+    _fields_ = (("text", ctypes.c_char * 1024),)
+
+
+# rclpy publishes with the interpreter lock held, and Fast DDS may block for seconds, waiting for a reader that has gone
+# or a shared-memory port. ctypes releases the lock.
+_publish_serialized = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_SerializedMessage), ctypes.c_void_p
+)(("rcl_publish_serialized_message", RCL))
+_error_string = ctypes.CFUNCTYPE(_ErrorString)(("rcutils_get_error_string", RCL))
+
+
+def _rcl_error() -> Exception:
+    """The error of this thread's last failed call of rcl."""
+    text = _error_string().text.decode(errors="replace")
+    RCL.rcutils_reset_error()
+    error: Exception = rclpy_implementation.RCLError(text)
+    return error
+
+
+class Publication:
+    """A publisher. `wanted`, a list of one boolean, is whether it has subscribers or serves late joiners.
+
+    `publish` takes CDR bytes, is thread-safe, and releases the interpreter lock while the middleware works. It raises
+    RCLError if the middleware fails or the publisher is closed.
+    """
+
+    def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
+        """Raises StartError."""
+        self.plan = plan
+        self.wanted = [plan.qos.serves_late_joiners]
+        with _refusing(f"{span}: topic '{plan.label}' cannot be published"), ExitStack() as opening:
+            self._publisher = node.create_publisher(
+                message,
+                plan.topic,
+                qos_profile(plan.qos),
+                event_callbacks=peers.of_publisher(plan, self.wanted),
+                callback_group=ReentrantCallbackGroup(),  # the node's own group would leak memory
+            )
+            opening.callback(node.destroy_publisher, self._publisher)
+            handle = self._publisher.handle
+            opening.enter_context(handle)
+            self._open = opening.pop_all()
+        self._calls: list[None] = []  # one entry for each call of `publish` that has not returned
+        self._is_closed = False
+        self.publish = self._publish_to(handle.pointer)
+        self.topic: str = handle.get_topic_name()
+        self.qos = publisher_qos(handle.pointer)
+        self.events: Sequence[EventHandler] = self._publisher.event_handlers
+
+    def await_subscribers(self) -> None:
+        """Wait up to 0.5 s until subscribers of an earlier publisher of the topic have discovered this one."""
+        for _ in range(int(_DISCOVERY_S / _POLL_S)):
+            if self._publisher.get_subscription_count():
+                self.wanted[0] = True
+                return
+            sleep(_POLL_S)
+
+    def _publish_to(self, publisher: int) -> Callable[[bytes], None]:
+        begin, end = self._calls.append, self._calls.pop
+
+        def publish(cdr: bytes) -> None:
+            begin(None)
+            try:
+                if self._is_closed:
+                    raise rclpy_implementation.RCLError("the publisher was closed by a reload")
+                size = len(cdr)
+                if _publish_serialized(publisher, _SerializedMessage(cdr, size, size), None):
+                    raise _rcl_error()
+            finally:
+                end()
+
+        return publish
+
+    def close(self) -> None:
+        """Wait for running calls of `publish`, and close. No thread may wait for its events."""
+        self._is_closed = True
+        while self._calls:
+            sleep(_POLL_S)
+        self._open.close()
+
+
+class Subscription:
+    """A subscription. Messages are taken through `raw`."""
+
+    def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
+        """Raises StartError."""
+        self.plan = plan
+        with _refusing(f"{span}: topic '{plan.label}' cannot be subscribed to"):
+            self.raw = RawSubscription(node, message, plan.topic, qos_profile(plan.qos), peers.of_subscription(plan))
+        self.events: Sequence[EventHandler] = self.raw.events
+        self.topic: str = self.raw.handle.get_topic_name()
+        self.qos = subscription_qos(self.raw.handle.pointer)
+
+    def await_publishers(self) -> None:
+        """Wait up to 0.5 s until publishers have discovered this subscription, while an earlier one receives.
+
+        All have discovered it soon after a message of the first one; silent publishers have time afterwards.
+        """
+        for _ in range(int(_DISCOVERY_S / _POLL_S)):
+            sleep(_POLL_S)
+            if self.raw.take():
+                sleep(_OTHERS_S)
+                return
+
+    def close(self) -> None:
+        """To be called when no thread takes from it or waits for its events."""
+        self.raw.close()
+
+
+@contextmanager
+def _refusing(problem: str) -> Iterator[None]:
+    try:
+        yield
+    except RCL_ERRORS as error:
+        raise StartError(f"{problem}: {error}") from error
+
+
+Opened = TypeVar("Opened", Publication, Subscription)
+
+
+@dataclass(slots=True)
+class RosChange:
+    """All endpoints of the next table by topic; those opened for it, and those that it does not use."""
+
+    publications: dict[str, Publication]
+    subscriptions: dict[str, Subscription]
+    opened: Sequence[Publication | Subscription]
+    left: Sequence[Publication | Subscription] = ()
+
+
+def opened_beside(
+    now: Mapping[str, Opened],
+    plans: Sequence[TopicPlan],
+    spans: Mapping[str, SourceSpan],
+    open_one: Callable[[TopicPlan, type, SourceSpan], Opened],
+) -> tuple[dict[str, Opened], list[Opened]]:
+    """Open the endpoints of `plans` that are not in `now`. Raises StartError.
+
+    Returns all endpoints by topic, and those that were opened.
+    """
+    classes = {}
+    for plan in plans:
+        if plan.label in now and now[plan.label].plan.type_name != plan.type_name:
+            kept = now[plan.label].plan.type_name  # DDS has one type for a topic in a process
+            what = f"topic '{plan.label}' is {kept} in the running router, and cannot become {plan.type_name}"
+            raise StartError(f"{spans[plan.label]}: {what} while it runs; restart it, or take another name")
+        classes[plan.label] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
+    opened: list[Opened] = []
+    with ExitStack() as opening:
+        for plan in plans:
+            if plan.label not in now or now[plan.label].plan != plan:
+                opened.append(open_one(plan, classes[plan.label], spans[plan.label]))
+                opening.callback(opened[-1].close)
+        opening.pop_all()
+    beside = {each.plan.label: each for each in opened}
+    return {plan.label: beside.get(plan.label) or now[plan.label] for plan in plans}, opened
+
+
+def left_by(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opened]:
+    """The open endpoints that are not kept."""
+    return [each for topic, each in now.items() if kept.get(topic) is not each]
+
+
+def hand_over(
+    messages: MessageThread, now: Mapping[str, Subscription], then: Mapping[str, Subscription]
+) -> list[tuple[str, bytes, int]]:
+    """Serve what has arrived on subscriptions that are not kept, while `messages` is paused.
+
+    A topic whose subscription is replaced receives each message twice: those that came until now are served from the
+    old subscription. Returns those that only the new one has: topic, CDR bytes and time at which they set out.
+    """
+    left = left_by(then, now)
+    replaced = {each.plan.label: then[each.plan.label] for each in left if each.plan.label in then}
+    if replaced:
+        sleep(_IN_TRANSIT_S)  # then what was served before the pause has reached the new subscription as well
+    for each in replaced.values():
+        each.raw.take_all()
+    if replaced:
+        sleep(_IN_TRANSIT_S)
+    served = {each.plan.label: messages.finish(each.raw) for each in left}
+    return [
+        (topic, *message)
+        for topic, each in replaced.items()
+        for message in each.raw.take_all()
+        if message not in served[topic]
+    ]

@@ -1,0 +1,224 @@
+"""Events of publishers and subscriptions: who subscribes, which peers are incompatible, and the thread that waits."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rclpy.event_handler import EventHandler, PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import qos_policy_name_from_kind
+
+from router.clock import monotonic_ns
+from router.compiler.metrics import QOS_POLICIES
+from router.compiler.program import TopicPlan
+from router.log import logger
+from router.ros.qos import ActualQos, incompatible_policies
+
+if TYPE_CHECKING:
+    from router.ros.endpoints import Publication, Subscription
+
+CHECK_INTERVAL_NS = 1_000_000_000
+"""The longest delay of what ends no wait: events of subscriptions, incompatible peers that have left, and a shutdown of
+ROS from outside."""
+
+Incompatible = Callable[[str, str, int], None]
+"""Called as `incompatible(topic, policy, peers)`: one of QOS_POLICIES, and how many peers it keeps from matching."""
+
+SubscriberJoined = Callable[[str], None]
+
+_MORE_CHECKS = 10
+"""Checks of a topic after its last incompatible peer: a middleware may report the event before the peer is in its
+graph."""
+
+
+class PeerEvents:
+    """Event callbacks of publishers and subscriptions about their peers. For one thread.
+
+    `subscribed` has the topics with subscribers; other threads may test whether it is empty. `subscriber_joined(topic)`
+    is called for each new subscriber.
+    """
+
+    def __init__(self, incompatible: Incompatible, subscriber_joined: SubscriberJoined) -> None:
+        self.subscribed: set[str] = set()
+        self._subscriber_joined = subscriber_joined
+        self._incompatible = incompatible
+        self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: how many checks are left
+
+    def of_publisher(self, plan: TopicPlan, wanted: list[bool]) -> PublisherEventCallbacks:
+        """Callbacks that also keep `wanted` up to date: whether there are subscribers."""
+
+        def on_matched(status: Any) -> None:
+            (self.subscribed.add if status.current_count else self.subscribed.discard)(plan.label)
+            wanted[0] = plan.qos.serves_late_joiners or status.current_count > 0
+            if status.total_count_change > 0:
+                self._subscriber_joined(plan.label)
+
+        def on_incompatible_qos(status: Any) -> None:
+            problem = "a subscriber asks for a QoS that the table does not offer, and gets nothing"
+            self._on_incompatible_qos(problem, plan, status)
+
+        def on_incompatible_type(_: Any) -> None:
+            logger.warning("a subscriber expects another type, and gets nothing", topic=plan.label, type=plan.type_name)
+
+        return PublisherEventCallbacks(
+            matched=on_matched, incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type
+        )
+
+    def forget_all_but(self, published: Collection[str]) -> None:
+        """Remove topics that are no longer published. To be called while no thread calls the callbacks."""
+        self.subscribed.intersection_update(published)
+
+    def check(
+        self, node: Node, publishers: Mapping[str, Publication], subscriptions: Mapping[str, Subscription]
+    ) -> None:
+        """Report how many incompatible peers each topic has now, if an event has named one. Arguments by topic.
+
+        Events report peers that come, but not those that go; the graph has those that are there.
+        """
+        for topic, checks in list(self._checks.items()):
+            del self._checks[topic]  # if `incompatible` raises, checks end until the next event
+            mismatches = Counter(_mismatches(node, publishers.get(topic), subscriptions.get(topic)))
+            for policy in QOS_POLICIES:
+                self._incompatible(topic, policy, mismatches[policy])
+            if mismatches or checks > 1:
+                self._checks[topic] = _MORE_CHECKS if mismatches else checks - 1
+
+    def of_subscription(self, plan: TopicPlan) -> SubscriptionEventCallbacks:
+        def on_incompatible_qos(status: Any) -> None:
+            problem = "a publisher offers less than the QoS that the table asks for, and is not heard"
+            self._on_incompatible_qos(problem, plan, status)
+
+        def on_incompatible_type(_: Any) -> None:
+            logger.warning("a publisher has another type, and is not heard", topic=plan.label, type=plan.type_name)
+
+        return SubscriptionEventCallbacks(incompatible_qos=on_incompatible_qos, incompatible_type=on_incompatible_type)
+
+    def _on_incompatible_qos(self, problem: str, plan: TopicPlan, status: Any) -> None:
+        """The middleware names only the last policy of the last peer."""
+        policy = qos_policy_name_from_kind(status.last_policy_kind).lower()
+        self._checks[plan.label] = _MORE_CHECKS
+        logger.warning(problem, topic=plan.label, policy=policy)
+
+
+def _mismatches(node: Node, publisher: Publication | None, subscription: Subscription | None) -> Iterator[str]:
+    """Yield the incompatible policies of each peer in the graph."""
+    if publisher:
+        for qos in _peers(node, publisher, rclpy_implementation.rclpy_get_subscriptions_info_by_topic):
+            yield from incompatible_policies(publisher.qos, qos)
+    if subscription:
+        for qos in _peers(node, subscription, rclpy_implementation.rclpy_get_publishers_info_by_topic):
+            yield from incompatible_policies(qos, subscription.qos)
+
+
+def _peers(
+    node: Node, ours: Publication | Subscription, ask: Callable[[Any, str, bool], Iterable[dict[str, Any]]]
+) -> Iterator[ActualQos]:
+    with node.handle:
+        peers = ask(node.handle, ours.topic, False)
+    for qos in (peer["qos_profile"] for peer in peers if peer["topic_type"] == ours.plan.type_name):
+        yield ActualQos(
+            qos["reliability"],
+            qos["durability"],
+            qos["deadline"].nanoseconds,
+            qos["liveliness"],
+            qos["liveliness_lease_duration"].nanoseconds,
+        )
+
+
+class WaitSet:
+    """Waits until one of the events has happened. For one thread; others may call `wake`.
+
+    Unlike the wait set of rclpy's executor, it is made only once.
+    """
+
+    def __init__(self, node: Node, events: Sequence[EventHandler]) -> None:
+        self._events = events
+        self._guard_condition = GuardCondition(None, None, node.context)
+        self._set = rclpy_implementation.WaitSet(0, 1, 0, 0, 0, len(events), node.context.handle)
+
+    def wait(self, timeout_ns: int) -> None:
+        """Wait until an event happens or `wake` is called, at most `timeout_ns`. No signal handler runs meanwhile."""
+        waiting = self._set
+        waiting.clear_entities()  # waiting removes what is not ready
+        waiting.add_guard_condition(self._guard_condition.handle)
+        for event in self._events:
+            event.add_to_wait_set(waiting)
+        waiting.wait(timeout_ns)
+
+    def happened(self) -> Iterator[tuple[EventHandler, Any]]:
+        """Yield the events that had happened when `wait` returned, each with its status."""
+        for event in self._events:
+            if event.is_ready(self._set):
+                yield event, event.take_data()
+
+    def wake(self) -> None:
+        """End the present wait, or the next one."""
+        self._guard_condition.trigger()
+
+    def close(self) -> None:
+        self._set.destroy_when_not_in_use()
+        self._guard_condition.destroy()
+
+
+class EventThread:
+    """Calls the callbacks of events: those of publishers when they happen, those of subscriptions at most 1 s later.
+
+    The latter are polled, because Fast DDS would end a wait for each message, and at once while a message is not taken:
+    this thread would compete with the receiving one for the interpreter. Events have a thread of their own because they
+    need a wait set, whose cost grows with the number of topics. The thread starts once and stops once.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        of_publishers: Sequence[EventHandler],
+        of_subscriptions: Sequence[EventHandler],
+        check: Callable[[], None],
+    ) -> None:
+        """`check` is called once per second, after the callbacks."""
+        self._waited_for = WaitSet(node, of_publishers)
+        self._polled = WaitSet(node, of_subscriptions)
+        self._context = node.context
+        self._check = check
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="ros events")
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopping = True
+        self._waited_for.wake()
+        self._thread.join()
+        self._waited_for.close()
+        self._polled.close()
+
+    def _run(self) -> None:
+        check_at = 0
+        while not self._stopping:
+            self._waited_for.wait(max(0, check_at - monotonic_ns()))
+            if not self._context.ok():
+                logger.critical("ROS was shut down from outside the router: nothing can be published any more")
+                return
+            self._serve(self._waited_for)
+            if (now := monotonic_ns()) >= check_at:
+                check_at = now + CHECK_INTERVAL_NS
+                self._polled.wait(0)
+                self._serve(self._polled)
+                self._call(self._check)
+
+    def _serve(self, wait_set: WaitSet) -> None:
+        for event, status in wait_set.happened():
+            self._call(partial(event.callback, status))
+
+    def _call(self, callback: Callable[[], None]) -> None:
+        try:
+            callback()
+        except Exception as error:  # noqa: BLE001 a bug, which is logged; the next events are served
+            logger.critical("a fault in the router itself lost an event; please report it", exc_info=error)
