@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -29,7 +28,17 @@ GATEWAY_WORDS = [
     "gateway_v2",
 ]
 GATEWAY_WORDS += ["include", "exclude", "regex", "rates", "publish_period", "each", "compression", "zstd", "inbound"]
-GATEWAY_WORDS += ["topics", "topic", "type", "deadman", "max_datagram", "127.0.0.1:8502", "key", "connect", "timeout"]
+GATEWAY_WORDS += [
+    "gateway_v2",
+    "topics",
+    "topic",
+    "type",
+    "deadman",
+    "max_datagram",
+    "127.0.0.1:8502",
+    "key",
+    "connect",
+]
 
 scalars = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from([*WORDS, "${X"])
@@ -41,7 +50,7 @@ trees = st.recursive(
 )
 fragments = st.text() | st.sampled_from(["\t", "{", "}", "[", "]", ":", "- ", "&a ", "*a", "!!x ", "${", "|", '"', "'"])
 
-quick = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
+quick = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def check(folder: Path, text: str | bytes) -> list[Diagnostic]:
@@ -116,6 +125,6 @@ def test_any_two_lines_changed_over(tmp_path: Path, first: int, second: int) -> 
     check(tmp_path, "".join(lines))
 
 
-@pytest.mark.parametrize("index", range(len(LINES)))
-def test_any_line_left_out(tmp_path: Path, index: int) -> None:
-    check(tmp_path, "".join(LINES[:index] + LINES[index + 1 :]))
+def test_any_line_left_out(tmp_path: Path) -> None:
+    for index in range(len(LINES)):
+        check(tmp_path, "".join(LINES[:index] + LINES[index + 1 :]))

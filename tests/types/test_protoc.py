@@ -1,4 +1,4 @@
-"""Running protoc inside the process."""
+"""protoc is run, and what it complains about becomes findings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from router.errors import TableError
+from router.errors import Code, Diagnostic, SourceSpan, TableError
 from router.types.protobuf import load_protos
 from tests.types.conftest import settings, with_envelope
 
@@ -38,3 +38,134 @@ def test_files_that_change_while_they_are_compiled_are_a_finding(write: Write, m
     monkeypatch.setattr("router.types.protoc._protoc_compiler.get_protos", break_off)  # the first look
     with pytest.raises(TableError, match=r"perhaps they changed meanwhile: try again"):
         load_protos(*settings(root))
+
+
+Refused = Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]
+
+
+@pytest.mark.parametrize(
+    ("body", "finding"),
+    [
+        pytest.param(
+            "message A {\n  int32 x = 1;\n  int32 y = 1;\n}",
+            'a.proto:4:13: error[wire-number-conflict]: Field number 1 has already been used in "A" by field "x"; '
+            "Next available field number is 2",
+            id="number used twice",
+        ),
+        pytest.param(
+            "message A {\n  reserved 3;\n  int32 x = 3;\n}",
+            'a.proto:4:9: error[wire-number-conflict]: Field "x" uses reserved number 3; '
+            "Suggested field numbers for A: 1",
+            id="reserved number",
+        ),
+        pytest.param(
+            'message A {\n  reserved "x";\n  int32 x = 3;\n}',
+            'a.proto:4:9: error[wire-number-conflict]: Field name "x" is reserved',
+            id="reserved name",
+        ),
+        pytest.param(
+            "enum E {\n  X = 0;\n  Y = 0;\n}",
+            'a.proto:4:7: error[wire-number-conflict]: "Y" uses the same enum value as "X"; If this is intended, '
+            "set 'option allow_alias = true;' to the enum definition. The next available enum value is 1",
+            id="enum value used twice",
+        ),
+        pytest.param(
+            "message A {}\n\nmessage A {}",
+            'a.proto:4:9: error[duplicate-message]: "A" is already defined',
+            id="message declared twice",
+        ),
+        pytest.param(
+            "message A {\n  int32 x = 1;\n  int32 x = 2;\n}",
+            'a.proto:4:9: error[bad-proto]: "x" is already defined in "A"',
+            id="field declared twice",
+        ),
+        pytest.param(
+            "message A {\n  int32 x = 1\n}",
+            'a.proto:4:1: error[bad-proto]: Expected ";"',
+            id="syntax",
+        ),
+        pytest.param(
+            "message A {\n  Motr motor = 1;\n}",
+            "a.proto:3:3: error[bad-proto]: \"Motr\" is not defined; did you mean 'Motor'?",
+            id="unknown type",
+        ),
+        pytest.param(
+            'import "commn/motor.proto";',
+            "a.proto:2:1: error[bad-proto]: there is no file 'commn/motor.proto' to import; "
+            "did you mean 'common/motor.proto'?",
+            id="unknown import",
+        ),
+        pytest.param(
+            'import "a.proto";',
+            "a.proto:2:1: error[bad-proto]: File recursively imports itself: a.proto -> a.proto",
+            id="import of itself",
+        ),
+        pytest.param(
+            "message A {\n\tint32 x = 1;\n\t/* gr\u00f6\u00dfe */ int32 y = 1;\n}",
+            'a.proto:4:24: error[wire-number-conflict]: Field number 1 has already been used in "A" by field "x"; '
+            "Next available field number is 2",
+            id="column after tabs and other scripts",
+        ),
+    ],
+)
+def test_error_of_protoc_has_file_line_column_and_code(refused: Refused, body: str, finding: str) -> None:
+    findings = refused({"a.proto": proto(body), "common/motor.proto": proto("message Motor {}")})
+    assert [str(found) for found in findings] == [finding]
+
+
+def test_same_message_in_two_files_is_blamed_on_the_second(refused: Refused) -> None:
+    (finding,) = refused({"a.proto": proto("message A {}"), "b.proto": proto("\nmessage A {}")})
+    assert (finding.code, finding.span) == (Code.DUPLICATE_MESSAGE, SourceSpan("b.proto", 3, 9, 10))
+
+
+def test_every_broken_file_is_reported_but_not_what_imports_it(refused: Refused) -> None:
+    findings = refused(
+        {
+            "a.proto": proto("message A { int32 x = 1 }"),
+            "b.proto": proto("message B { int32 x = 0; }"),
+            "c.proto": proto('import "a.proto";\nmessage C { A a = 1; }'),
+        }
+    )
+    assert [finding.span.file for finding in findings] == ["a.proto", "b.proto"]
+
+
+def test_missing_import_hides_what_follows_from_it(refused: Refused) -> None:
+    findings = refused({"c.proto": proto('import "nowhere.proto";\nmessage C { A a = 1; }')})
+    assert [finding.message for finding in findings] == ["there is no file 'nowhere.proto' to import"]
+
+
+def test_missing_import_hides_what_another_file_imports_too(refused: Refused) -> None:
+    findings = refused(
+        {
+            "a.proto": proto('import "b.proto";\nimport "sub/c.proto";\nmessage A { B b = 1; C c = 2; }'),
+            "b.proto": proto('import "c.proto";\nmessage B { C c = 1; }'),
+            "c.proto": proto("message C {}"),
+        }
+    )
+    assert [(finding.message, finding.hint) for finding in findings] == [
+        ("there is no file 'sub/c.proto' to import", "did you mean 'c.proto'?")
+    ]
+
+
+def test_type_of_an_imported_file_with_another_package_is_told_with_its_name(refused: Refused) -> None:
+    (finding,) = refused(
+        {
+            "a.proto": proto('import "b.proto";\nmessage A { B b = 1; }'),
+            "b.proto": proto("package rover;\nmessage B {}"),
+        }
+    )
+    assert (finding.message, finding.hint) == ('"B" is not defined', "b.proto declares rover.B")
+
+
+def test_type_of_a_file_that_only_another_one_imports_needs_its_import(refused: Refused) -> None:
+    (finding,) = refused(
+        {
+            "a.proto": proto('import "b.proto";\nmessage A { C c = 1; }'),
+            "b.proto": proto('import "c.proto";\nmessage B { C c = 1; }'),
+            "c.proto": proto("message C {}"),
+        }
+    )
+    assert (finding.message, finding.hint) == (
+        '"C" is not defined',
+        'c.proto declares it: `import "c.proto";` is missing',
+    )
