@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.gateway.measuring import Metrics, measure
-from benchmarks.gateway.topics import IMAGE, Topic, many
+from benchmarks.gateway.topics import Topic, many
 from benchmarks.versus.building import PROGRAMS, build
 from benchmarks.versus.contenders import TABLES, Contender, Native, Router
 from benchmarks.versus.processes import cores
@@ -42,11 +42,6 @@ LOADS = {
         "200 topics at 50 Hz: a fifth best-effort, a fifth transient-local",
         many(200, 50, ["reliable", "reliable", "reliable", "best_effort", "transient_local"]),
         "gateway.yaml",
-    ),
-    "image": Load(
-        "20 topics at 50 Hz beside an image of 2 MB once a second",
-        [*many(20, 50, ["reliable"]), Topic("/bench/image", IMAGE, "reliable", 1)],
-        "gateway_large.yaml",
     ),
 }
 LABELS = {

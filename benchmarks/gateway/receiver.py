@@ -13,8 +13,7 @@ from contextlib import AbstractContextManager, suppress
 from typing import NamedTuple
 
 from benchmarks.gateway.topics import Kind
-from router.gateway.compression import decompress
-from router.gateway.fragments import Reassembler
+from router.gateway.packets import decompress
 
 SO_TIMESTAMPNS = 35
 BUFFER = 64 << 20
@@ -71,11 +70,9 @@ class Receiver(AbstractContextManager["Receiver"]):
 
     def arrivals(self, kinds: Mapping[str, Kind]) -> Iterator[Arrival]:
         """Of all data packets, in their order; `kinds` by topic."""
-        reassembler = Reassembler(most_open=1024)
-        for time, datagram in self._datagrams:
-            for packet in reassembler.feed(datagram, None, time):
-                (sent,) = struct.unpack_from("<d", packet)
-                topic, _, payload = packet[9:].split(b"\0", 2)
-                text = decompress(payload, LONGEST) if packet[8] else payload
-                if not text.startswith(b'{"fields":'):
-                    yield Arrival(topic.decode(), kinds[topic.decode()].read(text), sent, time / NS)
+        for time, packet in self._datagrams:
+            (sent,) = struct.unpack_from("<d", packet)
+            topic, _, payload = packet[9:].split(b"\0", 2)
+            text = decompress(payload, LONGEST) if packet[8] else payload
+            if not text.startswith(b'{"fields":'):
+                yield Arrival(topic.decode(), kinds[topic.decode()].read(text), sent, time / NS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import re
 import struct
 from collections.abc import Callable, Sequence
@@ -13,10 +12,8 @@ from typing import Any, NamedTuple
 
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, PoseWithCovarianceStamped, Twist, Vector3
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Image, Imu, JointState, NavSatFix
+from sensor_msgs.msg import Imu, JointState, NavSatFix
 from std_msgs.msg import Float64, Header, String
-
-IMAGE_BYTES = 2_000_000
 
 _SECONDS = 0x51525354
 _NANOSECONDS = 0x31323334
@@ -102,12 +99,6 @@ KINDS = (
         ),
         _of_header,
     ),
-)  # fmt: skip
-IMAGE = Kind(
-    "sensor_msgs/msg/Image", "time",
-    Image(header=_header("camera"), height=1000, width=2000, encoding="mono8", step=2000,
-          data=random.Random(IMAGE_BYTES).randbytes(IMAGE_BYTES)),
-    _of_header,
 )  # fmt: skip
 
 

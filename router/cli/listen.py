@@ -24,8 +24,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "listen",
         help=VERBS["listen"],
-        description="Print each message and schema that a gateway sends as one line. Compressed, batched and "
-        "fragmented packets are understood. How many there were is said at the end.",
+        description="Print each message and schema that a gateway sends as one line. Compressed and batched "
+        "packets are understood. How many there were is said at the end.",
         epilog="Places: [udp://][HOST:]PORT receives on this address of this machine; tcp://HOST:PORT and "
         "ws://HOST:PORT connect to a gateway, again and again; zenoh://KEY?connect=tcp/10.0.0.1:7447 has the key "
         "of a gateway, and further listen=LOCATOR and mode=peer|client|router.",

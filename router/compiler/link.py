@@ -234,7 +234,7 @@ def _inbound(entry: CheckedInbound, gateway: str, counters: Counters) -> Inbound
 
 def _open_gateway_counters(counters: Counters, gateway: Gateway) -> None:
     name = gateway.name
-    for metric in ("datagrams_received", "received_bytes", "gateway_clients"):
+    for metric in ("datagrams_received", "received_bytes", "gateway_clients", "gateway_client_clock_ahead"):
         counters.index(metric, name)
     counters.index("route_last_message_timestamp_seconds", name)
     for reason in GATEWAY_REJECT_REASONS:

@@ -49,6 +49,7 @@ METRICS = (
     ),
     Metric("deadman_send_errors", "counter", ("route", "destination"), "Datagrams that the deadman could not send."),
     Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
+    Metric("gateway_client_clock_ahead", "counter", ("route",), "Messages of clients whose clock is ahead of ours."),
     Metric("gateway_key_conflicts", "counter", ("route",), "Times that another gateway had the same Zenoh key."),
     Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),
     Metric(
@@ -102,7 +103,7 @@ GATEWAY_REJECT_REASONS: Mapping[str, str] = {
     "not_allowed": "a topic that `inbound` does not have",
     "wrong_type": "another type than `inbound` says",
     "invalid": "a field is missing, unknown, of another type or out of range",
-    "rate_limited": "schemas were asked for too often, or too much waits to be read",
+    "rate_limited": "schemas were asked for too often",
 }
 """Why a gateway refused what a client sent, with what each means."""
 

@@ -15,14 +15,13 @@ _CANCEL_AGAIN_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class GatewayContext:
-    """`converting` runs what would block the loop for messages from ROS, `reading` for those from clients.
+    """`converting` runs what would block the loop: large messages from ROS.
 
     `failed` reports faults of the router itself. Clocks in ns.
     """
 
     subscriptions: Subscriptions
     converting: Executor
-    reading: Executor
     failed: Callable[[Exception], None]
     clock_ns: Callable[[], int]
     wall_ns: Callable[[], int]

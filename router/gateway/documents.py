@@ -8,17 +8,18 @@
     {"op": "publish", "topic": T, "type": N, "time": S, "data": {...}}   to the gateway; type and time may be left out
     {"op": "schema", "type": N}                                          asks for schemas, of all without a type
 
-Times are wall-clock seconds. No document has a newline in it. Knows no topics and no types.
+Times are wall-clock seconds. No document has a newline in it.
 """
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable
 from typing import NamedTuple, Union
 
-from router.gateway.json_reading import parse_json
+import msgspec
+import orjson
+
+from router.gateway.json_codec import InvalidMessageError, shown
 from router.gateway.packets import PacketError
 
 
@@ -40,12 +41,13 @@ class InboundRow(NamedTuple):
 
 
 class PublishRequest(NamedTuple):
-    """A client's message. `time` is when the client sent it."""
+    """A client's message: its JSON text, in a zstd frame if `is_compressed`. `time` is when the client sent it."""
 
     topic: str
     type_name: str | None
     time: float | None
-    data: object
+    data: bytes
+    is_compressed: bool = False
 
 
 class SchemaRequest(NamedTuple):
@@ -57,106 +59,60 @@ class SchemaRequest(NamedTuple):
 Request = Union[PublishRequest, SchemaRequest]
 
 
-class Heading(NamedTuple):
-    """What a publish request says besides its data."""
-
-    topic: str
-    type_name: str | None
-
-
-_SEEN = 1 << 10
-"""Bytes at a document's beginning and end in which a topic and a type of 255 bytes have room."""
-_MEMBER = rb'\s*"(op|topic|type|time)"\s*:\s*("[^"\\]*(?:\\.[^"\\]*)*"|[^\s",\[\]{}]{1,64})\s*'
-_ONE = re.compile(_MEMBER)
-_BEFORE = re.compile(rb"\s*\{(?:%b,){1,4}" % _MEMBER)
-_BEHIND = re.compile(rb",%b(?:,%b){0,3}\}\s*\Z" % (_MEMBER, _MEMBER))
-
-
-def data_document(topic: str, type_name: str, time: float, text: str) -> bytes:
+def data_document(topic: str, type_name: str, time: float, text: bytes) -> bytes:
     """A message whose JSON text is `text`."""
-    names = f'"topic":{json.dumps(topic)},"type":{json.dumps(type_name)}'
-    return f'{{"op":"data",{names},"time":{time!r},"data":{text}}}'.encode()
+    names = b'"topic":%b,"type":%b' % (orjson.dumps(topic), orjson.dumps(type_name))
+    return b'{"op":"data",%b,"time":%b,"data":%b}' % (names, orjson.dumps(time), text)
 
 
 def schema_document(type_name: str, time: float, text: str) -> bytes:
     """A type whose schema is the JSON text `text`."""
-    return f'{{"op":"schema","type":{json.dumps(type_name)},"time":{time!r},"schema":{text}}}'.encode()
+    return orjson.dumps({"op": "schema", "type": type_name, "time": time, "schema": orjson.Fragment(text)})
 
 
 def topics_document(time: float, rows: Iterable[TopicRow]) -> bytes:
     topics = [{"topic": row.topic, "type": row.type_name, "rate": row.rate} for row in rows]
-    return _document({"op": "topics", "time": time, "topics": topics})
+    return orjson.dumps({"op": "topics", "time": time, "topics": topics})
 
 
 def inbound_document(rows: Iterable[InboundRow]) -> bytes:
     topics = [
-        {"topic": row.topic, "type": row.type_name, "schema": json.loads(row.schema), "example": row.example}
+        {"topic": row.topic, "type": row.type_name, "schema": orjson.Fragment(row.schema), "example": row.example}
         for row in rows
     ]
-    return _document({"op": "inbound", "topics": topics})
+    return orjson.dumps({"op": "inbound", "topics": topics})
 
 
 def rejected_document(reason: str, detail: str, topic: str) -> bytes:
     """Why a client's message is not published: one of GATEWAY_REJECT_REASONS, and a sentence."""
-    return _document({"op": "rejected", "reason": reason, "detail": detail, "topic": topic})
+    return orjson.dumps({"op": "rejected", "reason": reason, "detail": detail, "topic": topic})
 
 
-def _document(content: Mapping[str, object]) -> bytes:
-    return json.dumps(content, separators=(",", ":")).encode()
+class _Publish(msgspec.Struct, tag_field="op", tag="publish", forbid_unknown_fields=True, gc=False):
+    topic: str
+    data: msgspec.Raw
+    type: str | None = None
+    time: float | None = None
+
+
+class _Schema(msgspec.Struct, tag_field="op", tag="schema", forbid_unknown_fields=True, gc=False):
+    type: str | None = None
+
+
+_decode = msgspec.json.Decoder(Union[_Publish, _Schema]).decode
 
 
 def request(text: bytes) -> Request:
-    """What a client asks for. Raises PacketError for what is no request, InvalidMessageError for what is no JSON."""
-    document = parse_json(text)
-    if not isinstance(document, dict):
-        raise PacketError("a request is a JSON object")
-    match document.get("op"):
-        case "publish":
-            _check_keys(document, {"op", "topic", "type", "time", "data"})
-            return _publish_request(document)
-        case "schema":
-            _check_keys(document, {"op", "type"})
-            return SchemaRequest(_type_name(document))
-    raise PacketError("'op' is neither publish nor schema")
+    """What a client asks for. The data of a message are not read yet.
 
-
-def heading(text: bytes) -> Heading:
-    """That of a long document, without reading its data, which stands before or behind all else. If the document is a
-    request at all, it is one with this heading. Raises PacketError where there is none, InvalidMessageError.
+    Raises PacketError for JSON that is no request, InvalidMessageError for what is no JSON.
     """
-    spans = [found.group() for found in (_BEFORE.match(text[:_SEEN]), _BEHIND.search(text[-_SEEN:])) if found]
-    said = {name: value for span in spans for name, value in _ONE.findall(span)}
-    topic, type_name = (parse_json(said.get(name, b"null")) for name in (b"topic", b"type"))
-    if not isinstance(topic, str) or not isinstance(type_name, (str, type(None))):
-        raise PacketError("a long request names its topic, and maybe its type, before its data or behind them")
-    return Heading(topic, type_name)
-
-
-def _publish_request(document: Mapping[str, object]) -> PublishRequest:
-    topic = document.get("topic")
-    if not isinstance(topic, str):
-        raise PacketError("'topic' is not a text")
-    if "data" not in document:
-        raise PacketError("there is no 'data'")
-    return PublishRequest(topic, _type_name(document), _time(document), document["data"])
-
-
-def _check_keys(document: Mapping[str, object], known: Collection[str]) -> None:
-    if unknown := sorted(document.keys() - known):
-        raise PacketError(f"a request of this kind has no '{unknown[0]}'")
-
-
-def _type_name(document: Mapping[str, object]) -> str | None:
-    type_name = document.get("type")
-    if type_name is not None and not isinstance(type_name, str):
-        raise PacketError("'type' is not a text")
-    return type_name
-
-
-def _time(document: Mapping[str, object]) -> float | None:
-    time = document.get("time")
-    if time is None:
-        return None
-    if isinstance(time, bool) or not isinstance(time, (int, float)):
-        raise PacketError("'time' is not a number")
-    return float(time)
+    try:
+        found = _decode(text)
+    except msgspec.ValidationError as error:
+        raise PacketError(f"no request: {shown(str(error))}") from None
+    except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+        raise InvalidMessageError(f"no JSON: {shown(str(error))}") from None
+    if isinstance(found, _Schema):
+        return SchemaRequest(found.type)
+    return PublishRequest(found.topic, found.type, found.time, bytes(found.data))

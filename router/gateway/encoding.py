@@ -1,18 +1,15 @@
-"""What a gateway's formats are on the wire: packets with a binary header, or JSON documents. Knows no clients."""
+"""The formats of a gateway on the wire: packets with a binary header, or JSON documents."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterator, Mapping, Sequence
-from itertools import count
+from collections.abc import Hashable, Mapping, Sequence
 from math import inf
 
-from router.gateway.documents import data_document, schema_document
-from router.gateway.fragments import capacity, datagrams
-from router.gateway.letters import DocumentLetter, Letter, PacketLetter
-from router.gateway.packets import HEAD, prefix
+from router.gateway.documents import PublishRequest, Request, SchemaRequest, data_document, request, schema_document
+from router.gateway.json_types import Style
+from router.gateway.packets import HEAD, datagrams, prefix, unpack
 from router.gateway.samples import Sample
-from router.gateway.style import Style
 from router.gateway.transport.base import Frame
 from router.table.model import Gateway, GatewayFormat, Transport
 from router.table.units import LARGEST_DATAGRAM
@@ -20,21 +17,18 @@ from router.table.units import LARGEST_DATAGRAM
 LARGE = 64 << 10
 """Bytes of a message that is converted in a thread of its own, so that smaller ones need not wait for it."""
 
-_IDS = 1 << 32
-
 
 class Encoding(ABC):
     """How one gateway writes samples and schemas, and reads what clients send. Times are wall-clock seconds."""
 
     style: Style
     level: int
-    fragments = False
-    """Whether what is longer than a datagram is spread over several."""
-    most: float = inf
-    """Bytes of the longest packet or document that can be sent."""
+    most: float
+    """Bytes of the longest packet or document that the transport can send."""
 
     def __init__(self, settings: Gateway) -> None:
         self.level = settings.compression
+        self.most = LARGEST_DATAGRAM if settings.transport.value is Transport.UDP else inf
 
     @abstractmethod
     def introduces(self, topic: str, type_name: str) -> Hashable:
@@ -48,7 +42,7 @@ class Encoding(ABC):
         """Raises UnreadableError."""
 
     @abstractmethod
-    def letter(self, data: bytes) -> Letter:
+    def request(self, data: bytes) -> Request:
         """What a client has sent. Raises PacketError for what has not the format, InvalidMessageError."""
 
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
@@ -61,11 +55,6 @@ class PacketEncoding(Encoding):
 
     style = Style.WRAPPED
 
-    def __init__(self, settings: Gateway) -> None:
-        super().__init__(settings)
-        if settings.transport.value is Transport.UDP:
-            self.most = LARGEST_DATAGRAM
-
     def introduces(self, topic: str, type_name: str) -> Hashable:
         return topic, type_name  # each packet names both, and clients may keep schemas by either
 
@@ -76,26 +65,23 @@ class PacketEncoding(Encoding):
         payload = sample.payload(self.style, self.level)
         return HEAD.pack(time, self.level > 0) + prefix(sample.topic, sample.type_name) + payload
 
-    def letter(self, data: bytes) -> Letter:
-        return PacketLetter(data)
+    def request(self, data: bytes) -> Request:
+        packet = unpack(data)
+        if not packet.payload:
+            return SchemaRequest(packet.type_name or None)
+        return PublishRequest(packet.topic, packet.type_name, packet.time, packet.payload, packet.is_compressed)
 
 
 class BatchEncoding(PacketEncoding):
-    """`gateway_v2`: packets that fit share a datagram, one that does not fit is spread over several."""
-
-    fragments = True
+    """`gateway_v2`: packets share datagrams of at most `max_datagram` bytes."""
 
     def __init__(self, settings: Gateway) -> None:
         super().__init__(settings)
         self._datagram = settings.max_datagram
-        self.most = capacity(self._datagram)
-        self._ids: Iterator[int] = (number % _IDS for number in count())
 
     def on_wire(self, frames: Sequence[Frame], time: float) -> Sequence[Frame]:
         packets = (frame.data for frame in frames)
-        return [
-            Frame(datagram, "", "", is_schema=False) for datagram in datagrams(packets, self._datagram, time, self._ids)
-        ]
+        return [Frame(datagram, "", "", is_schema=False) for datagram in datagrams(packets, self._datagram, time)]
 
 
 class DocumentEncoding(Encoding):
@@ -112,8 +98,8 @@ class DocumentEncoding(Encoding):
     def data(self, sample: Sample, time: float) -> bytes:
         return data_document(sample.topic, sample.type_name, time, sample.text(self.style))
 
-    def letter(self, data: bytes) -> Letter:
-        return DocumentLetter(data)
+    def request(self, data: bytes) -> Request:
+        return request(data)
 
 
 ENCODINGS: Mapping[GatewayFormat, type[Encoding]] = {

@@ -1,14 +1,12 @@
-"""A message that came in, and its JSON, made once for all gateways that send it. Knows no topic's followers."""
+"""ROS messages as they came in, and their JSON, which is made once for all gateways that send it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-from router.gateway.compression import compress
-from router.gateway.json_code import json_writer
-from router.gateway.schema_text import schema_text
-from router.gateway.style import Style
+from router.gateway.json_codec import Encode, encoder
+from router.gateway.json_types import Style, schema_text
+from router.gateway.packets import compress
 from router.types.model import MessageType
 
 
@@ -19,13 +17,13 @@ class ReadyType:
         self.message = message
         self.message_class = message_class
         self.schema = schema_text(message)
-        self._writers: dict[Style, Callable[[bytes], str]] = {}
+        self._encoders: dict[Style, Encode] = {}
 
-    def text(self, style: Style, cdr: bytes) -> str:
+    def text(self, style: Style, cdr: bytes) -> bytes:
         """Raises UnreadableError."""
-        if (writer := self._writers.get(style)) is None:
-            writer = self._writers[style] = json_writer(self.message, style)
-        return writer(cdr)
+        if (encode := self._encoders.get(style)) is None:
+            encode = self._encoders[style] = encoder(self.message, style)
+        return encode(cdr)
 
 
 class Sample:
@@ -38,26 +36,26 @@ class Sample:
         self.cdr = cdr
         self.sent_ns = sent_ns
         self._type = ready
-        self._texts: dict[Style, str] = {}
+        self._texts: dict[Style, bytes] = {}
         self._payloads: dict[tuple[Style, int], bytes] = {}
 
     @property
     def type_name(self) -> str:
         return self._type.message.name
 
-    def text(self, style: Style) -> str:
-        """As JSON. Raises UnreadableError."""
+    def text(self, style: Style) -> bytes:
+        """As JSON in UTF-8. Raises UnreadableError."""
         if (text := self._texts.get(style)) is None:
             text = self._texts[style] = self._type.text(style, self.cdr)
         return text
 
     def payload(self, style: Style, level: int) -> bytes:
-        """The same in UTF-8, compressed with zstd unless `level` is 0. Raises UnreadableError."""
+        """The same, compressed with zstd unless `level` is 0. Raises UnreadableError."""
         if (payload := self._payloads.get((style, level))) is None:
-            plain = self.text(style).encode()
+            plain = self.text(style)
             payload = self._payloads[style, level] = compress(plain, level) if level else plain
         return payload
 
     def has_payload(self, style: Style, level: int) -> bool:
-        """`payload` and `text` take no time."""
+        """Whether `payload` and `text` are made already."""
         return (style, level) in self._payloads

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import LARGE, Encoding
+from router.gateway.json_codec import UnreadableError
 from router.gateway.publishers import Selection
 from router.gateway.samples import Sample
-from router.gateway.style import UnreadableError
 from router.gateway.subscriptions import TopicSubscription
 from router.gateway.transport.base import Frame
 from router.table.model import EACH, Gateway, Transport
@@ -84,8 +84,8 @@ class TopicSender:
         self._pending: list[Frame] = []
         # Datagrams get lost, and the existing gateway's clients expect values to be repeated.
         self._repeats = settings.transport.value is Transport.UDP
-        self._most = min(settings.max_message, encoding.most)
-        self._remedy = "see `max_message`" if self._most < encoding.most else "use compression or gateway_v2"
+        self._most = min(settings.max_outbound, encoding.most)
+        self._remedy = "see `max_message`" if self._most < encoding.most else "use tcp, websocket or zenoh"
 
     def poll(self, served: ServedTopic, frames: list[Frame]) -> None:
         """Append the topic's latest value to `frames`, if it is to be sent now."""

@@ -9,20 +9,11 @@ from router.compiler.program import GatewayPlan
 from router.gateway.clients import Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
-from router.gateway.documents import (
-    InboundRow,
-    SchemaRequest,
-    inbound_document,
-    rejected_document,
-    topics_document,
-)
+from router.gateway.documents import InboundRow, inbound_document, rejected_document, topics_document
 from router.gateway.encoding import ENCODINGS
-from router.gateway.inlet import Checked, Inlet, RefusedError
-from router.gateway.json_reading import example
-from router.gateway.reader import Reader, Understood
-from router.gateway.schema_text import schema_text
+from router.gateway.inbound import InboundPublisher, RefusedError
+from router.gateway.json_types import Style, example, schema_text
 from router.gateway.sending import TopicSender
-from router.gateway.style import Style
 from router.gateway.topics import Topics
 from router.gateway.transport.base import Client, Frame, Transport
 from router.table.model import Transport as Way
@@ -40,7 +31,7 @@ class GatewayService:
         plan: GatewayPlan,
         context: GatewayContext,
         counters: GatewayCounters,
-        inlet: Inlet,
+        inbound: InboundPublisher,
         transport: Callable[[GatewayService], Transport],
     ) -> None:
         settings = plan.settings
@@ -49,7 +40,7 @@ class GatewayService:
         self.name = settings.name
         self._context = context
         self._counters = counters
-        self._inlet = inlet
+        self._inbound = inbound
         self._encoding = ENCODINGS[settings.format](settings)
         self._tasks = Tasks(context.failed)
         self.clients = Clients(self.name, self._encoding, counters, context.clock_ns, context.wall_s)
@@ -60,13 +51,12 @@ class GatewayService:
         self._new_transport = transport
         self._transport = transport(self)
         self._answered = -_ANSWER_NS
-        self._reader = Reader(self._encoding, inlet, self._tasks, context.reading, self._settle)
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
 
     def anew(self) -> GatewayService:
         """Return a new service like this one, which was closed: the same limits and counters, no clients."""
-        return GatewayService(self.plan, self._context, self._counters, self._inlet, self._new_transport)
+        return GatewayService(self.plan, self._context, self._counters, self._inbound, self._new_transport)
 
     async def open(self) -> None:
         """Raises StartError."""
@@ -119,29 +109,19 @@ class GatewayService:
 
     def refused(self, reason: str) -> None:
         self._counters.arrived(0)
-        self._inlet.reject(reason)
+        self._inbound.refusal(reason)
 
     def received(self, client: Client, data: bytes, arrived_ns: int) -> None:
         self._counters.arrived(len(data))
-        self._reader.received(client, data, arrived_ns)
-
-    def _settle(self, client: Client, understood: Understood, arrived_ns: int) -> None:
-        match understood:
-            case RefusedError():
-                self._refuse(client, understood)
-            case SchemaRequest():
-                self._show_schemas(client, understood.type_name)
-            case Checked():
-                try:
-                    self._inlet.publish(understood, arrived_ns)
-                except RefusedError as refused:
-                    self._tell(client, refused)
+        try:
+            wanted = self._inbound.receive(data, arrived_ns)
+        except RefusedError as refused:
+            self._tell(client, refused)
+        else:
+            if wanted is not None:
+                self._show_schemas(client, wanted.type_name)
 
     # -- answers -------------------------------------------------------------------------------------------------
-
-    def _refuse(self, client: Client, refused: RefusedError) -> None:
-        self._inlet.reject(refused.reason, str(refused))
-        self._tell(client, refused)
 
     def _tell(self, client: Client, refused: RefusedError) -> None:
         queue = self.clients.queues.get(client)
@@ -153,7 +133,8 @@ class GatewayService:
         now = self._context.clock_ns()
         queue = self.clients.queues.get(client)
         if queue is None or now - self._answered < _ANSWER_NS:
-            self._refuse(client, RefusedError("rate_limited", "schemas are sent 10 times per second at most"))
+            refused = self._inbound.refusal("rate_limited", "schemas are sent 10 times per second at most")
+            self._tell(client, refused)
             return
         self._answered = now
         self.clients.send_to(queue, self._topics.snapshot(type_name))

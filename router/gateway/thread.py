@@ -20,7 +20,7 @@ from router.gateway.clients import ClientQueue
 from router.gateway.context import GatewayContext
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import ENCODINGS
-from router.gateway.inlet import Inlet, InletOutlets
+from router.gateway.inbound import InboundOutputs, InboundPublisher
 from router.gateway.service import GatewayService
 from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Events, Transport
@@ -75,15 +75,12 @@ class GatewayThread:
         self._ros = ros
         self._report = report
         self._converting = DaemonThread("gateway bulk")
-        self._reading = DaemonThread("gateway reading")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
         self._services: dict[str, GatewayService] = {}
         self._subscriptions = Subscriptions(ros.topics, ros_interfaces(), self._loop)
-        self._context = GatewayContext(
-            self._subscriptions, self._converting, self._reading, failed, monotonic_ns, wall_ns
-        )
+        self._context = GatewayContext(self._subscriptions, self._converting, failed, monotonic_ns, wall_ns)
         self._thread.start()
 
     def prepare(self, program: Program, feed: FeedMaker) -> GatewayChange:
@@ -92,9 +89,9 @@ class GatewayThread:
         `feed` makes the functions that feed deadmen. A gateway that is the same as before keeps its clients. One that
         has changed loses them here: its socket has to be closed before the new one can be opened.
         """
-        return self._call(self._prepare(program, _outlets(program, self._ros, feed, self._report)))
+        return self._call(self._prepare(program, _outputs(program, self._ros, feed, self._report)))
 
-    async def _prepare(self, program: Program, outlets: InletOutlets) -> GatewayChange:
+    async def _prepare(self, program: Program, outputs: InboundOutputs) -> GatewayChange:
         kept = {
             plan.settings.name: service
             for plan in program.gateways
@@ -110,7 +107,7 @@ class GatewayThread:
                         each for each in change.left if _exclude_each_other(each.plan.settings, plan.settings)
                     ]:
                         await rival.close()
-                    service = await self._open(plan, program.counters, outlets)
+                    service = await self._open(plan, program.counters, outputs)
                     change.opened.append(service)
                     change.services[service.name] = service
         except BaseException:
@@ -157,12 +154,12 @@ class GatewayThread:
         for service in change.opened:
             service.start()
 
-    async def _open(self, plan: GatewayPlan, counters: Counters, outlets: InletOutlets) -> GatewayService:
+    async def _open(self, plan: GatewayPlan, counters: Counters, outputs: InboundOutputs) -> GatewayService:
         settings = plan.settings
-        gateway_counters = GatewayCounters(settings, counters, self._counts, outlets.report, wall_ns)
-        inlet = Inlet(plan, ENCODINGS[settings.format].style, counters, self._counts, outlets)
+        gateway_counters = GatewayCounters(settings, counters, self._counts, outputs.report, wall_ns)
+        inbound = InboundPublisher(plan, ENCODINGS[settings.format](settings), counters, self._counts, outputs)
         service = GatewayService(
-            plan, self._context, gateway_counters, inlet, lambda events: self._transport(settings, events)
+            plan, self._context, gateway_counters, inbound, lambda events: self._transport(settings, events)
         )
         try:
             await service.open()
@@ -192,7 +189,6 @@ class GatewayThread:
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
             self._converting.shutdown()
-            self._reading.shutdown()
             self._loop.close()
 
     async def _close(self) -> None:
@@ -212,7 +208,7 @@ class GatewayThread:
 
 def new_transport(settings: Gateway, events: Events) -> Transport:
     """Return the transport that a gateway's settings ask for, not open yet."""
-    most = settings.max_message if settings.inbound else MOST_REQUEST
+    most = settings.max_inbound if settings.inbound else MOST_REQUEST
     if settings.zenoh is not None:
         from router.gateway.transport.zenoh import ZenohTransport  # takes 50 ms to import
 
@@ -236,10 +232,10 @@ def _exclude_each_other(one: Gateway, other: Gateway) -> bool:
     return one.name == other.name or any(where.value in wanted for where in (one.address, one.receive) if where)
 
 
-def _outlets(program: Program, ros: RouterNode, feed: FeedMaker, report: Callable[[Report], None]) -> InletOutlets:
+def _outputs(program: Program, ros: RouterNode, feed: FeedMaker, report: Callable[[Report], None]) -> InboundOutputs:
     inbound = [each for gateway in program.gateways for each in gateway.inbound.values()]
     guarded = [each.deadman.route for each in inbound if each.deadman]
-    return InletOutlets(
+    return InboundOutputs(
         publish=ros.publish,
         publish_errors=ros.publish_errors,
         feed_deadman={route: feed(route, (route,)) for route in guarded},

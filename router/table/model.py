@@ -387,6 +387,12 @@ class TopicPattern:
 EACH = 0
 """The period of a gateway that sends every message."""
 
+MAX_OUTBOUND, MAX_INBOUND = 16 << 20, 64 << 10
+"""Bytes of a message to and from clients of a gateway without `max_message`."""
+
+MOST_INBOUND = 1 << 20
+"""Bytes of a message from clients, whatever `max_message` says: it is read in one go."""
+
 
 @dataclass(frozen=True, slots=True)
 class TopicRate:
@@ -474,10 +480,20 @@ class Gateway:
     compression: Annotated[int, Named("compression.zstd")] = 0
     rates: tuple[TopicRate, ...] = ()
     max_datagram: Annotated[int, DATAGRAM_SIZE] = 1400
-    max_message: Annotated[int, MESSAGE_SIZE] = 16 << 20
+    max_message: Annotated[int | None, MESSAGE_SIZE] = None
     max_clients: int = 1024
     max_clients_per_host: int = 16
     inbound: tuple[Inbound, ...] = ()
+
+    @property
+    def max_outbound(self) -> int:
+        """Bytes of the longest packet or document to clients."""
+        return MAX_OUTBOUND if self.max_message is None else self.max_message
+
+    @property
+    def max_inbound(self) -> int:
+        """Bytes of the longest packet or document from clients, also decompressed."""
+        return MAX_INBOUND if self.max_message is None else min(self.max_message, MOST_INBOUND)
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,7 +188,7 @@ def explained_gateway(checked: CheckedGateway, topics: Topics) -> Iterator[str]:
     gateway = checked.settings
     yield f"{gateway.name}: gateway, {_transport(gateway)}, {gateway.format.value}  ({gateway.span})"
     yield f"  {_period(gateway.publish_period)}; {_regularly(gateway)}"
-    yield f"  messages of up to {gateway.max_message} bytes{_sizes(gateway)}"
+    yield f"  messages of up to {gateway.max_outbound} bytes{_sizes(gateway)}"
     yield from _patterns(gateway)
     yield from _matched(TopicSelector(gateway, [entry.label for entry in checked.inbound]), topics)
     for entry in checked.inbound:

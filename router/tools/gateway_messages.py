@@ -7,8 +7,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Union
 
-from router.gateway.compression import decompress
-from router.gateway.packets import HEAD, Packet, PacketError, unpack
+from router.gateway.packets import HEAD, Packet, PacketError, decompress, unpack
 from router.values import SHOWN_ELEMENTS, Tree, list_text, one_line, plain_text, words
 
 MOST_TEXT = 256 << 20

@@ -29,7 +29,7 @@ Say = Callable[[str], None]
 
 
 class Arrival(NamedTuple):
-    """A datagram, packet or document. Fragments and schemas count for those of the same `sender` alone."""
+    """A datagram, packet or document. Schemas count for those of the same `sender` alone."""
 
     data: bytes
     sender: Hashable

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from router.compiler.selection import matcher, pattern_problem
 from router.errors import SourceSpan, UsageError
-from router.gateway.fragments import Reassembler
-from router.gateway.packets import PacketError
+from router.gateway.packets import PacketError, unbatched
 from router.table.model import TopicPattern
 from router.tools.gateway_messages import Heard, Message, Problem, Remark, Schema, Shape, read
 from router.tools.gateway_sources import Arrival, Source
@@ -53,11 +52,10 @@ class Listening:
         self._wants = wants
         self._held: dict[tuple[Hashable, str], Schema] = {}
         self._tally = Tally()
-        self._reassembler = Reassembler()
         self._shapes: dict[tuple[Hashable, str], Mapping[str, Shape]] = {}
 
     def tally(self, source: Source) -> Tally:
-        self._tally.lost = self._reassembler.lost + source.lost
+        self._tally.lost = source.lost
         return self._tally
 
     def hear(self, source: Source, seconds: float) -> Iterator[Heard]:
@@ -68,13 +66,12 @@ class Listening:
                 source.ask()
                 asks = now + ASK_AGAIN
             for arrival in source.arrivals(min(PATIENCE, ends - now)):
-                yield from self.take(arrival, time.monotonic_ns())
-            self._reassembler.look(time.monotonic_ns())
+                yield from self.take(arrival)
 
-    def take(self, arrival: Arrival, now: int) -> Iterator[Heard]:
+    def take(self, arrival: Arrival) -> Iterator[Heard]:
         """What one arrival says; `now` in monotonic ns."""
         try:
-            packets = self._reassembler.feed(arrival.data, arrival.sender, now)
+            packets = unbatched(arrival.data)
         except PacketError as error:
             yield self._problem(error, arrival.data)
             return

@@ -20,7 +20,7 @@ import zenoh
 from backports import zstd
 from websockets.sync.client import connect
 
-from router.gateway.fragments import Reassembler
+from router.gateway.packets import unbatched
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.ros_speaker import Speaker
@@ -526,27 +526,25 @@ BATCHING = """\
 """
 
 
-def test_small_messages_share_a_datagram_and_a_large_one_is_spread_without_delaying_them(tmp_path: Path) -> None:
+def test_small_messages_share_a_datagram_and_what_none_holds_is_dropped(tmp_path: Path) -> None:
     with scene(tmp_path, HEADSET + BATCHING) as now, udp("127.0.0.9", now.port) as client:
         for number in range(20):
             now.speaker.open(f"/gw/number_{number}", "std_msgs/msg/Int32", keeps=True)
             now.speaker.say(f"/gw/number_{number}", {"data": number})
         now.speaker.open("/gw/image", "std_msgs/msg/UInt8MultiArray", keeps=True)
         now.speaker.say("/gw/image", {"data": [7] * 2_000_000})
-        reassembler = Reassembler()
-        numbers, shared, image = set[str](), 0, b""
-        while len(numbers) < 20 or not image:
-            datagram = client.recv(65535)
-            assert len(datagram) <= 1200
-            packets = reassembler.feed(datagram, "the gateway", time.monotonic_ns())
+        numbers, shared = set[str](), 0
+        while len(numbers) < 20:
+            packets = unbatched(client.recv(65535))
             shared += len(packets) > 1
-            for _, _, topic, _, payload in map(packet, packets):
-                if topic.startswith("/gw/number") and payload.startswith(b'{"data":['):
-                    numbers.add(topic)
-                elif topic == "/gw/image" and payload.startswith(b'{"data":[7,'):
-                    image = payload
+            found = [packet(each) for each in packets]
+            assert len(packets) == 1 or all(len(each) <= 1200 for each in packets)
+            numbers |= {topic for _, _, topic, _, payload in found if payload.startswith(b'{"data":[')}
         assert shared
-        assert json.loads(image)["data"] == [7] * 2_000_000
+        dropped = key("messages_dropped", route="headset", target="clients", reason="too_large")
+        wait_until(lambda: now.site.scrape()[dropped] == 1, "the drop")
+        [detail] = [line["detail"] for line in now.router.events("message dropped") if line["reason"] == "too_large"]
+        assert detail.endswith("use tcp, websocket or zenoh")
 
 
 @pytest.mark.parametrize("gateway", [LOGGER, DASHBOARD], ids=["tcp", "websocket"])

@@ -11,15 +11,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import count
 from pathlib import Path
 
 import pytest
 
 from router.cli import BROKEN_PIPE, main
-from router.gateway.compression import compress
-from router.gateway.fragments import datagrams
-from router.gateway.packets import Packet, pack, unpack
+from router.gateway.packets import Packet, compress, datagrams, pack, unpack
 from tests.ports import free_port
 
 SCHEMA = {
@@ -57,7 +54,7 @@ def listening(*options: str) -> Iterator[tuple[subprocess.Popen[str], tuple[str,
 def test_what_arrives_is_printed_one_line_each(gateway: socket.socket) -> None:
     with listening("--count", "3") as (process, address):
         large = packet({"x": [0.5], "y": ["z" * 5000]})
-        for data in datagrams([packet(SCHEMA), packet({"x": [1.5]}, level=3), large], 1400, 5.0, count()):
+        for data in datagrams([packet(SCHEMA), packet({"x": [1.5]}, level=3), large], 1400, 5.0):
             gateway.sendto(data, address)
         gateway.sendto(b"?", address)
         gateway.sendto(packet({"x": [2.5]}), address)

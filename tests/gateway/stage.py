@@ -19,9 +19,9 @@ from router.engine import Report
 from router.errors import StartError
 from router.gateway.context import GatewayContext
 from router.gateway.counters import GatewayCounters
-from router.gateway.inlet import Inlet, InletOutlets
+from router.gateway.encoding import ENCODINGS
+from router.gateway.inbound import InboundOutputs, InboundPublisher
 from router.gateway.service import GatewayService
-from router.gateway.style import Style
 from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Client, Events, Frame
 from router.ros.topics import DiscoveredPublisher, RosTopics
@@ -171,7 +171,7 @@ class Stage:
         loop.set_exception_handler(lambda _, context: self.faults.append(context["exception"]))
         subscriptions = Subscriptions(cast("RosTopics", self._graph), INTERFACES, loop)
         self._closing.callback(subscriptions.close)
-        self.context = GatewayContext(subscriptions, worker, worker, self.faults.append, monotonic_ns, wall_ns)
+        self.context = GatewayContext(subscriptions, worker, self.faults.append, monotonic_ns, wall_ns)
         self.played = {plan.settings.name: Played(self, plan) for plan in self._plans}
         return self
 
@@ -188,11 +188,11 @@ class Stage:
     def gateway_counters(self, plan: GatewayPlan) -> GatewayCounters:
         return GatewayCounters(plan.settings, self._counters, self.counts, self.reports.append, wall_ns)
 
-    def inlet(self, plan: GatewayPlan) -> Inlet:
+    def inbound(self, plan: GatewayPlan) -> InboundPublisher:
         def publisher(topic: str) -> Any:
             return lambda cdr: self.published.append((topic, cdr))
 
-        outlets = InletOutlets(
+        outputs = InboundOutputs(
             publish={topic: publisher(topic) for topic in plan.inbound},
             publish_errors=(),
             feed_deadman={},
@@ -200,7 +200,8 @@ class Stage:
             clock_ns=monotonic_ns,
             wall_ns=wall_ns,
         )
-        return Inlet(plan, Style.PLAIN, self._counters, self.counts, outlets)
+        encoding = ENCODINGS[plan.settings.format](plan.settings)
+        return InboundPublisher(plan, encoding, self._counters, self.counts, outputs)
 
 
 class Played:
@@ -208,7 +209,7 @@ class Played:
 
     def __init__(self, stage: Stage, plan: GatewayPlan) -> None:
         self.service = GatewayService(
-            plan, stage.context, stage.gateway_counters(plan), stage.inlet(plan), self._transport
+            plan, stage.context, stage.gateway_counters(plan), stage.inbound(plan), self._transport
         )
         self._is_open = False
 

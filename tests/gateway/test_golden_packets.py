@@ -1,4 +1,4 @@
-"""Packets as the existing gateway's stand-in sent them, and ours for the same bytes."""
+"""Packets as the existing gateway's stand-in sent them, and ours for the same bytes: numbers may have other digits."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ from typing import Any
 
 import pytest
 
-from router.gateway.compression import decompress
-from router.gateway.json_code import json_writer
-from router.gateway.packets import Packet, pack, unpack
-from router.gateway.schema_text import schema_text
-from router.gateway.style import Style, UnreadableError
+from router.gateway.json_codec import UnreadableError, encoder
+from router.gateway.json_types import Style, schema_text
+from router.gateway.packets import Packet, decompress, pack, unpack
 from router.types.model import MessageType
 from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces
 from tests.compiler.interface_package import MESSAGES, NAME
@@ -49,30 +47,39 @@ def declared(interfaces: RosInterfaces, golden: Mapping[str, Any]) -> MessageTyp
     return found
 
 
-def packed(golden: Mapping[str, Any], text: str) -> str:
+def packed(golden: Mapping[str, Any], text: bytes) -> str:
     """Ours, after its time stamp."""
-    packet = Packet(TIME, False, f"/golden/{golden['case']}", golden["type"], text.encode())
+    packet = Packet(TIME, False, f"/golden/{golden['case']}", golden["type"], text)
     return pack(packet)[len(STAMP) :].decode()
+
+
+def parts(packet: str) -> tuple[str, str]:
+    """What is in front of the JSON, and the JSON's value, in which the order of keys and -0.0 can be seen."""
+    head, brace, rest = packet.partition("{")
+    return head, repr(json.loads(brace + rest))
 
 
 @pytest.mark.parametrize("golden", SENT, ids=name_of)
 def test_data_packet_is_that_of_the_existing_gateway(interfaces: RosInterfaces, golden: Mapping[str, Any]) -> None:
-    write = json_writer(declared(interfaces, golden), Style.WRAPPED)
-    assert packed(golden, write(bytes.fromhex(golden["cdr"]))) == golden["data"]
+    encode = encoder(declared(interfaces, golden), Style.WRAPPED)
+    ours = packed(golden, encode(bytes.fromhex(golden["cdr"])))
+    assert parts(ours) == parts(golden["data"])
+    if "." not in golden["data"]:  # without floats all bytes are equal
+        assert ours == golden["data"]
 
 
 @pytest.mark.parametrize("golden", [golden for golden in GOLDEN if golden["data"] is None], ids=name_of)
 def test_nothing_is_written_where_the_existing_gateway_sends_nothing(
     interfaces: RosInterfaces, golden: Mapping[str, Any]
 ) -> None:
-    write = json_writer(declared(interfaces, golden), Style.WRAPPED)
+    encode = encoder(declared(interfaces, golden), Style.WRAPPED)
     with pytest.raises(UnreadableError):
-        write(bytes.fromhex(golden["cdr"]))
+        encode(bytes.fromhex(golden["cdr"]))
 
 
 @pytest.mark.parametrize("golden", [golden for golden in GOLDEN if "schema" in golden], ids=name_of)
 def test_schema_packet_is_that_of_the_existing_gateway(interfaces: RosInterfaces, golden: Mapping[str, Any]) -> None:
-    assert packed(golden, schema_text(declared(interfaces, golden))) == golden["schema"]
+    assert packed(golden, schema_text(declared(interfaces, golden)).encode()) == golden["schema"]
 
 
 @pytest.mark.parametrize("golden", [golden for golden in GOLDEN if "compressed" in golden], ids=name_of)

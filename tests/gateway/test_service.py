@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 from backports import zstd
+from structlog.testing import capture_logs
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
-from router.gateway.letters import QUICK
-from router.gateway.packets import Packet, pack
+from router.gateway import packets
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.stage import Graph, Stage, program
 
@@ -94,21 +94,8 @@ async def test_a_client_that_asks_for_schemas_too_often_is_told(tmp_path: Path) 
         assert (answer["op"], answer["reason"]) == ("rejected", "rate_limited")
 
 
-@asynchronous
-async def test_messages_that_are_not_small_are_read_in_order_though_many_come_at_once(tmp_path: Path) -> None:
-    inbound = "inbound: [{topic: /said, type: std_msgs/msg/String}]"
-    async with Stage(program(tmp_path, f"it: {{{TCP}, {inbound}}}"), Graph({})) as stage:
-        played = stage.played["it"]
-        await played.start()
-        words = [*(str(number) * QUICK for number in range(10)), "a short one does not overtake them"]
-        for word in words:
-            request = {"op": "publish", "topic": "/said", "data": {"data": word}}
-            played.service.received(played.client, json.dumps(request).encode(), 0)
-        await until(lambda: len(stage.published) == len(words))
-        assert stage.published == [("/said", cdr(word)) for word in words]
-
-
 TWO = "inbound: [{topic: /said, type: std_msgs/msg/String}, {topic: /set, type: std_msgs/msg/Int32}]"
+TIMED = "inbound: [{topic: /said, type: std_msgs/msg/String, ttl: 500ms}]"
 
 
 def publish(topic: str, data: object, **others: object) -> bytes:
@@ -116,35 +103,43 @@ def publish(topic: str, data: object, **others: object) -> bytes:
 
 
 @asynchronous
-async def test_a_large_message_holds_up_its_own_topic_and_no_other(tmp_path: Path) -> None:
+async def test_messages_are_published_in_order(tmp_path: Path) -> None:
     async with Stage(program(tmp_path, f"it: {{{TCP}, {TWO}}}"), Graph({})) as stage:
         played = stage.played["it"]
         await played.start()
-        for data in (publish("/said", "a" * 2 * QUICK), publish("/said", "b"), publish("/set", 1)):
-            played.service.received(played.client, data, 0)
-        assert [topic for topic, _ in stage.published] == ["/set"]
-        played.service.received(played.client, publish("/said", 3), 0)  # which is nothing to keep in order
-        assert stage.count("datagrams_rejected", "it", "invalid") == 1
-        await until(lambda: len(stage.published) == 3)
-        assert stage.published[1:] == [("/said", cdr("a" * 2 * QUICK)), ("/said", cdr("b"))]
-        played.service.received(played.client, publish("/said", "c"), 0)
-        assert stage.published[-1] == ("/said", cdr("c"))
+        words = [*(str(number) * 4096 for number in range(10)), "a short one does not overtake them"]
+        for word in words:
+            played.service.received(played.client, publish("/said", word), 0)
+        assert stage.published == [("/said", cdr(word)) for word in words]
+
+
+@pytest.mark.parametrize(
+    ("said", "most"), [("", 64 << 10), ("max_message: 2kB,", 2000), ("max_message: 16MiB,", 1 << 20)]
+)
+@asynchronous
+async def test_what_clients_send_is_bounded(tmp_path: Path, said: str, most: int) -> None:
+    around = len(b'{"data":""}')
+
+    async with Stage(program(tmp_path, f"it: {{{TCP}, {said} {TWO}}}"), Graph({})) as stage:
+        played = stage.played["it"]
+        await played.start()
+        for length in (most - around, most - around + 1):
+            request = b'{"op":"publish","topic":"/said","data":{"data":"%b"}}' % (b"a" * length)
+            played.service.received(played.client, request, 0)
+        assert len(stage.published) == 1
+        assert stage.count("datagrams_rejected", "it", "too_large") == 1
 
 
 @asynchronous
-async def test_what_need_not_be_read_to_be_refused_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    long = "a" * 2 * QUICK
+async def test_refusals_say_why(tmp_path: Path) -> None:
     refused = {
-        "not_allowed": publish("/other", long),
-        "wrong_type": publish("/said", long, type="std_msgs/msg/Int32"),
-        "too_large": publish("/set", long),
-        "malformed": b'{"op":"publish","data":"' + long.encode() + b'"}',
+        "not_allowed": publish("/other", "a"),
+        "wrong_type": publish("/said", "a", type="std_msgs/msg/Int32"),
+        "too_large": publish("/set", "a" * 100_000),
+        "malformed": b'{"op":"publish","data":"a"}',
+        "invalid": publish("/set", 3.0),
     }
 
-    def read(letter: object, most: int) -> None:
-        raise AssertionError("it was read")
-
-    monkeypatch.setattr("router.gateway.letters.DocumentLetter.read", read)
     async with Stage(program(tmp_path, f"it: {{{TCP}, {TWO}}}"), Graph({})) as stage:
         played = stage.played["it"]
         await played.start()
@@ -152,37 +147,49 @@ async def test_what_need_not_be_read_to_be_refused_is_not_read(tmp_path: Path, m
             played.service.received(played.client, data, 0)
         assert [json.loads(frame.data)["reason"] for frame in played.client.frames] == [*refused]
         assert [stage.count("datagrams_rejected", "it", reason) for reason in refused] == [1] * len(refused)
+        assert not stage.published
 
 
+@pytest.mark.parametrize("topic", ["/other", "/set"])
 @asynchronous
-async def test_of_a_frame_that_does_not_tell_its_size_only_what_its_topic_may_have_is_decompressed(
-    tmp_path: Path,
+async def test_only_what_is_allowed_is_decompressed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topic: str
 ) -> None:
-    compressor = zstd.ZstdCompressor()
+    asked: list[int] = []
+
+    def decompress(data: bytes, most: int) -> bytes:
+        asked.append(most)
+        return packets.decompress(data, most)
+
+    monkeypatch.setattr("router.gateway.inbound.decompress", decompress)
+    compressor = zstd.ZstdCompressor()  # whose frame does not tell its size
     payload = compressor.compress(b'{"data":[' + b" " * 100_000 + b"1]}") + compressor.flush()
+
     v1 = TCP.replace("json_lines", "gateway_v1")
     async with Stage(program(tmp_path, f"it: {{{v1}, {TWO}}}"), Graph({})) as stage:
         played = stage.played["it"]
         await played.start()
-        played.service.received(played.client, pack(Packet(1.0, True, "/set", "std_msgs/msg/Int32", payload)), 0)
-        await until(lambda: stage.count("datagrams_rejected", "it", "too_large"))
+        packet = packets.pack(packets.Packet(1.0, True, topic, "std_msgs/msg/Int32", payload))
+        played.service.received(played.client, packet, 0)
+        reason = "not_allowed" if topic == "/other" else "too_large"
+        assert stage.count("datagrams_rejected", "it", reason) == 1
+        assert asked == ([] if topic == "/other" else [64 << 10])
 
 
+@pytest.mark.parametrize(("ahead", "counted"), [(0.0, 0), (-0.2, 0), (0.01, 0), (0.1, 1), (60.0, 1)])
 @asynchronous
-async def test_when_too_much_waits_to_be_read_the_rest_is_refused_and_its_client_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+async def test_a_clients_clock_that_is_ahead_is_counted_and_its_message_published(
+    tmp_path: Path, ahead: float, counted: int
 ) -> None:
-    monkeypatch.setattr("router.gateway.reader.MOST_READING", 3 * QUICK)
-    inbound = "inbound: [{topic: /said, type: std_msgs/msg/String}]"
-    async with Stage(program(tmp_path, f"it: {{{TCP}, {inbound}}}"), Graph({})) as stage:
+    async with Stage(program(tmp_path, f"it: {{{TCP}, {TIMED}}}"), Graph({})) as stage:
         played = stage.played["it"]
         await played.start()
-        request = {"op": "publish", "topic": "/said", "data": {"data": "a" * QUICK}}
-        for _ in range(5):
-            played.service.received(played.client, json.dumps(request).encode(), 0)
-        await until(lambda: len(stage.published) == 2)
-        assert stage.count("datagrams_rejected", "it", "rate_limited") == 3
-        assert [json.loads(frame.data)["reason"] for frame in played.client.frames] == ["rate_limited"] * 3
+        now = time.time_ns()
+        with capture_logs() as lines:
+            played.service.received(played.client, publish("/said", "a", time=now / 1e9 + ahead), now)
+        assert len(stage.published) == 1
+        assert stage.count("gateway_client_clock_ahead", "it") == counted
+        assert [line["log_level"] for line in lines if "clock" in line["event"]] == ["warning"] * counted
 
 
 @asynchronous
@@ -191,8 +198,7 @@ async def test_whoever_sends_while_the_gateway_closes_leaves_no_task_behind(tmp_
     async with Stage(program(tmp_path, f"it: {{{TCP}, {inbound}}}"), Graph({})) as stage:
         played, before = stage.played["it"], asyncio.all_tasks()
         await played.start()
-        request = {"op": "publish", "topic": "/said", "data": {"data": "a" * 100_000}}
-        played.transport.last_words = [json.dumps(request).encode()]
+        played.transport.last_words = [publish("/said", "a" * 100_000), b'{"op":"schema"}']
         await played.close()
         assert asyncio.all_tasks() == before
         assert (stage.published, stage.faults) == ([], [])

@@ -18,10 +18,11 @@ from rclpy.serialization import serialize_message
 
 from router.compiler.program import TopicPlan
 from router.errors import StartError
-from router.gateway.compression import decompress
+from router.gateway.json_codec import UnreadableError
+from router.gateway.json_types import Style
+from router.gateway.packets import decompress
 from router.gateway.publishers import Selection
 from router.gateway.samples import ReadyType, Sample
-from router.gateway.style import Style, UnreadableError
 from router.gateway.subscriptions import READ_PER_TURN, Subscriptions, TopicSubscription
 from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces, ros_interfaces
 from tests.gateway.asynchronous import asynchronous, until
@@ -398,7 +399,7 @@ async def test_a_message_is_followed_as_its_class_says_where_msg_files_do_not(
         await heard(publisher(STRING), HELLO, subscription)
         sample = subscription.latest()
         assert sample
-        assert sample.text(Style.PLAIN) == '{"data":"hello, rover"}'
+        assert sample.text(Style.PLAIN) == b'{"data":"hello, rover"}'
 
 
 @pytest.mark.parametrize("type_name", ["std_msgs/msg/NoSuch", "no_such/msg/Thing", "some::Idl_", "a/action/B_Feedback"])
@@ -423,7 +424,7 @@ class Counted(ReadyType):
 
     conversions = 0
 
-    def text(self, style: Style, cdr: bytes) -> str:
+    def text(self, style: Style, cdr: bytes) -> bytes:
         self.conversions += 1
         return super().text(style, cdr)
 
@@ -439,7 +440,7 @@ def test_each_form_of_a_sample_is_made_once() -> None:
     sample = Sample("/greeting", ready, HELLO, 1)
     assert not sample.has_payload(Style.WRAPPED, 3)
     for _ in range(2):
-        assert sample.text(Style.PLAIN) == '{"data":"hello, rover"}'
+        assert sample.text(Style.PLAIN) == b'{"data":"hello, rover"}'
         assert sample.payload(Style.PLAIN, 0) == b'{"data":"hello, rover"}'
         assert sample.payload(Style.WRAPPED, 0) == b'{"data":["hello, rover"]}'
         assert decompress(sample.payload(Style.WRAPPED, 3), 1000) == b'{"data":["hello, rover"]}'

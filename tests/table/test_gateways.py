@@ -45,7 +45,7 @@ def test_a_gateway_is_typed(tmp_path: Path) -> None:
     assert [(pattern.text, pattern.is_regex) for pattern in found.include] == [("/rover/**", False), ("/imu/.*", True)]
     assert [pattern.text for pattern in found.exclude] == ["/rover/camera/**"]
     assert (found.publish_period, found.schema_period, found.discovery_period) == (EACH, 10**9, 2 * 10**9)
-    assert (found.compression, found.max_datagram, found.max_message) == (3, 8000, 1 << 20)
+    assert (found.compression, found.max_datagram, found.max_outbound) == (3, 8000, 1 << 20)
     rates = [(rate.pattern.text, rate.period) for rate in found.rates]
     assert rates == [("/rover/imu", 20_000_000), ("/tf", EACH), ("/slow", 2 * 10**9)]
 
@@ -76,7 +76,12 @@ def test_what_is_left_out_has_a_default(tmp_path: Path, transport: str, given: G
     found = gateway(tmp_path, f"transport: {{{transport}}}")
     assert (found.format, found.include, found.exclude, found.rates, found.inbound) == (given, (), (), (), ())
     assert (found.publish_period, found.schema_period, found.discovery_period) == (500_000_000, 5 * 10**9, 5 * 10**9)
-    assert (found.compression, found.max_datagram, found.max_message) == (0, 1400, 16 << 20)
+    assert (found.compression, found.max_datagram, found.max_outbound, found.max_inbound) == (
+        0,
+        1400,
+        16 << 20,
+        64 << 10,
+    )
     assert (found.max_clients, found.max_clients_per_host) == (1024, 16)
     assert found.receive is None
 

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.gateway.compression import compress
 from router.gateway.documents import data_document, rejected_document, schema_document
-from router.gateway.packets import Packet, PacketError, pack
+from router.gateway.packets import Packet, PacketError, compress, pack
 from router.tools.gateway_messages import Heard, Message, Problem, Remark, Schema, Shape, json_line, pieces, read
 
 HEADER = {
@@ -53,7 +52,7 @@ def test_a_message_with_fields_of_these_names_is_none() -> None:
 
 
 def test_documents_say_what_they_are() -> None:
-    assert read(data_document("/imu", "p/msg/T", 5.0, '{"x":0.01}')) == Message(
+    assert read(data_document("/imu", "p/msg/T", 5.0, b'{"x":0.01}')) == Message(
         5.0, "/imu", "p/msg/T", {"x": 0.01}, False
     )
     assert read(schema_document("p/msg/T", 5.0, json.dumps(SCHEMA))) == Schema(5.0, "", "p/msg/T", SCHEMA, SHAPE)

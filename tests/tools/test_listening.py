@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from itertools import count
 
 import pytest
 from hypothesis import given
@@ -10,8 +9,7 @@ from hypothesis import strategies as st
 
 from router.errors import UsageError
 from router.gateway.documents import data_document, schema_document
-from router.gateway.fragments import datagrams
-from router.gateway.packets import Packet, pack
+from router.gateway.packets import Packet, datagrams, pack
 from router.table.addresses import Address
 from router.table.model import GatewayFormat
 from router.tools.gateway_messages import Heard, Message, Problem, Schema, Shape, json_line, pieces
@@ -68,9 +66,9 @@ def arrivals(*packets: bytes, sender: object = "a") -> list[Arrival]:
     return [Arrival(data, sender) for data in packets]
 
 
-def test_batches_and_fragments_become_packets() -> None:
+def test_batches_become_packets() -> None:
     packets = [packet(SCHEMA), packet('{"x":[1]}'), packet(json.dumps({"x": ["y" * 5000]}))]
-    sent = arrivals(*datagrams(packets, 1400, 5.0, count()))
+    sent = arrivals(*datagrams(packets, 1400, 5.0))
     listening, source = Listening(EVERY), Played(sent)
     assert [type(one) for one in heard(listening, source)] == [Schema, Message, Message]
     assert str(listening.tally(source)) == "2 messages, 1 schemas, 0 undecodable, 0 lost"
@@ -87,7 +85,7 @@ def test_a_message_before_its_schema_is_shown_and_counted() -> None:
 
 
 def test_another_sender_has_to_send_its_schema_first() -> None:
-    documents = schema_document("p/msg/T", 5.0, SCHEMA), data_document("/t", "p/msg/T", 5.0, '{"x":1}')
+    documents = schema_document("p/msg/T", 5.0, SCHEMA), data_document("/t", "p/msg/T", 5.0, b'{"x":1}')
     listening, source = Listening(EVERY), Played(arrivals(*documents), arrivals(documents[1], sender="b"))
     heard(listening, source)
     assert listening.tally(source).early == 1
@@ -102,7 +100,7 @@ def test_other_topics_are_counted_and_not_shown() -> None:
 
 def test_schemas_of_other_topics_are_not_shown() -> None:
     schemas = [schema_document(name, 5.0, SCHEMA) for name in ("p/msg/S", "p/msg/T", "p/msg/U")]
-    values = [data_document(topic, name, 5.0, '{"x":1}') for topic, name in (("/a", "p/msg/S"), ("/b", "p/msg/T"))]
+    values = [data_document(topic, name, 5.0, b'{"x":1}') for topic, name in (("/a", "p/msg/S"), ("/b", "p/msg/T"))]
     listening, source = Listening(lambda topic: topic == "/b"), Played(arrivals(*schemas, *values, values[1]))
     schema, *messages = heard(listening, source)
     assert isinstance(schema, Schema)
@@ -112,7 +110,7 @@ def test_schemas_of_other_topics_are_not_shown() -> None:
 
 
 def test_what_means_nothing_is_shown_with_its_bytes_and_ends_nothing() -> None:
-    batch = b"".join(datagrams([packet("no JSON"), packet('{"x":[1]}')], 1400, 5.0, count()))
+    batch = b"".join(datagrams([packet("no JSON"), packet('{"x":[1]}')], 1400, 5.0))
     listening, source = Listening(EVERY), Played(arrivals(b"", b"garbage and more", batch))
     first, second, third, fourth = heard(listening, source)
     assert first == Problem("0 bytes are no packet", b"")
@@ -146,7 +144,7 @@ HOSTILE = st.one_of(
 def test_whatever_arrives_can_be_shown(sent: list[bytes]) -> None:
     listening = Listening(EVERY)
     for arrival in arrivals(packet(SCHEMA), *sent):
-        for one in listening.take(arrival, 0):
+        for one in listening.take(arrival):
             assert all(text.isprintable() for text, _ in pieces(one))
             assert "\n" not in json_line(one)
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from router.gateway.schema_text import schema_text
+from router.gateway.json_types import schema_text
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.ros import RosInterfaces, ros_interfaces
 

@@ -1,0 +1,178 @@
+"""What clients may publish: each request is checked, counted and handed to ROS, or refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from router.compiler.metrics import CLIENTS, GATEWAY_REJECT_REASONS, INBOUND_DROP_REASONS, Counters
+from router.compiler.program import GatewayPlan, InboundPlan
+from router.engine import Report
+from router.engine.delivery import Feed as FeedDeadman
+from router.engine.freshness import Freshness
+from router.engine.pacing import RateLimit
+from router.gateway.documents import PublishRequest, SchemaRequest
+from router.gateway.encoding import Encoding
+from router.gateway.json_codec import InvalidMessageError, decoder
+from router.gateway.json_types import Style
+from router.gateway.packets import PacketError, TooLargeError, decompress
+from router.log import FloodLog, logger
+
+CLOCK_TOLERANCE_NS = 20_000_000
+"""By so much a client's clock may be ahead before that is counted: NTP keeps two computers closer than that."""
+
+
+class RefusedError(Exception):
+    """What a client sent is not published. `reason` is one of GATEWAY_REJECT_REASONS or of INBOUND_DROP_REASONS."""
+
+    def __init__(self, reason: str, detail: str, topic: str = "") -> None:
+        super().__init__(detail)
+        self.reason = reason
+        self.topic = topic
+
+
+@dataclass(frozen=True, slots=True)
+class InboundOutputs:
+    """Where requests go. `publish` takes CDR bytes by topic and may raise `publish_errors`; `feed_deadman` is by
+    the deadman's route, each called with the monotonic time before a message is published. Clocks in ns.
+    """
+
+    publish: Mapping[str, Callable[[bytes], None]]
+    publish_errors: tuple[type[Exception], ...]
+    feed_deadman: Mapping[str, FeedDeadman]
+    report: Callable[[Report], None]
+    clock_ns: Callable[[], int]
+    wall_ns: Callable[[], int]
+
+
+class _Topic:
+    """One topic that clients may publish on."""
+
+    def __init__(self, plan: InboundPlan, style: Style, counters: Counters, gateway: str) -> None:
+        self.plan = plan
+        self.decode = decoder(plan.type, style)
+        self.max_rate, ttl = plan.settings.topic.max_rate, plan.settings.ttl
+        self.ttl = ttl.value if ttl else None
+        self.may_pass = RateLimit(self.max_rate).may_pass if self.max_rate is not None else None
+        self.published = counters.index("messages_published", gateway, plan.label)
+        self.dropped = {
+            reason: counters.index("messages_dropped", gateway, plan.label, reason) for reason in INBOUND_DROP_REASONS
+        }
+
+
+class InboundPublisher:
+    """Reads the requests of one gateway's clients and publishes their messages.
+
+    For the thread that owns `counts`. Requests are short (`max_inbound`), so they are read at once.
+    """
+
+    def __init__(
+        self, plan: GatewayPlan, encoding: Encoding, counters: Counters, counts: list[int], outputs: InboundOutputs
+    ) -> None:
+        name = plan.settings.name
+        self._gateway = name
+        self._encoding = encoding
+        self._most = plan.settings.max_inbound
+        self._topics = {topic: _Topic(each, encoding.style, counters, name) for topic, each in plan.inbound.items()}
+        self._counts = counts
+        self._outputs = outputs
+        self._freshness = Freshness()
+        self._log = FloodLog()
+        self._accepted = counters.index("messages_received", name, CLIENTS)
+        self._last = counters.index("route_last_message_timestamp_seconds", name)
+        self._clock_ahead = counters.index("gateway_client_clock_ahead", name)
+        self._rejected = {
+            reason: counters.index("datagrams_rejected", name, reason) for reason in GATEWAY_REJECT_REASONS
+        }
+
+    def refusal(self, reason: str, detail: str = "", topic: str = "") -> RefusedError:
+        """Count and report something that is not accepted, for one of GATEWAY_REJECT_REASONS. Return the error."""
+        self._counts[self._rejected[reason]] += 1
+        self._outputs.report(Report("reject", self._gateway, "", reason, None, detail))
+        return RefusedError(reason, detail, topic)
+
+    def receive(self, data: bytes, arrived_ns: int) -> SchemaRequest | None:
+        """Publish the message that a client sent, or return what else it wants. `arrived_ns` is wall-clock time.
+
+        Raises RefusedError, which is counted and reported.
+        """
+        topic = ""
+        try:
+            request = self._encoding.request(data)
+            if isinstance(request, SchemaRequest):
+                return request
+            topic = request.topic
+            allowed = self._allowed(request)
+            cdr = allowed.decode(self._text(request))
+        except PacketError as error:
+            reason = "too_large" if isinstance(error, TooLargeError) else "malformed"
+            raise self.refusal(reason, str(error), topic) from error
+        except InvalidMessageError as error:
+            raise self.refusal("invalid", str(error), topic) from error
+        self._publish(allowed, cdr, request.time, arrived_ns)
+        return None
+
+    def _allowed(self, request: PublishRequest) -> _Topic:
+        """The topic of a request that may be published there. Raises RefusedError, InvalidMessageError."""
+        name = request.topic
+        topic = self._topics.get(name)
+        if topic is None:
+            raise self.refusal("not_allowed", f"clients may not publish on '{name[:80]}'", name)
+        wanted = topic.plan.type.name
+        if request.type_name not in (None, wanted):
+            raise self.refusal("wrong_type", f"{name} has the type {wanted}", name)
+        if topic.ttl is not None and request.time is None:
+            raise InvalidMessageError(f"{name} needs the time at which it was sent")
+        return topic
+
+    def _text(self, request: PublishRequest) -> bytes:
+        """The JSON text of a message. Raises PacketError."""
+        if len(request.data) > self._most:
+            raise TooLargeError(f"{len(request.data)} bytes are more than {self._most}")
+        return decompress(request.data, self._most) if request.is_compressed else request.data
+
+    def _publish(self, topic: _Topic, cdr: bytes, sent: float | None, arrived_ns: int) -> None:
+        """`sent` is the client's wall clock in seconds."""
+        self._counts[self._accepted] += 1
+        self._counts[self._last] = self._outputs.wall_ns()
+        now = self._outputs.clock_ns()
+        if topic.ttl is not None and sent is not None:
+            self._check_age(topic, topic.ttl, sent, arrived_ns, now)
+        if topic.may_pass and not topic.may_pass(now):
+            raise self._dropped(topic, "rate_limited", f"more often than {topic.max_rate:g} Hz")
+        if topic.plan.deadman is not None:
+            self._outputs.feed_deadman[topic.plan.deadman.route](now)
+        try:
+            self._outputs.publish[topic.plan.label](cdr)
+        except self._outputs.publish_errors as error:
+            raise self._dropped(topic, "publish_error", str(error), error) from error
+        self._counts[topic.published] += 1
+
+    def _check_age(self, topic: _Topic, ttl: int, sent: float, arrived_ns: int, now: int) -> None:
+        """The age counts from when the client says that it sent the message, or from its arrival if that is earlier.
+
+        So a client whose clock is ahead gets its messages published up to that much later than `ttl` allows.
+        """
+        stamp = round(min(max(sent, 0.0), arrived_ns / 1e9) * 1e9)
+        age = now - self._freshness.born(stamp, self._outputs.wall_ns(), now)
+        if age > ttl:
+            detail = f"{age / 1e9:.3f} s old, and older than {ttl / 1e9:g} s; are both clocks right?"
+            raise self._dropped(topic, "stale", detail)
+        if (ahead := sent - arrived_ns / 1e9) * 1e9 > CLOCK_TOLERANCE_NS:
+            self._counts[self._clock_ahead] += 1
+            self._log.note(
+                topic.plan.label,
+                logger.warning,
+                "a client's clock is ahead: its messages are published for longer than ttl",
+                gateway=self._gateway,
+                topic=topic.plan.label,
+                ahead_s=round(ahead, 3),
+                ttl_s=ttl / 1e9,
+            )
+
+    def _dropped(self, topic: _Topic, reason: str, detail: str, error: Exception | None = None) -> RefusedError:
+        """Count an accepted message that is not published, and report it. Return the error."""
+        self._counts[topic.dropped[reason]] += 1
+        if reason != "rate_limited":  # which is what the table asks for
+            self._outputs.report(Report("drop", self._gateway, topic.plan.label, reason, error, detail))
+        return RefusedError(reason, detail, topic.plan.label)
