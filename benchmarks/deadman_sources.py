@@ -21,7 +21,7 @@ from pathlib import Path
 from google.protobuf.message import Message
 
 from router.compiler import check_table
-from router.tools.sending import paced
+from router.tools.udp import paced
 
 WRAP = 1 << 22
 """ms; a float holds all numbers below exactly, and an hour is enough to tell fresh from stale."""

@@ -8,7 +8,7 @@ import socket
 from router.errors import UsageError
 from router.table.addresses import Address
 from router.table.model import RouteTable, Transport
-from router.tools.places import open_udp
+from router.tools.udp import open_udp
 
 DOMAINS = range(1, 102)
 """ROS 2 domains whose ports lie below Linux's ephemeral ones."""

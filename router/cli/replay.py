@@ -68,14 +68,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _send(args: argparse.Namespace, recording: Recording) -> int:
     from router.table import read_table
-    from router.tools import places
+    from router.tools import udp
     from router.tools.recordings import Replayer, on_time, parse_rate
 
     rate = parse_rate(args.rate or "1x")
     path = args.table or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
     table = read_table(path) if path is not None else None
-    to = places.destination(args.to, table) if args.to else None
-    origin = places.origin(args.origin, table) if args.origin else None
+    to = udp.destination(args.to, table) if args.to else None
+    origin = udp.origin(args.origin, table) if args.origin else None
     replayer = Replayer(table, to, origin)
     try:
         with closing(replayer), _progress(recording, "sending") as update:

@@ -13,7 +13,7 @@ from router.cli.tool_options import add_wire_options, explained, load_wire, posi
 if TYPE_CHECKING:
     from router.table.addresses import Address
     from router.table.model import RouteTable
-    from router.tools.sending import Sent
+    from router.tools.udp import Sent
 
 EPILOG = """\
 examples:
@@ -45,20 +45,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 @explained
 def run(args: argparse.Namespace) -> int:
     from router.engine.wire import framed
-    from router.tools import places
-    from router.tools.sending import Sent, send
+    from router.tools import udp
+    from router.tools.udp import Sent, send
     from router.values import payload
 
     wire, table = load_wire(args)
     case = wire.case(args.case)
     exact = wire.encode(case, payload(case, args.fields))
     data = framed(exact, args.trim, args.pad)
-    to = places.destination(args.to, table)
-    origin = places.origin(args.origin, table) if args.origin else places.ANYWHERE
+    to = udp.destination(args.to, table)
+    origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
     count = args.count if args.count is not None else None if args.rate else 1
     sent = Sent()
     # A flood without --count ends with Ctrl-C; what was sent until then is told below.
-    with places.open_udp(origin, "--from") as sender, contextlib.suppress(KeyboardInterrupt):
+    with udp.open_udp(origin, "--from") as sender, contextlib.suppress(KeyboardInterrupt):
         send(sender, to, data, count, args.rate, sent)
     print(_told(args.case, data, to, sent))
     return _advise(args, table, to, sent)

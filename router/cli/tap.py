@@ -115,10 +115,9 @@ def _print(batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: ar
 
 def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> None:
     from router.threads import background_threads
-    from router.tools.conditions import Condition
-    from router.tools.places import peer_names
     from router.tools.running_router import tap
-    from router.tools.tap import RunningTap
+    from router.tools.tap import Condition, RunningTap
+    from router.tools.udp import peer_names
 
     cases = [wire.case(word) for word in args.words]
     condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
@@ -141,14 +140,14 @@ def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> 
 
 @contextmanager
 def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Iterator[Iterator[TappedDatagram]]:
-    from router.tools import places
+    from router.tools import udp
     from router.tools.tap import listen
 
     place = args.words[0]
-    with places.open_udp(places.listening(place, table), place) as receiver:
+    with udp.open_udp(udp.listening(place, table), place) as receiver:
         host, port = receiver.getsockname()
         _say(f"listening on {host}:{port}; Ctrl-C ends it")
-        yield listen(receiver, wire, places.peer_names(table))
+        yield listen(receiver, wire, udp.peer_names(table))
 
 
 @contextmanager

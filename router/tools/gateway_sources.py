@@ -22,7 +22,7 @@ from router.net.kernel import ask_for_receive_buffer, drops
 from router.table.addresses import Address
 from router.table.model import GatewayFormat, ZenohSettings
 from router.table.units import LARGEST_DATAGRAM
-from router.tools import places
+from router.tools import udp
 from router.tools.gateway_messages import MOST_TEXT
 
 Say = Callable[[str], None]
@@ -250,7 +250,7 @@ class UdpSource:
     """Bound to `address`. `gateway` is where schemas are asked for, if they are. Raises UsageError."""
 
     def __init__(self, address: Address, gateway: Address | None, say: Say) -> None:
-        self._socket = places.open_udp(address, "listen")
+        self._socket = udp.open_udp(address, "listen")
         ask_for_receive_buffer(self._socket, _RECEIVE_BUFFER)
         self._gateway = gateway
         self._say = say
@@ -314,13 +314,13 @@ def remote(text: str) -> Address:
     """`HOST:PORT`. Raises UsageError."""
     if not re.fullmatch(r".+:[0-9]+", text):
         raise UsageError(f"'{text}' is not HOST:PORT")
-    return places.destination(text, None)
+    return udp.destination(text, None)
 
 
 def _local(text: str) -> Address:
     if not re.fullmatch(r"(?:.+:)?[0-9]+", text):
         raise UsageError(f"'{text}' is not {_FORMS}")
-    return places.listening(text, None)
+    return udp.listening(text, None)
 
 
 def _zenoh(text: str) -> ZenohSettings:

@@ -20,7 +20,7 @@ from router.recording.recorder import PERIOD
 from router.recording.writer import RecordingFile
 from router.table.addresses import Address
 from router.table.model import RouteTable
-from router.tools import places
+from router.tools import udp
 from router.types.protobuf import Envelope
 
 MOST_SOCKETS = 256
@@ -177,18 +177,18 @@ class Replayer:
         if listener not in listeners:
             hint = did_you_mean(listener, listeners)
             raise UsageError(f"the table has no listener '{listener}' as the recording has; {hint or 'give --to'}")
-        return places.listener_address(listeners[listener])
+        return udp.listener_address(listeners[listener])
 
     def _bound(self, found: Recorded) -> socket.socket:
         if self._origin is not None:
-            return places.open_udp(self._origin, "--from")
+            return udp.open_udp(self._origin, "--from")
         wanted = Address(*found.peer)
         if self._table is not None and found.endpoint in self._table.endpoints:
-            wanted = places.origin(found.endpoint, self._table)
+            wanted = udp.origin(found.endpoint, self._table)
         for address in (wanted, wanted._replace(port=0)):
             try:
-                return places.open_udp(address, found.endpoint)
+                return udp.open_udp(address, found.endpoint)
             except UsageError:
                 continue
         self.resent.elsewhere[found.endpoint or f"{found.peer[0]}:{found.peer[1]}"] = wanted.host
-        return places.open_udp(places.ANYWHERE, "replay")
+        return udp.open_udp(udp.ANYWHERE, "replay")

@@ -16,7 +16,7 @@ from router.observe.snapshot import COLLECTED_AT
 from router.observe.tap import Lost, StreamReader
 from router.recording.mirror import MirroredDatagram
 from router.table.model import RouteTable
-from router.tools.places import reachable
+from router.tools.udp import reachable
 
 PATIENCE = 5.0
 """Seconds; a router answers at once, and says once a second in a tap that it is there."""

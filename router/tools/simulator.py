@@ -23,7 +23,7 @@ from router.table.model import ANY, Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
 from router.tools.payloads import PayloadModel, pose, usual_rate
-from router.tools.places import LOOPBACK, listener_address, open_udp
+from router.tools.udp import LOOPBACK, listener_address, open_udp
 from router.types.protobuf import PayloadCase
 
 STRANGER = "(anybody)"

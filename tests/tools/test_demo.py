@@ -36,8 +36,8 @@ from router.errors import Located
 from router.table import read_table
 from router.table.addresses import Address
 from router.table.model import RouteTable
-from router.tools.places import open_udp
 from router.tools.top import RouteRow, TargetRow, View
+from router.tools.udp import open_udp
 from tests.ports import free_port
 from tests.tables import ROUTES
 

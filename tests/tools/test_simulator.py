@@ -19,9 +19,9 @@ from router.table import read_table
 from router.table.addresses import Address
 from router.table.model import RouteTable
 from router.tools.board import Arrivals, Board, Change, Frames, Inbox, State
-from router.tools.places import LOOPBACK, open_udp, reachable
 from router.tools.sim_view import SimView
 from router.tools.simulator import Silence, Simulator, Statistics, Stream, parse_silence, streams
+from router.tools.udp import LOOPBACK, open_udp, reachable
 
 FAST = 100.0
 

@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from router.errors import UsageError
+from router.table import read_table
+from router.table.addresses import Address
+from router.table.model import RouteTable
+from router.tools import udp
+from router.tools.udp import Sent, open_udp, send
+
+
+def test_addresses_as_typed(table: RouteTable) -> None:
+    assert udp.destination("127.0.0.1:5000", table) == Address("127.0.0.1", 5000)
+    assert udp.destination("localhost:5000", None) == Address("127.0.0.1", 5000)
+    assert udp.listening("5000", None) == Address("0.0.0.0", 5000)
+    assert udp.listening("127.0.0.1:5000", table) == Address("127.0.0.1", 5000)
+    assert udp.origin("127.0.0.7", table) == Address("127.0.0.7", 0)
+    assert udp.origin("127.0.0.7:70", None) == Address("127.0.0.7", 70)
+
+
+def test_names_of_the_table(table: RouteTable) -> None:
+    rover, board = table.listeners["rover"].address.value, table.endpoints["board"].address.value
+    assert udp.destination("rover", table) == Address("127.0.0.1", rover.port)
+    assert udp.listening("rover", table) == rover
+    assert udp.destination("board", table) == board
+    assert udp.origin("board", table) == Address(board.host, 0)
+
+
+def test_an_endpoint_known_by_its_source_port_sends_from_it(table_path: Callable[..., Path]) -> None:
+    table = read_table(table_path(source_port=True))
+    source_port = table.endpoints["station"].source_port
+    assert source_port is not None
+    assert udp.origin("station", table) == Address("127.0.6.10", source_port.value)
+    name_of = udp.peer_names(table)
+    assert name_of(("127.0.6.10", source_port.value)) == "station"
+    assert name_of(("127.0.6.10", 1)) == "127.0.6.10:1"
+
+
+def test_peers_are_named_by_their_address(table: RouteTable) -> None:
+    name_of = udp.peer_names(table)
+    assert name_of(("127.0.6.30", 12345)) == "board"
+    assert name_of(("127.0.0.1", 12345)) == "127.0.0.1:12345"
+
+
+@pytest.mark.parametrize(
+    ("resolve", "text", "complaint"),
+    [
+        (
+            udp.destination,
+            "boart",
+            "'boart' is neither HOST:PORT nor a name of the route table; did you mean 'board'",
+        ),
+        (udp.destination, "127.0.0.1:0", "'0' is not a UDP port; ports are 1 to 65535"),
+        (udp.destination, "127.0.0.1:70000", "'70000' is not a UDP port; ports are 1 to 65535"),
+        (udp.listening, "127.0.0.1", "'127.0.0.1' is neither [HOST:]PORT nor a name of the route table; known: "),
+        (
+            udp.origin,
+            "statio",
+            "'statio' is neither HOST[:PORT] nor a name of the route table; did you",
+        ),
+    ],
+)
+def test_a_place_that_is_none_is_explained(
+    table: RouteTable, resolve: Callable[[str, RouteTable], Address], text: str, complaint: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        resolve(text, table)
+    assert str(caught.value).startswith(complaint)
+
+
+def test_a_port_that_is_taken_and_an_address_that_is_not_ours_are_named() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
+        first.bind(("127.0.0.1", 0))
+        taken = Address(*first.getsockname())
+        with pytest.raises(UsageError, match=f"board: cannot bind {taken}: another process has this port"):
+            udp.open_udp(taken, "board")
+    with pytest.raises(UsageError, match=r"cannot bind 192\.0\.2\.1:5000: this machine has no such address"):
+        udp.open_udp(Address("192.0.2.1", 5000), "board")
+
+
+HERE = Address("127.0.0.1", 0)
+
+
+def test_every_datagram_arrives_and_is_counted() -> None:
+    with open_udp(HERE, "receiver") as receiver, open_udp(HERE, "sender") as sender:
+        sent = Sent()
+        send(sender, Address(*receiver.getsockname()), b"hello", 5, 1000, sent)
+        assert [receiver.recv(100) for _ in range(5)] == [b"hello"] * 5
+        assert (sent.count, sent.refused) == (5, 0)
+        assert sent.seconds > 0
+
+
+def test_a_port_where_nobody_listens_is_noticed_and_does_not_stop_the_sending() -> None:
+    with open_udp(HERE, "gone") as gone:
+        nobody = Address(*gone.getsockname())
+    with open_udp(HERE, "sender") as sender:
+        sent = Sent()
+        send(sender, nobody, b"hello", 3, None, sent)
+    assert (sent.count, sent.refused) == (3, 3)
+
+
+def test_one_datagram_alone_has_no_rate() -> None:
+    assert Sent(count=1, seconds=0.0).rate == 0
+    assert Sent(count=11, seconds=2.0).rate == 5
+
+
+def test_the_sender_keeps_the_address_it_was_opened_with() -> None:
+    with open_udp(HERE, "receiver") as receiver, open_udp(Address("127.0.6.1", 0), "sender") as sender:
+        receiver.settimeout(5)
+        send(sender, Address(*receiver.getsockname()), b"x", 1, None, Sent())
+        _, peer = receiver.recvfrom(10)
+        assert peer[0] == "127.0.6.1"
+
+
+def test_the_refusal_of_the_last_datagram_is_seen_too() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        nobody = Address(*gone.getsockname())
+    sent = Sent()
+    with open_udp(HERE, "sender") as sender:
+        send(sender, nobody, b"hello", 1, None, sent)
+    assert sent.refused == 1
