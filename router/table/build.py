@@ -329,10 +329,13 @@ def _misplaced_keys(root: MappingNode) -> Iterator[Diagnostic]:
 
 def _misplaced(model: type, settings: MappingNode, with_ros: bool) -> Iterator[Diagnostic]:
     for key in keys_of(model):
-        entry = settings.entries.get(key.name)
-        if entry and key.misplaced and key.misplaced.with_ros == with_ros and is_valid(entry.value):
+        entry, rule = settings.entries.get(key.name), key.misplaced
+        if entry is None or rule is None or rule.with_ros != with_ros or rule.model not in (None, model.__name__):
+            continue
+        if is_valid(entry.value):
             span = entry.value.span if isinstance(entry.value, ScalarNode) else entry.key.span
-            yield Diagnostic(span, Code.UNKNOWN_KEY, key.misplaced.message, key.misplaced.hint)
+            message, hint = rule.message.format(key=key.name), rule.hint.format(key=key.name)
+            yield Diagnostic(span, Code.UNKNOWN_KEY, message, hint)
 
 
 def _members(node: Node | None) -> Sequence[Node]:

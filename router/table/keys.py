@@ -38,11 +38,15 @@ class Words:
 
 @dataclass(frozen=True, slots=True)
 class Misplaced:
-    """The finding for the key in a route from ROS (`with_ros`), or in any other route."""
+    """The finding for the key in a route from ROS (`with_ros`), or in any other route; of one class only if it says so.
+
+    `{key}` in its texts is the name of the key.
+    """
 
     with_ros: bool
     message: str
     hint: str
+    model: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -220,15 +220,32 @@ class Qos:
     liveliness_lease_duration: Annotated[Located[int] | None, DURATION] = None
 
 
+OF_TARGETS = Misplaced(
+    with_ros=True,
+    model="Topic",
+    message="with `source: ros` it is destinations that take a '{key}'",
+    hint="move it to {{endpoint: NAME, {key}: ...}}",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetKeys:
+    """The keys that destinations and topics have in common. `max_rate` is in Hz.
+
+    A key of this kind that limits what is sent is marked OF_TARGETS: the topics of `source: ros` are no targets.
+    """
+
+    when: Annotated[Expression | None, Words("when {}")] = None
+    max_rate: Annotated[float | None, RATE, Words("at most {}"), OF_TARGETS] = None
+    keep: Annotated[Keep, Words("keeping the {}", beside="max_rate")] = Keep.FIRST
+
+
 @dataclass(frozen=True, slots=True)
-class Destination:
-    """A destination endpoint of a route. `max_rate` is in Hz."""
+class Destination(TargetKeys):
+    """A destination endpoint of a route."""
 
     endpoint: Located[str]
     span: SourceSpan
-    when: Annotated[Expression | None, Words("when {}")] = None
-    max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
-    keep: Annotated[Keep, Words("keeping the {}", beside="max_rate")] = Keep.FIRST
     fields: Annotated[
         FieldMap | None,
         Misplaced(
@@ -240,26 +257,14 @@ class Destination:
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
-    """A ROS topic of a route: published for a UDP source, subscribed to for `source: ros`. `max_rate` is in Hz."""
+class Topic(TargetKeys):
+    """A ROS topic of a route: published for a UDP source, subscribed to for `source: ros`."""
 
     topic: Located[str]
     type: Located[str]
     span: SourceSpan
     queue_depth: Located[int] | None = None
     qos: Qos | None = None
-    when: Annotated[Expression | None, Words("when {}")] = None
-    max_rate: Annotated[
-        float | None,
-        RATE,
-        Words("at most {}"),
-        Misplaced(
-            with_ros=True,
-            message="with `source: ros` it is destinations that take a 'max_rate'",
-            hint="move it to {endpoint: NAME, max_rate: ...}",
-        ),
-    ] = None
-    keep: Annotated[Keep, Words("keeping the {}", beside="max_rate")] = Keep.FIRST
     fields: Annotated[
         FieldMap | None,
         Misplaced(
