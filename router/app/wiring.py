@@ -120,7 +120,7 @@ class Wiring:
                 thread = timers.inbound_deadman if route in inbound else timers.deadman
                 thread.locked(deadman, deadman.replace)(before)
         timers.release(list(self.state.left()))
-        places = {(each.route, target.target) for each in self.program.handlers for target in each.targets}
+        places = {(each.route, target.label) for each in self.program.handlers for target in each.targets}
         for pacer in self.pacers.values():
             timers.pacing.locked(pacer, pacer.keep_only)(monotonic_ns(), places)
 

@@ -55,8 +55,8 @@ class CheckedTarget:
 
 
 @dataclass(frozen=True, slots=True)
-class CheckedFeed:
-    """A topic that an outbound route is fed from, with a target for each destination.
+class CheckedSubscription:
+    """A topic that an outbound route subscribes to, with a target for each destination.
 
     `reads` serves all expressions in it. `when` is the topic's own. With `for_each`, a list, `when` and the
     targets are evaluated for each element: `item` and `index` of `count`. `stamp` is the message's `header.stamp`
@@ -74,7 +74,7 @@ class CheckedFeed:
 
 @dataclass(frozen=True, slots=True)
 class CheckedCollect:
-    """The three numbers of a datagram that is part of a frame. `reads` serves them, and nothing else."""
+    """How the datagrams of a frame are grouped, counted and ordered. `reads` makes the variables of all three."""
 
     span: SourceSpan
     reads: Reads
@@ -97,15 +97,15 @@ class CheckedDeadman:
 
 @dataclass(frozen=True, slots=True)
 class CheckedRoute:
-    """A route whose names all exist. Findings that it has beside that keep it out of a program.
+    """A route whose payload case exists. If it has findings of severity error, no program is made of it.
 
-    `targets` are those of a route from UDP, `feeds` those topics that a route from ROS is fed from.
+    `targets` are those of a route from UDP, `subscriptions` the topics of a route from ROS.
     """
 
     route: Route
     case: PayloadCase
     targets: tuple[CheckedTarget, ...] = ()
-    feeds: tuple[CheckedFeed, ...] = ()
+    subscriptions: tuple[CheckedSubscription, ...] = ()
     collect: CheckedCollect | None = None
     deadman: CheckedDeadman | None = None
 

@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from typing import Any
 
 from router.compiler.cdr import write_message
 from router.compiler.checked import CheckedGateway, CheckedInbound
 from router.compiler.deadmen import constant_plan, timing_findings
 from router.compiler.lookup import Lookup
-from router.compiler.namespace import NAMESPACE
-from router.compiler.plan import Record
+from router.compiler.namespace import constant_bytes
 from router.compiler.selection import pattern_problem
-from router.compiler.source import Source
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, MappingError
 from router.table.model import Gateway, Inbound, InboundDeadman, RouteTable
@@ -83,23 +80,13 @@ def _checked(lookup: Lookup, inbound: Inbound, name: str) -> CheckedInbound | No
 
 
 def _stop(lookup: Lookup, deadman: InboundDeadman, ros_type: MessageType) -> bytes | None:
-    """What the deadman publishes, as CDR bytes."""
+    """The message that the deadman publishes, as CDR bytes."""
     span = deadman.fields.span
     plan = constant_plan(lookup, deadman.fields, ros_type, span, ros_type)
     if plan is None:
         return None
     try:
-        return _constant_message(plan)
-    except (MappingError, ArithmeticError, LookupError, ValueError, struct.error) as error:
+        return constant_bytes(lambda out: write_message(out, plan, "constant"), span)
+    except (MappingError, ValueError, struct.error) as error:
         lookup.report(span, Code.BAD_VALUE, f"this message cannot be built: {error}")
         return None
-
-
-def _constant_message(plan: Record) -> bytes:
-    """The CDR bytes of a plan whose expressions have no message to look at."""
-    out = Source()
-    with out.block("def build():", plan.span):
-        out.line(f"return {write_message(out, plan, 'constant')}", plan.span)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile(plan.span.file), namespace)  # noqa: S102 - code that we made of a checked plan
-    return bytes(namespace["build"]())

@@ -10,10 +10,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 
 from router.compiler.cdr import write_message
-from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedTarget
+from router.compiler.checked import CheckedCollect, CheckedSubscription, CheckedTarget
 from router.compiler.expressions import Typed
 from router.compiler.metrics import DROP_REASONS, Counters
 from router.compiler.payload import write_envelope
@@ -23,9 +22,15 @@ from router.errors import SourceSpan
 from router.table.model import Keep, Route
 from router.types.protobuf import PayloadCase
 
+Deliver = Callable[[str, CheckedTarget], None]
+"""Appends the lines that hand the message to a target."""
+
+NamedTarget = tuple[str, CheckedTarget]
+"""A target with its part of the Python names."""
+
 
 class HandlerSource:
-    """Generates `def route_NAME(MESSAGE, received_at, now, source)` for one route.
+    """The source of `def route_NAME(MESSAGE, received_at, now, source)` for one route, with the targets that it serves.
 
     MESSAGE is `m, datagram` of a route from UDP, `cdr` of one from ROS. With a `ttl` there is one more argument:
     `born`, the arrival by the monotonic clock (ns).
@@ -33,63 +38,61 @@ class HandlerSource:
 
     def __init__(self, route: Route, case: PayloadCase, counters: Counters) -> None:
         self.route = route
+        self.case = case
         self.counters = counters
-        self.span = route.span
         self.function = f"route_{namespace_name(route.name)}"  # a case may be called as a keyword, or as a function
         self.out = Source()
-        self._serving = ServingSource(self.out, route, case, counters)
-
-    @property
-    def plans(self) -> tuple[TargetPlan, ...]:
-        """The targets that the function serves."""
-        return tuple(self._serving.plans)
+        self.targets: list[TargetPlan] = []
 
     def inbound(self, targets: Sequence[CheckedTarget], collect: CheckedCollect | None) -> None:
-        """Destinations first: forwarding waits for no mapping. Topics get whole frames where there is a `collect`."""
-        named = [self._serving.named(target) for target in targets]
+        """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames."""
+        named = [self._named(target) for target in targets]
         with self._function("m", "datagram"):
             self._expires()
             if collect is None:
-                self._serving.serve(named)
+                self._serve(named)
             else:
-                self._serving.serve([(name, target) for name, target in named if not target.topic])
+                self._serve([(name, target) for name, target in named if not target.topic])
                 topics = [(name, target) for name, target in named if target.topic]
                 self._collect(collect, topics)
-                self._serving.serve(topics)
+                self._serve(topics)
             if not targets:
-                self.out.line("pass", self.span)
+                self.out.line("pass", self.route.span)
 
-    def outbound(self, feed: CheckedFeed) -> None:
-        """The message is read once for all destinations. With `for_each` each element is a message of its own."""
-        span, one_received = feed.topic.span, self._received(feed, "1")
-        named = [self._serving.named(target) for target in feed.targets]
+    def outbound(self, subscription: CheckedSubscription) -> None:
+        """The message is read once for all destinations. With `for_each`, each element is served as a message."""
+        span, for_each = subscription.topic.span, subscription.for_each
+        one_received = self._received(subscription, "1")
+        named = [self._named(target) for target in subscription.targets]
         with self._function("cdr"):
             with self.out.block("try:", span):
-                feed.reads.write(self.out, span)
-                if feed.for_each is not None:
-                    self.out.line(f"elements = {self.out.expression(feed.for_each.node)}", feed.for_each.span)
-            self._serving.all_lost(named, span, one_received)
-            if feed.stamp is not None:
-                self._born(feed.stamp)
+                subscription.reads.write(self.out, span)
+                if subscription.for_each is not None:
+                    self.out.line(
+                        f"elements = {self.out.expression(subscription.for_each.node)}", subscription.for_each.span
+                    )
+            self._all_lost(named, span, one_received)
+            if subscription.stamp is not None:
+                self._born(subscription.stamp)
             self._expires()
-            if feed.for_each is None:
+            if for_each is None:
                 self.out.line(one_received, span)
-                self._serving.serve(named, feed.when)
+                self._serve(named, subscription.when)
                 return
-            self.out.line("count = len(elements)", feed.for_each.span)
-            self.out.line(self._received(feed, "count"), span)
-            with self.out.block("for index, item in enumerate(elements):", feed.for_each.span):
-                self._serving.serve(named, feed.when)
+            self.out.line("count = len(elements)", for_each.span)
+            self.out.line(self._received(subscription, "count"), span)
+            with self.out.block("for index, item in enumerate(elements):", for_each.span):
+                self._serve(named, subscription.when)
 
-    def _received(self, feed: CheckedFeed, messages: str) -> str:
-        """The line that counts so many."""
-        index = self.counters.index("messages_received", self.route.name, feed.topic.topic.value)
+    def _received(self, subscription: CheckedSubscription, messages: str) -> str:
+        """Return the line that counts so many messages."""
+        index = self.counters.index("messages_received", self.route.name, subscription.topic.topic.value)
         return f"counts[{index}] += {messages}  # messages_received"
 
     @contextmanager
     def _function(self, *message: str) -> Iterator[None]:
         parameters = (*message, "received_at", "now", "source", *(["born"] if self.route.ttl else []))
-        with self.out.block(f"def {self.function}({', '.join(parameters)}):", self.span):
+        with self.out.block(f"def {self.function}({', '.join(parameters)}):", self.route.span):
             yield
 
     # the age of the message
@@ -107,7 +110,7 @@ class HandlerSource:
     # frames
 
     def _collect(self, collect: CheckedCollect, topics: Sequence[NamedTarget]) -> None:
-        """What follows is for whole frames: `items`, of which `m` is the first."""
+        """Append the lines that return unless a frame is complete. `items` are its parts, `m` is the first of them."""
         span = collect.span
         for _, target in topics:
             self.counters.index("messages_collected", self.route.name, target.label)
@@ -116,28 +119,15 @@ class HandlerSource:
             collect.reads.write(self.out, span)
             by, count, order = (self.out.expression(typed.node) for typed in (collect.by, collect.count, collect.order))
             self.out.line(f"items = collect(now, (source, {by}), {count}, {order}, m)", span)
-        self._serving.all_lost(topics, span)
+        self._all_lost(topics, span)
         with self.out.block("if items is None:", span):
             self.out.line("return", span)
         self.out.line("m, count = items[0], len(items)", span)
 
+    # targets
 
-NamedTarget = tuple[str, CheckedTarget]
-"""A target with its part of the Python names."""
-
-
-@dataclass(slots=True)
-class ServingSource:
-    """Appends to `out` what serves targets of `route`. `plans` are those that were named so far."""
-
-    out: Source
-    route: Route
-    case: PayloadCase
-    counters: Counters
-    plans: list[TargetPlan] = field(default_factory=list)
-
-    def named(self, target: CheckedTarget) -> NamedTarget:
-        """Opens the target's series, which all exist from the start."""
+    def _named(self, target: CheckedTarget) -> NamedTarget:
+        """Add a target, and open all its series in the counters."""
         for reason in DROP_REASONS:
             self.counters.index("messages_dropped", self.route.name, target.label, reason)
         self.counters.index("messages_filtered", self.route.name, target.label)
@@ -145,10 +135,10 @@ class ServingSource:
         for metric in delivered:
             self.counters.index(metric, self.route.name, target.label)
         name = self._unique(namespace_name(target.label))
-        self.plans.append(
+        self.targets.append(
             TargetPlan(
-                name=name,
-                target=target.label,
+                identifier=name,
+                label=target.label,
                 is_topic=target.topic is not None,
                 max_rate=target.declared.max_rate,
                 keep=target.declared.keep,
@@ -160,13 +150,13 @@ class ServingSource:
         return name, target
 
     def _unique(self, base: str) -> str:
-        """`a/b` and `a_b` are different topics but would be one Python name."""
-        taken = {plan.name for plan in self.plans}
+        """Return a Python name that no other target has: `a/b` and `a_b` are different topics."""
+        taken = {plan.identifier for plan in self.targets}
         candidates = (f"{base}_{number}" if number > 1 else base for number in itertools.count(1))
         return next(name for name in candidates if name not in taken)
 
-    def serve(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:
-        """`when` holds for all of them, beside what each has."""
+    def _serve(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:
+        """Append the lines that serve targets. `when` is a condition for all of them, beside their own."""
         for name, target in targets:
             self.out.line(f"# {'topic' if target.topic else 'destination'} {target.label}", target.span)
             conditions = [condition for condition in (when, target.when) if condition is not None]
@@ -178,8 +168,8 @@ class ServingSource:
             with self.out.block("else:", target.span):
                 self._count("messages_filtered", target)
 
-    def all_lost(self, targets: Sequence[NamedTarget], span: SourceSpan, *before: str) -> None:
-        """Ends a `try:` without which no target can be served. The lines `before` come before the losses."""
+    def _all_lost(self, targets: Sequence[NamedTarget], span: SourceSpan, *before: str) -> None:
+        """Append the `except` of a `try:` without which no target can be served, with the lines `before` in front."""
         with self.out.block("except FAILURES as error:", span):
             for line in before:
                 self.out.line(line, span)
@@ -188,20 +178,28 @@ class ServingSource:
             self.out.line("return", span)
 
     def _guarded(
-        self, name: str, target: CheckedTarget, conditions: Sequence[Typed], serve: Callable[[str, CheckedTarget], None]
+        self,
+        name: str,
+        target: CheckedTarget,
+        conditions: Sequence[Typed],
+        deliver: Deliver,
     ) -> None:
-        """What fails for one target is counted there and leaves the others alone."""
+        """A failure of one target is counted for it and does not affect the others."""
         with self.out.block("try:", target.span):
             if target.reads is not None:
                 target.reads.write(self.out, target.span)
-            self._conditional(name, target, conditions, serve)
+            self._conditional(name, target, conditions, deliver)
         with self.out.block("except FAILURES as error:", target.span):
             self.out.line(f"lost_{name}(error)", target.span)
 
     def _conditional(
-        self, name: str, target: CheckedTarget, conditions: Sequence[Typed], serve: Callable[[str, CheckedTarget], None]
+        self,
+        name: str,
+        target: CheckedTarget,
+        conditions: Sequence[Typed],
+        deliver: Deliver,
     ) -> None:
-        """Serves the target if each `when` is true, the message is fresh, and its `max_rate` is not used up."""
+        """Serve the target if each `when` is true, the message is not older than `ttl`, and `max_rate` allows it."""
         word = "if"
         for condition in conditions:
             with self.out.block(f"{word} not {self.out.expression(condition.node)}:", condition.span):
@@ -216,17 +214,17 @@ class ServingSource:
                 self._count("messages_dropped", target, "rate_limited")
             word = "elif"
         if word == "if":
-            serve(name, target)
+            deliver(name, target)
             return
         with self.out.block("else:", target.span):
-            serve(name, target)
+            deliver(name, target)
 
     def _count(self, metric: str, target: CheckedTarget, *reason: str) -> None:
         index = self.counters.index(metric, self.route.name, target.label, *reason)
         self.out.line(f"counts[{index}] += 1  # {' '.join((metric, *reason))}", target.span)
 
     def _data(self, name: str, target: CheckedTarget) -> str:
-        """Appends what makes the bytes for a target, and returns the expression that is them."""
+        """Append the lines that make the bytes for a target, and return the expression that is the bytes."""
         if target.plan is None:
             data = "datagram"
         elif target.topic:
@@ -237,7 +235,7 @@ class ServingSource:
 
     def _send(self, name: str, target: CheckedTarget) -> None:
         data = self._data(name, target)
-        if target.deadmen:  # before the command is sent, so that nothing which a deadman sends can follow it
+        if target.deadmen:  # before the command is sent, so that no datagram of a deadman can follow it
             self.out.line(f"feed_{name}(now)", target.span)
         index = self.counters.index("sent_bytes", self.route.name, target.label)
         self.out.line(f"counts[{index}] += send_{name}({data})  # sent_bytes", target.span)
@@ -248,7 +246,7 @@ class ServingSource:
         self._count("messages_published", target)
 
     def _deliver(self, name: str, target: CheckedTarget) -> None:
-        """Sent or published now or later; counted there, and deadmen are told there."""
+        """Sent or published now or later. What delivers it then counts it and feeds the deadmen."""
         data = self._data(name, target)
         expires = "expires" if self.route.ttl else "None"
         self.out.line(f"deliver_{name}(now, {data}, {expires})", target.span)

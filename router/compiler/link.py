@@ -50,9 +50,10 @@ def link(
     own_topics: Sequence[tuple[Topic, MessageType]] = (),
     counters: Counters | None = None,
 ) -> Program:
-    """`own_topics` are published by the router itself, whatever its routes do.
+    """Make the program of a checked table.
 
-    `counters` are to be counted in, where the program takes over from another one (`Counters.continued`).
+    `own_topics` are published by the router itself, whatever its routes do. A program that takes over from another
+    one counts in `counters`, which continue those of the other (`Counters.continued`).
     """
     counters = counters or Counters()
     _open_counters(counters, table, envelope)
@@ -77,8 +78,8 @@ def link(
         envelope=envelope,
         counters=counters,
         senders=tuple(endpoint for endpoint in table.endpoints.values() if endpoint.name in destinations),
-        publishers=_topics([*_published(served), *own_topics], _let_in(gateways)),
-        subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.feeds),
+        publishers=_topics([*_published(served), *own_topics], _published_by_clients(gateways)),
+        subscriptions=_topics((feed.topic, feed.type) for checked in served for feed in checked.subscriptions),
         inbound=inbound,
         outbound=outbound,
         deadmen=deadmen,
@@ -89,22 +90,22 @@ def link(
 
 
 def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageType]]:
-    """What routes fill."""
+    """The topics that routes publish on."""
     for checked in routes:
         for used in checked.targets:
             if used.topic and used.type:
                 yield used.topic, used.type
 
 
-def _let_in(gateways: Iterable[CheckedGateway]) -> Iterator[TopicPlan]:
-    """What clients of gateways publish, under absolute names."""
+def _published_by_clients(gateways: Iterable[CheckedGateway]) -> Iterator[TopicPlan]:
+    """The topics that clients of gateways publish on, under absolute names."""
     for gateway in gateways:
         for entry in gateway.inbound:
             yield _topic(entry.settings.topic, entry.type, entry.label)
 
 
 def _topics(used: Iterable[tuple[Topic, MessageType]], more: Iterable[TopicPlan] = ()) -> tuple[TopicPlan, ...]:
-    """One for each topic, however many routes name it: the check has seen to it that they agree."""
+    """One plan for each topic, however many routes name it; they agree on its type and QoS."""
     plans: dict[str, TopicPlan] = {}
     for plan in (*(_topic(topic, declared, topic.topic.value) for topic, declared in used), *more):
         plans.setdefault(plan.label, plan)
@@ -128,7 +129,7 @@ def _open_counters(counters: Counters, table: RouteTable, envelope: Envelope) ->
 
 
 def _open_own_counters(counters: Counters, table: RouteTable) -> None:
-    """Of what the router does beside routing."""
+    """The series of mirror, recorder and reloads."""
     for name in ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"):
         counters.index(name)
     for result in RELOAD_RESULTS:
@@ -141,9 +142,9 @@ def _open_own_counters(counters: Counters, table: RouteTable) -> None:
 
 
 def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[Handler]:
-    """Generates and compiles the functions of one route, and opens its series in the counters.
+    """Generate and compile the functions of one route, and open its series in the counters.
 
-    A route from UDP has one, a route from ROS one for each of its topics.
+    A route from UDP has one function, a route from ROS one for each of its topics.
     """
     route, case = checked.route, checked.case
     counters.index("route_duration_seconds", route.name)
@@ -161,7 +162,7 @@ def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counter
             counters.index("messages_received", route.name, source_label(source))
         spans = [target.span for target in checked.targets if target.topic]
         yield _handler(generator, checked, (spans or [route.span])[0].file, frozenset(sources), None)
-    for feed in checked.feeds:
+    for feed in checked.subscriptions:
         generator = HandlerSource(route, case, counters)
         generator.outbound(feed)
         yield _handler(generator, checked, feed.topic.span.file, frozenset(), feed.topic.topic.value)
@@ -179,7 +180,7 @@ def _handler(
         source=generator.out.text(),
         code=generator.out.compile(file),
         constants={**NAMESPACE, **generator.out.constants},
-        targets=generator.plans,
+        targets=tuple(generator.targets),
         sources=sources,
         topic=topic,
         ttl=route.ttl.value if route.ttl else None,

@@ -115,7 +115,7 @@ GATEWAY_DROP_REASONS: Mapping[str, str] = {
 """Why no client of a gateway got a ROS message, with what each means."""
 
 INTENDED_REASONS = frozenset({"rate_limited", "ignored"})
-"""Drops and rejections that do what the table says: nobody has to be told of them."""
+"""Drops and rejections that the table asks for: they are not reported."""
 
 INBOUND_DROP_REASONS = ("stale", "rate_limited", "publish_error")
 """Those of DROP_REASONS for which a client's message is not published."""
@@ -161,9 +161,9 @@ HISTOGRAM_BOUNDS_NS = tuple(us * 1000 for us in (10, 20, 50, 100, 200, 500, 1000
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One index's meaning: a metric's name and its label values, in the metric's order.
+    """What an index counts: a metric, with its label values in the metric's order.
 
-    A histogram has a run of slots: one for each bound, one for everything slower, one for the sum (ns).
+    A histogram has several indexes in a row, one for each `part`: each bound, everything slower, the sum (ns).
     """
 
     metric: str
@@ -176,79 +176,80 @@ HISTOGRAM_CELLS = len(HISTOGRAM_BOUNDS_NS) + 2
 
 @dataclass(slots=True)
 class Counters:
-    """Slots by series. Asking twice for one series gives the same index, so series exist once.
+    """The index of each series in the lists of integers in which threads count.
 
-    Counters may continue those of an earlier program (`continued`): what both have is counted in the same slots. What
-    only the earlier one had is gone: it is no longer current, but keeps its slots until `settle` frees them.
+    Counters may continue those of an earlier program (`continued`): series that both have keep their indexes. Series
+    that only the earlier one had are no longer current, but keep their indexes until `settle` frees them.
     """
 
-    _slots: dict[Series, int] = field(default_factory=dict)
+    _indexes: dict[Series, int] = field(default_factory=dict)
     _current: set[Series] = field(default_factory=set)
-    _free: dict[int, list[int]] = field(default_factory=dict)  # the first slots of free runs, by length
+    _free: dict[int, list[int]] = field(default_factory=dict)  # first indexes of free runs, by length
     _size: int = 0
 
     def continued(self) -> Counters:
-        """Counters for the program that comes next, in which nothing is current yet. These here stay as they are."""
+        """Return counters for the next program, in which no series is current yet. These stay unchanged."""
         return Counters(
-            self._slots.copy(), set(), {length: starts.copy() for length, starts in self._free.items()}, self._size
+            self._indexes.copy(), set(), {length: starts.copy() for length, starts in self._free.items()}, self._size
         )
 
     def index(self, metric: str, *labels: str) -> int:
+        """Return the first index of a series, which is current from now on."""
         declared = _BY_NAME[metric]
         if len(labels) != len(declared.labels):
             raise ValueError(f"{metric} has the labels {declared.labels}, not {labels}")
         first = Series(metric, labels)
         self._current.add(first)
-        if first not in self._slots:
-            length = _slots_of(declared)
+        if first not in self._indexes:
+            length = _length_of(declared)
             start = self._run(length)
             for part in range(length):
-                self._slots[Series(metric, labels, part)] = start + part
-        return self._slots[first]
+                self._indexes[Series(metric, labels, part)] = start + part
+        return self._indexes[first]
 
     def _run(self, length: int) -> int:
-        """So many slots in a row that no series has."""
+        """Return the first of `length` indexes in a row that no series has."""
         if free := self._free.get(length):
             return free.pop()
         self._size += length
         return self._size - length
 
     def series(self) -> Iterable[tuple[Series, int]]:
-        """Every series with its index: those of this program, and those of earlier ones that counted something."""
-        return self._slots.items()
+        """Return every series with its index, also those of earlier programs that have counted something."""
+        return self._indexes.items()
 
     def fresh_counts(self) -> list[int]:
-        """A list of zeros, one for each index, for one thread to own."""
+        """Return a list of zeros, one for each index, for one thread to own."""
         return [0] * self._size
 
     def grow(self, counts: list[int]) -> None:
-        """Gives the list of a thread that counts in earlier counters room for these, in place."""
+        """Extend the list of a thread that has counted in earlier counters, in place."""
         counts.extend([0] * (self._size - len(counts)))
 
     def settle(self, threads: Iterable[list[int]]) -> None:
-        """To be called when nobody counts in what is gone any more, with the lists of all threads.
+        """Free the indexes of series that are no longer current, given the lists of all threads.
 
-        Counters of what is gone keep what they counted, for nothing that happened may vanish. Those that counted
-        nothing, and what is no counter, vanish, and their slots are free.
+        To be called when no thread counts in them any more. Counters and histograms that have counted something stay,
+        so that totals never decrease.
         """
         lists = list(threads)
-        for first in [series for series in self._slots if series.part == 0 and series not in self._current]:
-            declared, start = _BY_NAME[first.metric], self._slots[first]
-            length = _slots_of(declared)
+        for first in [series for series in self._indexes if series.part == 0 and series not in self._current]:
+            declared, start = _BY_NAME[first.metric], self._indexes[first]
+            length = _length_of(declared)
             run = slice(start, start + length)
             if declared.kind in _COUNTED and any(any(counts[run]) for counts in lists):
                 continue
             for counts in lists:
                 counts[run] = [0] * length
             for part in range(length):
-                del self._slots[Series(first.metric, first.labels, part)]
+                del self._indexes[Series(first.metric, first.labels, part)]
             self._free.setdefault(length, []).append(start)
 
 
 _COUNTED = ("counter", "histogram")
 
 
-def _slots_of(metric: Metric) -> int:
+def _length_of(metric: Metric) -> int:
     return HISTOGRAM_CELLS if metric.kind == "histogram" else 1
 
 

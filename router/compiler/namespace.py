@@ -5,7 +5,7 @@ A value that a field cannot hold raises MappingError.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sized
+from collections.abc import Callable, Mapping, Sized
 from typing import Any, NamedTuple, TypeVar
 
 from router.compiler.cdr.primitives import (
@@ -25,7 +25,8 @@ from router.compiler.cdr.primitives import (
     wide_texts,
 )
 from router.compiler.expressions.functions import FUNCTIONS
-from router.errors import MappingError
+from router.compiler.source import Source
+from router.errors import MappingError, SourceSpan
 
 Values = TypeVar("Values", bound=Sized)
 
@@ -102,3 +103,19 @@ NAMESPACE: Mapping[str, object] = {
     "wide_texts": wide_texts,
     "numbers": numbers,
 }
+
+
+def constant_bytes(write: Callable[[Source], str], span: SourceSpan) -> bytes:
+    """Run now what `write` appends to a function, and return the bytes that its expression gives.
+
+    For plans whose expressions read no message. Raises MappingError, ValueError or struct.error if they give none.
+    """
+    out = Source()
+    with out.block("def build():", span):
+        out.line(f"return {write(out)}", span)
+    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
+    exec(out.compile(span.file), namespace)  # noqa: S102 - code that we made of a checked plan
+    try:
+        return bytes(namespace["build"]())
+    except (ArithmeticError, LookupError) as error:
+        raise MappingError(str(error)) from error

@@ -10,12 +10,10 @@ import ast
 import keyword
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
-from router.compiler.namespace import NAMESPACE
+from router.compiler.namespace import constant_bytes
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.source import Source, attribute, call, load, placed
-from router.errors import MappingError
 from router.types.model import Field, Float
 from router.types.protobuf import PayloadCase
 
@@ -40,20 +38,11 @@ def write_envelope(out: Source, plan: Record, case: PayloadCase, name: str) -> s
 
 
 def constant_envelope(plan: Record, case: PayloadCase) -> bytes:
-    """The envelope of a plan whose expressions have no message to look at.
+    """The envelope of a plan whose expressions read no message.
 
     Raises MappingError or ValueError when it cannot be built.
     """
-    out = Source()
-    with out.block("def build():", plan.span):
-        out.line(f"return {write_envelope(out, plan, case, case.name)}", plan.span)
-    namespace: dict[str, Any] = {**NAMESPACE, **out.constants}
-    exec(out.compile(plan.span.file), namespace)  # noqa: S102 - code that we made of a checked plan
-    try:
-        made: bytes = namespace["build"]()
-    except (ArithmeticError, LookupError) as error:
-        raise MappingError(str(error)) from error
-    return made
+    return constant_bytes(lambda out: write_envelope(out, plan, case, case.name), plan.span)
 
 
 def _envelope(number: int) -> Callable[[bytes], bytes]:

@@ -1,7 +1,6 @@
-"""What the compiler hands on: all handlers, and what must be opened for them.
+"""The compiled table: all handlers, and what must be opened for them.
 
-A program is plain data and code objects. It holds no socket, no publisher and no counter value; `engine`
-binds it to those.
+A program is plain data and code objects; `engine` binds it to sockets, publishers and counts.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
 STRANGER = None
-"""Stands among a handler's sources for a sender that is no endpoint of the table."""
+"""The source of a datagram whose sender is no endpoint of the table."""
 
 
 def source_label(source: str | None) -> str:
@@ -27,7 +26,7 @@ def source_label(source: str | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class QosPlan:
-    """A complete ROS QoS: no None but for durations that are infinite. Durations in ns, rclpy's names."""
+    """A complete ROS QoS, with rclpy's names. Durations in ns; None is infinite."""
 
     reliability: str
     durability: str
@@ -40,7 +39,7 @@ class QosPlan:
 
     @property
     def serves_late_joiners(self) -> bool:
-        """A late subscriber gets the last messages, so they must be published before anybody listens."""
+        """Late subscribers get the last messages, so they must be published also while nobody is subscribed."""
         return self.durability == "transient_local"
 
 
@@ -48,8 +47,8 @@ class QosPlan:
 class TopicPlan:
     """One ROS publisher or subscription: `label` names it in metrics, `topic` is the name that ROS resolves.
 
-    `definitions` are what its CDR bytes are laid out after: of the type itself and of each type nested
-    in it, by name, the fields as rclpy spells them.
+    `definitions` determine the layout of its CDR bytes: by name of the type itself and of each type nested in it, the
+    fields as rclpy spells them.
     """
 
     label: str
@@ -61,15 +60,15 @@ class TopicPlan:
 
 @dataclass(frozen=True, slots=True)
 class TargetPlan:
-    """A target of a generated function: `name` is its part of the Python names, `target` its label.
+    """A target of a generated function: `label` in metrics, `identifier` in the names that the function calls.
 
     `is_deferred` says that it may be served later and by another thread: it has `keep: latest`, or its
-    endpoint has a budget. `deadmen` are the routes whose deadmen hear of each command to it: it feeds that of its own
-    route, and relieves others, which hand over to it.
+    endpoint has a budget. `deadmen` are the routes whose deadmen each command to it feeds (its own route's) or disarms.
+    It holds no positions of the table, since the engine keeps state by it from one table to the next.
     """
 
-    name: str
-    target: str
+    identifier: str
+    label: str
     is_topic: bool
     max_rate: float | None
     keep: Keep = Keep.FIRST
@@ -107,7 +106,7 @@ class InboundPlan:
 
 @dataclass(frozen=True, slots=True)
 class GatewayPlan:
-    """A gateway as the table has it, and what its clients may publish, by topic. The topics are absolute names."""
+    """A gateway, with the topics that its clients may publish on by absolute name."""
 
     settings: Gateway
     inbound: Mapping[str, InboundPlan]
@@ -117,10 +116,10 @@ class GatewayPlan:
 class Handler:
     """One route as generated Python, for a route from ROS one for each of its topics.
 
-    `code` defines the function called `function`. Executed in a namespace that holds `constants` and what the
-    engine binds for `targets` (see engine.binding), it serves one message: a parsed payload, or the CDR bytes
-    from `topic`. `source` is the same as text. `sources` are the endpoints that may send it, perhaps with
-    STRANGER among them; for a route from ROS none. `ttl` and `collect_timeout` in ns, None for none.
+    `code` defines the function called `function`; its namespace needs `constants` and what the engine binds for
+    `targets` (see engine.binding). It serves one message: a parsed payload, or the CDR bytes from `topic`. `source` is
+    its text. `sources` are the endpoints that may send the message, perhaps with STRANGER among them; a route from ROS
+    has none. `ttl` and `collect_timeout` in ns, None for none.
     """
 
     route: str

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from router.compiler.cdr.reading import CdrReads
-from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedRoute, CheckedTarget
+from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.deadmen import check_deadman, deadmen_of
 from router.compiler.expressions import ParsedReads, Scope, Typed
 from router.compiler.expressions.kinds import UINT32, BoolKind, EnumKind, IntKind, ListKind, MessageKind, StringKind
@@ -176,33 +176,27 @@ HEADER = "std_msgs/msg/Header"
 
 
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
-    name = route.name
     if not route.topics:
-        message = f"'{name}' comes from ROS, but from no topic"
+        message = f"'{route.name}' comes from ROS, but from no topic"
         lookup.report(route.span, Code.NO_TARGET, message, "name it under 'topics'")
     if route.topics and not route.destinations:
-        message = f"'{name}' goes to no destination"
+        message = f"'{route.name}' goes to no destination"
         lookup.report(route.span, Code.NO_TARGET, message, "name it under 'destinations'")
     found = destinations(lookup, route, case)
-    feeds = []
+    subscriptions = []
     for topic in route.topics:
-        _subscribed(lookup, route, topic)
+        name = topic.topic.value
+        if next(other for other in route.topics if other.topic.value == name) is not topic:
+            lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{name}' is a topic twice", "name it once")
         ros_type = lookup.ros_type(topic)
-        if ros_type is not None and (feed := _feed(lookup, route, case, topic, ros_type, found)):
-            feeds.append(feed)
-    return CheckedRoute(route, case, feeds=tuple(feeds))
+        if ros_type is not None and (checked := _subscription(lookup, route, case, topic, ros_type, found)):
+            subscriptions.append(checked)
+    return CheckedRoute(route, case, subscriptions=tuple(subscriptions))
 
 
-def _subscribed(lookup: Lookup, route: Route, topic: Topic) -> None:
-    """What a topic may say once."""
-    name = topic.topic.value
-    if next(other for other in route.topics if other.topic.value == name) is not topic:
-        lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{name}' is a topic twice", "name it once")
-
-
-def _feed(
+def _subscription(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
-) -> CheckedFeed | None:
+) -> CheckedSubscription | None:
     """None where it is not known what `item` is: all that names it would only seem wrong."""
     reads = CdrReads(ros_type)
     scope = lookup.scope(ros_type, reads, ros_type)
@@ -232,7 +226,7 @@ def _feed(
             deadmen=deadmen_of(lookup.table, route, destination),
         )
         targets.append(target)
-    return CheckedFeed(topic, ros_type, reads, when, for_each, stamp, tuple(targets))
+    return CheckedSubscription(topic, ros_type, reads, when, for_each, stamp, tuple(targets))
 
 
 def _stamp(scope: Scope, span: SourceSpan) -> Typed | None:

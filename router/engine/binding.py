@@ -109,18 +109,18 @@ def unbind(handle: FunctionType) -> None:
 
 
 def _target_names(target: TargetPlan, handler: Handler, counters: Counters, context: EngineContext) -> dict[str, Any]:
-    name, route = target.name, handler.route
+    name, route = target.identifier, handler.route
     place = route, handler.topic, target
     names: dict[str, Any] = {f"lost_{name}": Outcome(counters, context.counts, route, target, context.report).failed}
     if target.is_topic:
-        names[f"wanted_{name}"] = context.wanted[target.target]
+        names[f"wanted_{name}"] = context.wanted[target.label]
     if target.is_deferred:
         outcome = Outcome(counters, context.pacing.counts, route, target, context.report)
         names[f"deliver_{name}"] = _deliver(place, outcome, context)
     elif target.is_topic:
-        names[f"publish_{name}"] = context.publish[target.target]
+        names[f"publish_{name}"] = context.publish[target.label]
     else:
-        names[f"send_{name}"] = context.send[target.target]
+        names[f"send_{name}"] = context.send[target.label]
         if target.deadmen:
             names[f"feed_{name}"] = context.feed(route, target.deadmen)
     if target.max_rate is not None and target.keep is Keep.FIRST:
@@ -152,14 +152,14 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
     (route, _, target), locked = place, context.pacing.locked
     feed = context.feed(route, target.deadmen) if target.deadmen else None
     destination: object
-    pacer = None if target.is_topic else context.pacers.get(target.target)
+    pacer = None if target.is_topic else context.pacers.get(target.label)
     if pacer is not None:
         destination, deliver = pacer, pacer.queue(target.priority, outcome, feed)
     elif target.is_topic:
-        destination = publish = context.publish[target.target]
+        destination = publish = context.publish[target.label]
         deliver = immediately(publish, outcome, context.publish_errors)
     else:
-        destination = send = context.send[target.target]
+        destination = send = context.send[target.label]
         deliver = immediately(send, outcome, feed=feed)
     if target.keep is Keep.LATEST and target.max_rate is not None:
         rate = target.max_rate

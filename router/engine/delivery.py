@@ -53,18 +53,18 @@ class Outcome:
     def __init__(
         self, counters: Counters, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
     ) -> None:
-        self.place: Place = route, target.target
+        self.place: Place = route, target.label
         self._counts = counts
         self._is_topic = target.is_topic
         self._report = report
         self._dropped = {
-            reason: counters.index("messages_dropped", route, target.target, reason) for reason in DROP_REASONS
+            reason: counters.index("messages_dropped", route, target.label, reason) for reason in DROP_REASONS
         }
-        self._filtered = counters.index("messages_filtered", route, target.target)
+        self._filtered = counters.index("messages_filtered", route, target.label)
         self._delivered = counters.index(
-            "messages_published" if target.is_topic else "datagrams_sent", route, target.target
+            "messages_published" if target.is_topic else "datagrams_sent", route, target.label
         )
-        self._sent_bytes = None if target.is_topic else counters.index("sent_bytes", route, target.target)
+        self._sent_bytes = None if target.is_topic else counters.index("sent_bytes", route, target.label)
 
     def delivered(self, size: int) -> None:
         """Count a message as published, or as sent with `size` bytes."""
@@ -93,7 +93,7 @@ class FrameOutcome(Outcome):
         self, counters: Counters, counts: list[int], route: str, target: TargetPlan, report: Callable[[Report], None]
     ) -> None:
         super().__init__(counters, counts, route, target, report)
-        self._collected = counters.index("messages_collected", route, target.target)
+        self._collected = counters.index("messages_collected", route, target.label)
 
     def collected(self) -> None:
         """Count a message as part of a frame."""

@@ -125,7 +125,7 @@ class Coverage:
         seen = set()
         for checked in self.routes:
             name = checked.route.name
-            served = [*checked.targets, *(target for feed in checked.feeds for target in feed.targets)]
+            served = [*checked.targets, *(target for feed in checked.subscriptions for target in feed.targets)]
             found = [((name, each.label, False), each.span) for each in served]
             if checked.deadman and checked.route.deadman:
                 found += [((name, to.value, True), checked.route.deadman.span) for to in checked.route.deadman.to]

@@ -97,7 +97,7 @@ class Names:
 
     @cached_property
     def _subscribed(self) -> dict[str, MessageType]:
-        return {feed.topic.topic.value: feed.type for route in self.checked.routes for feed in route.feeds}
+        return {feed.topic.topic.value: feed.type for route in self.checked.routes for feed in route.subscriptions}
 
     def _known(self, name: str, known: Iterable[str], span: SourceSpan, what: str, code: Code) -> None:
         names = list(known)

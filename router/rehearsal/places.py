@@ -26,7 +26,7 @@ class Places:
         self._routes = {route.route.name: route for route in checked.routes}
         self._targets: dict[tuple[str, str], list[CheckedTarget]] = {}
         for route in checked.routes:
-            served = [*route.targets, *(target for feed in route.feeds for target in feed.targets)]
+            served = [*route.targets, *(target for feed in route.subscriptions for target in feed.targets)]
             for target in served:
                 self._targets.setdefault((route.route.name, target.label), []).append(target)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from router.compiler import Checked
-from router.compiler.checked import CheckedCollect, CheckedFeed, CheckedRoute, CheckedTarget
+from router.compiler.checked import CheckedCollect, CheckedRoute, CheckedSubscription, CheckedTarget
 from router.compiler.expressions import Typed
 from router.compiler.plan import Each, Items, Leaf, Plan, Record
 from router.compiler.program import Handler, Program
@@ -93,7 +93,7 @@ class _Route:
         return replace(
             checked,
             targets=tuple(map(self._target, checked.targets)),
-            feeds=tuple(map(self._feed, checked.feeds)),
+            subscriptions=tuple(map(self._feed, checked.subscriptions)),
             collect=self._collect(checked.collect) if checked.collect else None,
         )
 
@@ -102,7 +102,7 @@ class _Route:
         assert plan is None or isinstance(plan, Record)  # noqa: S101 - it was one before
         return replace(served, when=self._condition(served.when), plan=plan)
 
-    def _feed(self, feed: CheckedFeed) -> CheckedFeed:
+    def _feed(self, feed: CheckedSubscription) -> CheckedSubscription:
         return replace(
             feed,
             when=self._condition(feed.when),

@@ -58,7 +58,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
     for served in checked.targets:
         yield ""
         yield from _topic(served) if served.topic else _destination(served, checked.route, table, "unchanged")
-    for feed in checked.feeds:
+    for feed in checked.subscriptions:
         yield ""
         yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
         yield _quality(feed.topic)

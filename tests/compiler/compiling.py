@@ -110,8 +110,8 @@ class Published:
     reports: list[Report] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        topics = [target.target for target in self.handler.targets if target.is_topic]
-        endpoints = [target.target for target in self.handler.targets if not target.is_topic]
+        topics = [target.label for target in self.handler.targets if target.is_topic]
+        endpoints = [target.label for target in self.handler.targets if not target.is_topic]
         self.topics = {topic: [] for topic in topics}
         self.sent = {endpoint: [] for endpoint in endpoints}
         self._handle = bind(

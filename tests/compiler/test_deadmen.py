@@ -86,7 +86,7 @@ def test_hand_over_concerns_what_goes_to_the_endpoints_of_the_deadman(check_text
     checked = check_text(TURNS.format(to="board", cases="drive_motor"), endpoints=THREE)
     assert not checked.has_errors
     routes = {checked.route.name: checked for checked in checked.routes}
-    deadman, (feed,) = routes["manual_drive"].deadman, routes["drive_motor"].feeds
+    deadman, (feed,) = routes["manual_drive"].deadman, routes["drive_motor"].subscriptions
     assert deadman is not None
     assert deadman.hands_over_to == ("drive_motor",)
     assert [served.deadmen for served in routes["manual_drive"].targets] == [("manual_drive",)]

@@ -54,9 +54,9 @@ def test_rover_has_every_series_before_the_first_datagram(rover_program: Program
         route = handler.case.name
         for target in handler.targets:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
-            assert Series(delivered, (route, target.target)) in series
-            assert Series("messages_filtered", (route, target.target)) in series
-            assert all(Series("messages_dropped", (route, target.target, reason)) in series for reason in DROP_REASONS)
+            assert Series(delivered, (route, target.label)) in series
+            assert Series("messages_filtered", (route, target.label)) in series
+            assert all(Series("messages_dropped", (route, target.label, reason)) in series for reason in DROP_REASONS)
         for name in ("route_duration_seconds", "route_last_message_timestamp_seconds"):
             assert Series(name, (route,)) in series
 

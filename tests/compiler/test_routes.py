@@ -7,7 +7,7 @@ import ast
 import pytest
 
 from router.compiler import Checked
-from router.compiler.checked import CheckedFeed, CheckedTarget
+from router.compiler.checked import CheckedSubscription, CheckedTarget
 from router.compiler.plan import Leaf, Record
 from router.errors import Code, Diagnostic, Severity
 from router.table.model import Keep, Priority
@@ -83,9 +83,9 @@ def errors(checked: Checked) -> list[str]:
     return [str(finding) for finding in checked.diagnostics if finding.severity is Severity.ERROR]
 
 
-def only_feed(checked: Checked) -> CheckedFeed:
+def only_feed(checked: Checked) -> CheckedSubscription:
     assert errors(checked) == []
-    ((feed,),) = (route.feeds for route in checked.routes)
+    ((feed,),) = (route.subscriptions for route in checked.routes)
     return feed
 
 
@@ -100,7 +100,7 @@ def source_of(plan: Record, name: str) -> str:
     return ast.unparse(made.node)
 
 
-def plan_of(feed: CheckedFeed) -> Record:
+def plan_of(feed: CheckedSubscription) -> Record:
     (served,) = feed.targets
     assert served.plan is not None
     return served.plan
@@ -191,9 +191,9 @@ def test_each_topic_feeds_each_destination(check_text: CheckText) -> None:
     checked = check_text(routes)
     assert errors(checked) == []
     (route,) = checked.routes
-    served = [(feed.topic.topic.value, target.label) for feed in route.feeds for target in feed.targets]
+    served = [(feed.topic.topic.value, target.label) for feed in route.subscriptions for target in feed.targets]
     assert served == [("a", "base"), ("a", "board"), ("b", "base"), ("b", "board")]
-    assert [len(target.rows) for feed in route.feeds for target in feed.targets] == [1, 1, 1, 1]
+    assert [len(target.rows) for feed in route.subscriptions for target in feed.targets] == [1, 1, 1, 1]
 
 
 # destinations
@@ -224,7 +224,7 @@ routes:
 def targets(check_text: CheckText, routes: str, priority: str = "") -> tuple[CheckedTarget, CheckedTarget]:
     said = f"\n    priority: {priority}" if priority else ""
     (route,) = check_text(routes.format(priority=said), endpoints=BOARD_AND_BASE).routes
-    board, base = [*route.targets, *(target for feed in route.feeds for target in feed.targets)]
+    board, base = [*route.targets, *(target for feed in route.subscriptions for target in feed.targets)]
     return board, base
 
 

@@ -29,7 +29,7 @@ def generated(checked: Checked) -> list[Source]:
         if not route.route.is_outbound:
             generator.inbound(route.targets, route.collect)
             made.append(generator.out)
-        for feed in route.feeds:
+        for feed in route.subscriptions:
             generator = HandlerSource(route.route, route.case, Counters())
             generator.outbound(feed)
             made.append(generator.out)

@@ -51,7 +51,7 @@ class Ledger:
         for target in handler.targets:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
             metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected")
-            fates = [self.total(metric, route, target.target) for metric in metrics]
+            fates = [self.total(metric, route, target.label) for metric in metrics]
             if accepted != sum(fates):
                 kinds = "delivered, dropped, filtered, collected"
-                yield f"{route} to {target.target}: accepted {accepted}, but {kinds} {fates}"
+                yield f"{route} to {target.label}: accepted {accepted}, but {kinds} {fates}"
