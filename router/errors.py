@@ -200,7 +200,7 @@ def shown_path(path: Path) -> str:
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The known name that somebody who wrote `name` most likely meant, None when none is near."""
+    """Return the known name that `name` most likely stands for, None when none is near."""
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
     close = difflib.get_close_matches(name.lower(), folded, n=8, cutoff=0.6)
     if not close:

@@ -1,7 +1,4 @@
-"""Findings for people and for machines: text with the source line and a caret, JSON, GitHub annotations.
-
-Knows Diagnostic only; what was checked, and what follows from it, is the verb's business.
-"""
+"""Findings for people and for machines: text with the source line and a caret, JSON, GitHub annotations."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""`router validate PATH...`: everything that is wrong with route tables, before anyone drives.
-
-Needs neither ROS nor a network.
-"""
+"""`router validate PATH...`: every finding of route tables. Needs neither ROS nor a network."""
 
 from __future__ import annotations
 
@@ -52,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class NoTableError(Exception):
-    """A folder that stands for no table at all, which nobody asks to validate on purpose."""
+    """A folder without a table."""
 
 
 def find_tables(paths: Sequence[Path]) -> list[Path]:

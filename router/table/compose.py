@@ -200,6 +200,8 @@ def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
     return start.line, start.column, end.line, end.column
 
 
+# Plain scalars
+
 _WORDS: dict[str, Plain] = {
     **dict.fromkeys(("", "null", "Null", "NULL")),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -255,8 +257,11 @@ def surprise(text: str) -> Surprise | None:
     return next((found for pattern, found in _SURPRISES if pattern.fullmatch(text)), None)
 
 
+# Syntax errors
+
+
 class _Advice(NamedTuple):
-    """`at_start` blames the place where the thing that went wrong began, not the place where it was noticed."""
+    """What is wrong and what to do. With `at_start` the place is where the construct begins."""
 
     what: str
     hint: str = ""

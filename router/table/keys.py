@@ -30,7 +30,7 @@ class Named:
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """How people are told of the key's value, which replaces `{}`; said only where the table has `beside` as well."""
+    """The wording of the key's value, which replaces `{}`; used only where the key `beside` is set as well."""
 
     text: str
     beside: str | None = None
@@ -38,9 +38,9 @@ class Words:
 
 @dataclass(frozen=True, slots=True)
 class Misplaced:
-    """The finding for the key in a route from ROS (`with_ros`), or in any other route; of one class only if it says so.
+    """The finding for the key in a route from ROS (`with_ros`), or in any other route.
 
-    `{key}` in its texts is the name of the key.
+    With a `model`, only for the class of this name. `{key}` in the texts is the name of the key.
     """
 
     with_ros: bool
@@ -118,15 +118,15 @@ def _key(field: Field[Any], hint: Any) -> Key:
 
 
 def phrases(part: Any) -> dict[str, str]:
-    """What is told of a part of the table, by key: `at most 30 Hz` for `max_rate`."""
-    told = {}
+    """The wording of the keys that are set and have one: `at most 30 Hz` for `max_rate`."""
+    words = {}
     for key in keys_of(type(part)):
         value = getattr(part, key.attribute)
         if key.words is None or value is None:
             continue
         if key.words.beside is None or getattr(part, key.words.beside) is not None:
-            told[key.name] = key.words.text.format(key.text(value))
-    return told
+            words[key.name] = key.words.text.format(key.text(value))
+    return words
 
 
 def flat(part: object) -> dict[str, str]:
@@ -157,7 +157,7 @@ def _settings(part: object) -> Iterator[tuple[str, Any, Callable[[Any], str]]]:
 
 
 def _has_keys(value: object) -> bool:
-    """Whether it is a part with keys of its own, and no value with a text of its own."""
+    """Whether the value is a part with keys, not one with a text of its own."""
     return is_dataclass(value) and not isinstance(value, Located) and type(value).__str__ is object.__str__
 
 

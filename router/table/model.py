@@ -518,7 +518,7 @@ class RouteTable:
     `sha256` is over the bytes of `files` in order.
     `broken` names what the table has but is left out here because of findings of its own, as
     `endpoints/arm_board`, so that nobody reports its absence as well. Of a route in it, `routes/imu_info`,
-    there may be the sound part: what is missing there is no finding.
+    there may be the valid part: what is missing there is no finding.
     """
 
     path: Path

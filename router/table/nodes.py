@@ -1,6 +1,6 @@
 """A YAML document as data with positions: scalars, mappings and sequences, each with its span.
 
-`broken` marks what has a finding already, so that nobody reports it again.
+`broken` marks what has a finding already, so that it is not reported again.
 """
 
 from __future__ import annotations
@@ -192,10 +192,10 @@ def _child(node: Node, step: str | int) -> Node:
 _INDISPENSABLE = frozenset(
     {"source", "ignore", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count", "order", "transport"}
 )
-"""Keys without which a route, a topic, a destination, a deadman, a collect or a gateway says nothing."""
+"""Keys without which a route, a topic, a destination, a deadman, a collect or a gateway has no meaning."""
 
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"}, {"transport"})
-"""Keys with which it says something, whatever else it lacks or has too much."""
+"""Sets of keys each of which gives a mapping a meaning, whatever else it lacks or has too much."""
 
 _USES_NAMES_OF = {"for_each": ("fields", "destinations", "topics"), "collect": ("topics",)}
 """Where a route's expressions use names (`item`, `items`) that there are only with this key."""
@@ -212,13 +212,13 @@ def _valid_part(node: Node) -> Node | None:
         return _valid_mapping(node)
     if node.broken:
         return None
-    if isinstance(node, SequenceNode) and any(map(_says_something, node.items)):
+    if isinstance(node, SequenceNode) and any(map(_has_meaning, node.items)):
         return replace(node, items=tuple(part for item in node.items if (part := _valid_part(item))))
     return node if is_valid(node) else None
 
 
 def _valid_mapping(node: MappingNode) -> MappingNode | None:
-    if node.broken and not _says_something(node):
+    if node.broken and not _has_meaning(node):
         return None
     invalid = {key for key, entry in node.entries.items() if not is_valid(entry.value)}
     if invalid & _INDISPENSABLE:
@@ -233,9 +233,9 @@ def _valid_mapping(node: MappingNode) -> MappingNode | None:
 
 
 def _valid_entry(entry: Entry) -> Entry | None:
-    """What stands under a key of a route: broken as a whole it may be a mapping where a list belongs."""
+    """The valid part of an entry; None for one that is broken as a whole, such as a mapping in place of a list."""
     return None if entry.value.broken else valid_part(entry)
 
 
-def _says_something(node: Node) -> bool:
+def _has_meaning(node: Node) -> bool:
     return isinstance(node, MappingNode) and any(keys <= node.entries.keys() for keys in _SUFFICIENT)

@@ -24,10 +24,62 @@ if TYPE_CHECKING:
     from jsonschema.protocols import Validator
 
 SCHEMA = "schemas/route-table.schema.json"
+_TYPES = {
+    "object": "a mapping",
+    "array": "a list",
+    "string": "text",
+    "integer": "a whole number",
+    "number": "a number",
+    "boolean": "true or false",
+}
+_LONGEST = 60
+_ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
+"""Keys under which an address stands."""
+_NAME_DEPTH = len(("endpoints", "name"))
+_HINTS_FOR_MISSING = {
+    "source": "or say 'ignore: why'",
+    "transport": "or say 'ignore: why'",
+    "receive": "what its client publishes has to arrive somewhere",
+}
+_BELONG_TOGETHER = ("envelope", "listen", "routes")
+_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with 'gateways' only needs none of them"
+NAME_FIELDS = ("fields", "send")
+"""Keys under which the names of fields stand, each with an expression."""
+
+
+@dataclass(frozen=True, slots=True)
+class SchemaError:
+    """What of jsonschema's error is used: `value` at `path` fails `keyword: limit` of `schema`.
+
+    With `about_name` the value is the name of the last key of the path.
+    """
+
+    path: Path
+    keyword: str
+    limit: Any
+    value: object
+    schema: Mapping[str, Any]
+    message: str
+    about_name: bool
+
+    @classmethod
+    def of(cls, raised: ValidationError) -> SchemaError:
+        about_name = "propertyNames" in raised.absolute_schema_path
+        path: Path = tuple(raised.absolute_path)
+        if about_name:
+            path = (*path, str(raised.instance))
+        schema = raised.schema if isinstance(raised.schema, Mapping) else {}
+        keyword, limit = str(raised.validator), raised.validator_value
+        return cls(path, keyword, limit, raised.instance, schema, raised.message, about_name)
+
+    @property
+    def is_about_keys(self) -> bool:
+        """The mapping is one, but some of its keys are missing or too many."""
+        return self.keyword in ("required", "additionalProperties")
 
 
 def table_schema() -> dict[str, Any]:
-    """The schema as data, for whoever documents keys."""
+    """The schema as data."""
     return _schema(SCHEMA)
 
 
@@ -152,58 +204,7 @@ def _with_known_keys(node: Node, known: list[str]) -> Node:
     return replace(node, entries=entries, broken=broken)
 
 
-_TYPES = {
-    "object": "a mapping",
-    "array": "a list",
-    "string": "text",
-    "integer": "a whole number",
-    "number": "a number",
-    "boolean": "true or false",
-}
-_LONGEST = 60
-_ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
-"""Keys under which an address stands."""
-_NAME_DEPTH = len(("endpoints", "name"))
-_HINTS_FOR_MISSING = {
-    "source": "or say 'ignore: why'",
-    "transport": "or say 'ignore: why'",
-    "receive": "what its client publishes has to arrive somewhere",
-}
-_BELONG_TOGETHER = ("envelope", "listen", "routes")
-_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with 'gateways' only needs none of them"
-NAME_FIELDS = ("fields", "send")
-"""Keys under which the names of fields stand, each with an expression."""
-
-
-@dataclass(frozen=True, slots=True)
-class SchemaError:
-    """What of jsonschema's error is used: `value` at `path` fails `keyword: limit` of `schema`.
-
-    With `about_name` the value is the name of the last key of the path.
-    """
-
-    path: Path
-    keyword: str
-    limit: Any
-    value: object
-    schema: Mapping[str, Any]
-    message: str
-    about_name: bool
-
-    @classmethod
-    def of(cls, raised: ValidationError) -> SchemaError:
-        about_name = "propertyNames" in raised.absolute_schema_path
-        path: Path = tuple(raised.absolute_path)
-        if about_name:
-            path = (*path, str(raised.instance))
-        schema = raised.schema if isinstance(raised.schema, Mapping) else {}
-        keyword, limit = str(raised.validator), raised.validator_value
-        return cls(path, keyword, limit, raised.instance, schema, raised.message, about_name)
-
-    @property
-    def is_about_keys(self) -> bool:
-        """The mapping is one, but some of its keys are missing or too many."""
-        return self.keyword in ("required", "additionalProperties")
+# Messages
 
 
 def finding(error: SchemaError, tree: Node) -> Diagnostic:
@@ -233,7 +234,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
 
 
 def shown(value: object) -> str:
-    """How a sentence speaks of a value."""
+    """A value as messages name it."""
     if value is None:
         return "empty"
     if isinstance(value, bool):
@@ -306,14 +307,14 @@ def _blamed(tree: Node, path: Path) -> SourceSpan:
 
 
 def _first_line(node: Node) -> SourceSpan:
-    """A collection's first key or item stands for it."""
+    """The span of a scalar, or of a collection's first key."""
     if isinstance(node, MappingNode) and node.entries:
         return next(iter(node.entries.values())).key.span
     return node.span
 
 
 def subject(path: Path) -> str:
-    """How a sentence names what stands at a path."""
+    """What stands at a path, as messages name it."""
     names = [step for step in path if isinstance(step, str)]
     if not names:
         return "the table"

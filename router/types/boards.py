@@ -36,7 +36,7 @@ _TYPES = {"FT_DEFAULT": True, "FT_STATIC": True, "FT_INLINE": True, "FT_CALLBACK
 
 @dataclass(frozen=True, slots=True)
 class BoardOptions:
-    """What nanopb is told about one field. Sizes in bytes, a string's with its final NUL.
+    """nanopb's options of one field. Sizes in bytes, a string's with its final NUL.
 
     `is_static` is False where the board holds the field by pointer or callback, which has no bound.
     """
@@ -144,6 +144,9 @@ _FIXED = {
     FieldDescriptor.TYPE_UINT32: 5,
     FieldDescriptor.TYPE_UINT64: 10,
 }
+
+
+# Sizes
 
 
 @dataclass(frozen=True, slots=True)

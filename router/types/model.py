@@ -1,7 +1,4 @@
-"""One type model for both sides: protobuf messages and ROS interfaces, seen by the compiler alike.
-
-Knows neither descriptors nor `.msg` files; `types.protobuf` and `types.ros` build it.
-"""
+"""One type model for protobuf messages and ROS interfaces. `types.protobuf` and `types.ros` build it."""
 
 from __future__ import annotations
 

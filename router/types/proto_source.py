@@ -22,7 +22,7 @@ _WORD = re.compile(rb'"[^"\n]*"?|[\w.]+|.')
 
 
 class ProtoText:
-    """Read only when somebody asks for a place. protoc counts lines and columns from 0."""
+    """The lines of a file, read when first needed. protoc counts lines and columns from 0."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

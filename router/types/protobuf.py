@@ -145,9 +145,9 @@ def load_protos(
         raise TableError(faults)
     compiled = compile_protos(folder, [file], homes)
     names = [each.name for each in compiled.file]
-    warnings, sound = _check_others(folder, names)
-    if with_others and sound:
-        compiled = compile_protos(folder, [*names, *sound], homes)
+    warnings, valid = _check_others(folder, names)
+    if with_others and valid:
+        compiled = compile_protos(folder, [*names, *valid], homes)
         names = [each.name for each in compiled.file]
     findings = _same_name_findings(folder, compiled, homes)
     options = {}
@@ -196,17 +196,17 @@ def _check_others(folder: Folder, compiled: Sequence[str]) -> tuple[list[Diagnos
     """A warning for each file that was not compiled and has faults, and the `.proto` files among them without any."""
     unused = [faults for name, faults in folder.faults.items() if _proto_of(name) not in compiled]
     warnings = [_unused(faults[0], len(faults)) for faults in unused]
-    sound = [name for name in folder.protos if name not in compiled and name not in folder.faults]
-    if not sound:
+    valid = [name for name in folder.protos if name not in compiled and name not in folder.faults]
+    if not valid:
         return warnings, []
-    complaints = check_protos(folder, compiled, sound)
+    complaints = check_protos(folder, compiled, valid)
     news = [complaint for complaint in complaints if complaint.file not in folder.faults]
     files: dict[str, list[Diagnostic]] = {}
     for finding in findings_of(news, folder, {}):
         files.setdefault(finding.span.file, []).append(finding)
     warnings += [_unused(findings[0], len(findings)) for findings in files.values()]
     broken = {complaint.file for complaint in complaints}
-    return warnings, [name for name in sound if name not in broken]
+    return warnings, [name for name in valid if name not in broken]
 
 
 def _unused(finding: Diagnostic, count: int = 1) -> Diagnostic:

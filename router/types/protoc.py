@@ -99,7 +99,7 @@ def _finding(complaint: Complaint, files: Mapping[str, bytes], text: ProtoText) 
     if complaint.line < 0:
         return Diagnostic(SourceSpan(shown_path(text.path)), Code.BAD_PROTO, complaint.message.rstrip("."))
     span = text.word(complaint.line, complaint.column)
-    if reserved := _RESERVED.match(complaint.message):  # protoc blames the `reserved`, not who breaks it
+    if reserved := _RESERVED.match(complaint.message):  # protoc reports the `reserved`, not the field
         span = text.nearest(rf"\b{reserved['field']}\s*=\s*{reserved['number']}\b", complaint.line) or span
     if missing := _IMPORT_FAILED.fullmatch(complaint.message):
         others = files.keys() - {complaint.file, *scan(files.get(complaint.file, b"")).imports}

@@ -152,7 +152,7 @@ class RosInterfaces:
         return self._get(name, ())
 
     def names(self) -> Collection[str]:
-        """Every name that `get` knows, for did-you-mean; reads folders, so ask when something is wrong."""
+        """Every name that `get` knows, for did-you-mean. Lists folders: for findings only."""
         return {*self._files.names(), *self._rosbags.names()}
 
     def _get(self, name: str, inside: tuple[str, ...]) -> MessageType | None:
@@ -219,4 +219,4 @@ def _spelled(type_: Type) -> str:
     if not isinstance(type_, MessageType):
         raise TypeError(f"ROS has no type {type_}")
     package, _, rest = type_.name.partition("/")
-    return f"{package}/{rest.rpartition('/')[2]}"  # whether it belongs to a service or action is not told
+    return f"{package}/{rest.rpartition('/')[2]}"  # without `msg`, `srv` or `action`
