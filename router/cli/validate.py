@@ -10,9 +10,10 @@ from pathlib import Path
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
 from router.cli.findings import FORMATS, count_line, print_findings, severity
+from router.cli.tool_options import explained
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.errors import Diagnostic, Severity, shown_path
+from router.errors import Diagnostic, Severity, UsageError, shown_path
 from router.table import summary
 
 DEFAULT = Path("routes")
@@ -28,12 +29,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--strict", action="store_true", help="take warnings for errors")
 
 
+@explained
 def run(args: argparse.Namespace) -> int:
-    try:
-        tables = find_tables(args.paths or [DEFAULT])
-    except NoTableError as error:
-        print(f"router validate: {error}", file=sys.stderr)
-        return BAD_USAGE
+    tables = find_tables(args.paths or [DEFAULT])
     findings: dict[Diagnostic, None] = {}  # tables that extend the same one share its findings
     definitions = Definitions()
     for path in tables:
@@ -48,12 +46,8 @@ def run(args: argparse.Namespace) -> int:
     return BAD_TABLE if wrong else OK
 
 
-class NoTableError(Exception):
-    """A folder without a table."""
-
-
 def find_tables(paths: Sequence[Path]) -> list[Path]:
-    """The files that the paths stand for, each once. Raises NoTableError; a file need not exist."""
+    """The files that the paths stand for, each once. Raises UsageError; a file need not exist."""
     tables: dict[Path, None] = {}
     for path in paths:
         if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises where a folder above is not ours to read)
@@ -62,9 +56,9 @@ def find_tables(paths: Sequence[Path]) -> list[Path]:
         try:
             found = sorted(file for file in path.iterdir() if _is_table(file))
         except OSError as error:
-            raise NoTableError(f"the folder '{path}' cannot be read: {error.strerror}") from error
+            raise UsageError(f"the folder '{path}' cannot be read: {error.strerror}") from error
         if not found:
-            raise NoTableError(f"the folder '{path}' has no route table (*.yaml, *.yml)")
+            raise UsageError(f"the folder '{path}' has no route table (*.yaml, *.yml)")
         tables.update(dict.fromkeys(found))
     return list(tables)
 

@@ -58,6 +58,5 @@ def summary(table: RouteTable) -> str:
         "endpoint": len(table.endpoints),
         "gateway": len(table.gateways),
     }
-    return (
-        ", ".join(f"{count} {noun}{'s' * (count != 1)}" for noun, count in counts.items() if count) or "nothing to do"
-    )
+    named = [f"{count} {noun}{'s' * (count != 1)}" for noun, count in counts.items() if count]
+    return ", ".join(named) or "nothing to do"
