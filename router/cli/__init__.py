@@ -1,6 +1,6 @@
 """The command line: which verbs there are. A verb's module is imported once the verb is chosen.
 
-Knows no verb's work. A verb's module offers `add_parser(subparsers)` and `run(args) -> int`.
+A verb's module offers `add_parser(subparsers)` and `run(args) -> int`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ VERBS = {
 
 
 class _Version(argparse.Action):
-    """Reads the version only when somebody asks for it: importlib.metadata is slow to import."""
+    """Reads the version on demand, since importlib.metadata is slow to import."""
 
     def __call__(self, parser: argparse.ArgumentParser, *rest: object) -> None:
         from importlib.metadata import version

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def shown(result: CheckResult, *, coloured: bool) -> str:
-    """A line, and another one with what to do."""
+    """One line, and a second one with the remedy."""
     grade = f"{result.grade.value:8}"
     if coloured:
         grade = f"{_STYLES[result.grade]}{grade}{_RESET}"

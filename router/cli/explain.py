@@ -22,7 +22,7 @@ largest sizes, and the code that the router runs. Of a gateway, show what it sen
 a ~ in front each topic that its patterns match, of those that the table names, or with --live of all that there are.
 With --diff, say what one table does otherwise than another, and nothing else."""
 _LIVE = 2.0
-"""Seconds that ROS takes at most, as a rule, until a new node knows the others."""
+"""Seconds that discovery takes at most, as a rule."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

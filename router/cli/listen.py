@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
-    """A function that appends a line to the file, which has it when it returns."""
+    """A function that appends a line to the file, unbuffered."""
     from router.tools.gateway_messages import json_line
 
     if path is None:
@@ -106,7 +106,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
 
 
 def _printer(as_json: bool) -> Callable[[Heard], None]:
-    """Colours, and lines cut at the border, for a terminal alone."""
+    """A function that prints; on a terminal with colours and lines cut to its width."""
     from router.tools.gateway_messages import json_line, pieces
 
     if as_json:

@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(table: Path) -> list[Checked]:
-    """The table, and those beside it."""
+    """Check the table, and those beside it."""
     from router.cli.validate import find_tables
     from router.compiler import check_table
     from router.compiler.lookup import Definitions
@@ -95,7 +95,7 @@ def _site(checked: Checked) -> Site:
 
 
 def _news(before: Sequence[Checked], after: Sequence[Checked]) -> list[Diagnostic]:
-    """What is said of the tables now and was not before, by what it says: lines have moved."""
+    """Findings that are new, compared by message, since lines have moved."""
     known = {(finding.code, finding.message) for checked in before for finding in checked.diagnostics}
     found = {finding: None for checked in after for finding in checked.diagnostics}
     return [finding for finding in found if (finding.code, finding.message) not in known]

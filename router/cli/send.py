@@ -57,14 +57,14 @@ def run(args: argparse.Namespace) -> int:
     origin = udp.origin(args.origin, table) if args.origin else udp.ANYWHERE
     count = args.count if args.count is not None else None if args.rate else 1
     sent = Sent()
-    # A flood without --count ends with Ctrl-C; what was sent until then is told below.
+    # Without --count it ends with Ctrl-C, and then reports what was sent.
     with udp.open_udp(origin, "--from") as sender, contextlib.suppress(KeyboardInterrupt):
         send(sender, to, data, count, args.rate, sent)
-    print(_told(args.case, data, to, sent))
+    print(_summary(args.case, data, to, sent))
     return _advise(args, table, to, sent)
 
 
-def _told(case: str, data: bytes, to: Address, sent: Sent) -> str:
+def _summary(case: str, data: bytes, to: Address, sent: Sent) -> str:
     if sent.count == 1:
         return f"sent {case} to {to}: {len(data)} bytes {data.hex()}"
     rate = f" in {sent.seconds:.2f} s ({sent.rate:.1f}/s)" if sent.rate else ""

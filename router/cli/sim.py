@@ -85,7 +85,7 @@ def _show_json(simulator: Simulator, view: SimView, args: argparse.Namespace) ->
 
 
 def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
-    """A line now and then, and one for each change of a board."""
+    """A line every LINE_REFRESH seconds, and one for each change of a board."""
     shown, due = 0.0, LINE_REFRESH
 
     def write(seconds: float) -> None:
@@ -105,7 +105,7 @@ def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -
 
 
 def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
-    """In place on the whole screen; the summary stays when it ends."""
+    """In place on the whole screen; the summary stays at the end."""
     from rich.console import Console, Group
     from rich.live import Live
     from rich.text import Text

@@ -1,7 +1,4 @@
-"""What the tools' verbs share: the options that find the envelope or a running router, numbers in range, progress.
-
-Knows no verb.
-"""
+"""Shared by verbs: options that find the envelope or a running router, numbers in range, a progress display."""
 
 from __future__ import annotations
 
@@ -53,7 +50,7 @@ def add_url_option(parser: argparse.ArgumentParser) -> None:
 
 
 def running_url(args: argparse.Namespace) -> str:
-    """By what is sound of the table: it may have errors, and one address is all that is wanted. Raises UsageError."""
+    """The URL from --url or from the table, which may have errors elsewhere. Raises UsageError."""
     from router.table import load_table
     from router.tools.running_router import url_of
 
@@ -66,17 +63,17 @@ def running_url(args: argparse.Namespace) -> str:
 
 
 def explained(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
-    """A verb whose errors are one line: exit code 2 for what was typed, 1 for what the network did."""
+    """Decorate a verb to print errors as one line: exit code 2 for usage, 1 for the network."""
 
     @functools.wraps(run)
-    def explaining(args: argparse.Namespace) -> int:
+    def explained_run(args: argparse.Namespace) -> int:
         try:
             return run(args)
         except (UsageError, TransportError) as error:
             print(f"router {args.verb}: {error}", file=sys.stderr)
             return BAD_USAGE if isinstance(error, UsageError) else 1
 
-    return explaining
+    return explained_run
 
 
 def positive(text: str) -> float:
@@ -97,7 +94,7 @@ def whole(text: str) -> int:
 def progress(
     columns: Callable[[], Iterable[ProgressColumn]], total: int | None = None
 ) -> Iterator[Callable[..., None]]:
-    """Shows `columns` of rich's on stderr, where somebody looks, and gives what updates them: `tell(completed=7)`."""
+    """Show `columns` of rich on stderr if it is a terminal; the value updates them: `tell(completed=7)`."""
     if not sys.stderr.isatty():
         yield lambda **_: None
         return
@@ -109,7 +106,7 @@ def progress(
 
         def tell(**news: Any) -> None:
             nonlocal told
-            if news != told:  # mostly nothing: it is told with each datagram
+            if news != told:  # called for each datagram, mostly without a change
                 told = news
                 shown.update(task, **news)
 

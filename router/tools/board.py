@@ -1,4 +1,4 @@
-"""Simulated endpoints: what they make of the datagrams that they receive. Times are seconds since the start."""
+"""What simulated endpoints do with the datagrams that they receive. Times are seconds since the start."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from router.types.model import MessageType
 from router.values import compact
 
 TIMEOUT = 1.0
-"""Seconds without a command after which a board stops by itself: it trusts no router."""
+"""Seconds without a command after which a board stops on its own."""
 
 MISSED_REPEATS = 3
-"""A deadman that was not heard for so many of its repeats has let go."""
+"""A deadman has ended when this many of its repeats are missing."""
 
 
 class State(enum.Enum):
@@ -42,7 +42,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A board's state has changed: when, in seconds since the start, and in which words."""
+    """A change of a board's state, with its time and its description."""
 
     at: float
     board: str
@@ -54,7 +54,7 @@ class Change:
 
 
 def command_cases(table: RouteTable, board: str) -> frozenset[str]:
-    """The payload cases that the table sends to a board, but for those that it calls less than commands."""
+    """The payload cases that the table sends to a board with the priority of commands."""
     return frozenset(
         route.case.value
         for route in table.routes
@@ -64,7 +64,7 @@ def command_cases(table: RouteTable, board: str) -> frozenset[str]:
 
 
 def stops_for(wire: Wire, deadmen: Iterable[DeadmanPlan], board: str) -> list[Stop]:
-    """What the deadmen of a program send to this board."""
+    """The payloads that the deadmen of a program send to this board."""
     return [
         Stop(decoded.case.name, decoded.message, MISSED_REPEATS * plan.repeat / 1e9)
         for plan in deadmen
@@ -77,8 +77,8 @@ def stops_for(wire: Wire, deadmen: Iterable[DeadmanPlan], board: str) -> list[St
 class Board:
     """Obeys `commands`, halts for `stops`, and stops when neither came for TIMEOUT seconds.
 
-    A halt ends with the first command after the deadman has let go: commands of another route may go on meanwhile.
-    `changed` hears of every new state.
+    A halt ends with the first command after the deadman has ended, since commands of other routes may continue.
+    `changed` is called with every new state.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Board:
         self._halt = ""
 
     def take(self, now: float, decoded: Decoded) -> None:
-        """A datagram has arrived."""
+        """Process a received datagram."""
         case, message = decoded.case, decoded.message
         stop = next((stop for stop in self._stops if stop.case == case.name and stop.message == message), None)
         if stop is not None:
@@ -108,12 +108,12 @@ class Board:
                 self._become(now, State.OBEYING)
 
     def advance(self, now: float) -> None:
-        """Time has passed."""
+        """Check for missing commands."""
         if self.state in (State.OBEYING, State.HALTED) and now - self._commanded_at >= TIMEOUT:
             self._become(now, State.STOPPED)
 
     def status(self, now: float) -> str:
-        """The state in words."""
+        """The state as text for people."""
         if self.state is State.WAITING:
             return "no commands yet"
         if self.state is State.STOPPED:
@@ -161,7 +161,7 @@ def is_part(kind: MessageType) -> bool:
 
 
 class Frames(PartOutcome):
-    """Counts the frames of one payload case. `astray` are parts whose numbers fit no frame."""
+    """Counts the frames that a simulated basestation assembles of one payload case. `astray` are parts of no frame."""
 
     def __init__(self) -> None:
         self.complete = 0
@@ -170,7 +170,7 @@ class Frames(PartOutcome):
         self._collector = Collector(FRAME_TIMEOUT, [self])
 
     def take(self, now: int, part: Any) -> None:
-        """A payload that `is_part`; monotonic ns."""
+        """Add a part; `now` in monotonic ns."""
         try:
             whole = self._collector.offer(now, part.frame_id, part.total_count, part.index, part)
         except MappingError:
@@ -179,16 +179,14 @@ class Frames(PartOutcome):
             self.complete += whole is not None
 
     def advance(self, now: int) -> None:
-        """Time has passed."""
+        """Give up frames that are overdue."""
         self._collector.due(now)
 
-    # what becomes of the parts, as the collector says
-
     def collected(self) -> None:
-        """A part is no frame yet."""
+        """A part that does not complete its frame."""
 
     def filtered(self) -> None:
-        """Nor is a copy of one."""
+        """A duplicate part."""
 
     def dropped(self, reason: str, *, detail: str) -> None:
         self.incomplete += 1
@@ -196,7 +194,7 @@ class Frames(PartOutcome):
 
 @dataclass(slots=True)
 class Arrivals:
-    """What was received of one payload case: the newest message and when, and how many."""
+    """The newest message of one payload case, its time, and how many were received."""
 
     last: Message
     at: float
@@ -204,7 +202,7 @@ class Arrivals:
 
 
 class Inbox:
-    """`arrivals` and `frames` are by payload case. `board` is None where commands mean nothing: the basestation."""
+    """What one endpoint has received. `arrivals` and `frames` are by payload case; a basestation has no `board`."""
 
     def __init__(self, wire: Wire, board: Board | None) -> None:
         self.board = board
@@ -231,7 +229,7 @@ class Inbox:
             self.frames.setdefault(case.name, Frames()).take(_nanoseconds(now), message)
 
     def advance(self, now: float) -> None:
-        """Time has passed: commands may be missing, frames incomplete."""
+        """Check for missing commands and incomplete frames."""
         if self.board is not None:
             self.board.advance(now)
         for frames in self.frames.values():

@@ -1,6 +1,6 @@
 """What keeps a router from working on this computer, and what to do about it.
 
-`examine` goes from what is needed first, the table, to what only a running router can tell.
+`examine` checks the table first, then this computer, then the running router if there is one.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
 
 
 _SHOWN = 3
-"""Targets that are named for each reason of losses."""
+"""Targets that are named for each reason of a loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,12 +182,12 @@ class Health:
 
 
 def health(program: Program) -> Health | None:
-    """None where nobody answers, or another program, and where the table does not say at which address."""
+    """The health of the running router. None if none answers, or the table has no `metrics.address`."""
     table = program.table
     if table.metrics is None:
         return None
     try:
         snapshot = parse_metrics(*metrics(url_of(table)))
-    except (TransportError, ValueError, KeyError):  # nobody, or somebody else
+    except (TransportError, ValueError, KeyError):  # no answer, or another program's
         return None
     return Health(table, snapshot, snapshot.at) if snapshot.values else None

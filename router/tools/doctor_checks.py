@@ -46,7 +46,7 @@ def fine(about: str, text: str) -> CheckResult:
 
 
 def warning(about: str, text: str, remedy: str) -> CheckResult:
-    """Something works worse than it could, or will not work for somebody."""
+    """Something works worse than it could, or not for everybody."""
     return CheckResult(Grade.WARNING, about, text, remedy)
 
 
@@ -58,7 +58,7 @@ def problem(about: str, text: str, remedy: str) -> CheckResult:
 RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 
 _BUILT = datetime(2025, 1, 1, tzinfo=timezone.utc)
-"""A clock that says less was never set."""
+"""A clock that shows an earlier time was never set."""
 
 _TIMEX = struct.Struct("@i4xqqqqi")
 """The beginning of Linux's struct timex: modes, offset, freq, maxerror, esterror, status."""
@@ -67,13 +67,13 @@ _UNSYNCHRONISED = 0x40
 
 
 def receive_buffers(program: Program) -> Iterator[CheckResult]:
-    """Whether a burst has the room that the table wants for it."""
+    """Check that the kernel grants the receive buffers of the table."""
     if not program.listeners:
         return
     wanted = max(listener.receive_buffer for listener in program.listeners)
     try:
         allowed = int(RMEM_MAX.read_text())
-    except FileNotFoundError:  # in a container with a network of its own
+    except FileNotFoundError:  # in a container
         what = "the kernel does not say here how large receive buffers may be"
         yield warning("buffers", what, "run this on the host as well; the router's log says when it got less")
         return
@@ -89,12 +89,12 @@ def receive_buffers(program: Program) -> Iterator[CheckResult]:
 
 
 def recordings(program: Program) -> Iterator[CheckResult]:
-    """Whether there is a place for them, and room for as many as the table keeps."""
+    """Check that the directory is writable and has room for what the table keeps."""
     settings = program.table.record
     if settings is None:
         return
     directory = settings.directory.resolve()
-    # os.path, since Path.exists raises where a folder above is not ours to read.
+    # os.path, since Path.exists raises if a folder above is not readable.
     there = next(folder for folder in (directory, *directory.parents) if os.path.exists(folder))  # noqa: PTH110
     if not there.is_dir():
         remedy = "move that file away, or give `record` another directory"
@@ -120,7 +120,7 @@ def recordings(program: Program) -> Iterator[CheckResult]:
 
 
 def clock(now: datetime | None = None, status: int | None = None) -> Iterator[CheckResult]:
-    """`ttl` compares stamps of computers, so their clocks have to agree. Other arguments than none are for tests."""
+    """Check that the clock is synchronised, as `ttl` needs. Tests give the arguments."""
     now = now or datetime.now(timezone.utc)
     status = _clock_status() if status is None else status
     if now < _BUILT:
@@ -138,7 +138,7 @@ def clock(now: datetime | None = None, status: int | None = None) -> Iterator[Ch
 
 
 def _clock_status() -> int | None:
-    """The status bits of adjtimex; None where it may not be asked."""
+    """The status bits of adjtimex; None if not permitted."""
     timex = ctypes.create_string_buffer(_TIMEX_BYTES)
     if ctypes.CDLL(None).adjtimex(timex) < 0:
         return None
@@ -146,7 +146,7 @@ def _clock_status() -> int | None:
 
 
 def shared_memory(variables: Mapping[str, str], folder: Path = SHM) -> Iterator[CheckResult]:
-    """Fast DDS shares memory with processes of its own user only, and tells nobody of what it could not hand over."""
+    """Warn of nodes of several users: between these, Fast DDS's shared memory loses messages silently."""
     owners = {each.stat().st_uid for each in folder.glob("fastrtps_port*") if not each.name.endswith("_el")}
     if len(owners) > 1 or (owners - {os.geteuid()} and variables.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4"):
         yield warning(
@@ -172,11 +172,11 @@ _ECHO, _ECHO_REPLY = 8, 0
 _ICMP = struct.Struct("!BBHHH")
 
 _KEEPS = "systemd"
-"""The name of the process that keeps the ports of an installed service."""
+"""The process that holds the ports of an installed service."""
 
 
 def ports(program: Program, *, running: bool, with_listeners: bool = True) -> Iterator[CheckResult]:
-    """Whether the router can have its ports. With a router `running` they are taken, and should be."""
+    """Check that the router can bind its ports, unless it is `running` already."""
     if running:
         yield fine("ports", "the running router has them")
         return
@@ -192,7 +192,7 @@ def ports(program: Program, *, running: bool, with_listeners: bool = True) -> It
 
 
 def interfaces(program: Program) -> Iterator[CheckResult]:
-    """Whether the network interfaces of listeners are there and up."""
+    """Check that the network interfaces of listeners exist and are up."""
     for listener in program.listeners:
         if listener.interface is None:
             continue
@@ -212,7 +212,7 @@ def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
 
 
 def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:
-    """What gateways bind. Of Zenoh's locators those of tcp; a name or IPv6 in one is not looked at."""
+    """What gateways bind: (protocol, address, owner). Of Zenoh's locators only those of tcp with an IPv4 address."""
     for gateway in program.table.gateways.values():
         what = f"gateway '{gateway.name}'"
         if gateway.receive is not None:
@@ -229,13 +229,13 @@ def _port(protocol: str, address: Address, interface: str | None, what: str, wai
     """`waits`: whether the router waits for an address that no interface has yet."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM if protocol == "udp" else socket.SOCK_STREAM) as probe:
         if protocol == "tcp":
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as a server has it
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do
         try:
             if interface is not None:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, interface.encode())
             probe.bind(address)
         except OSError as error:
-            if error.errno == errno.ENODEV:  # `interfaces` tells
+            if error.errno == errno.ENODEV:  # `interfaces` reports it
                 return
             yield from _refused(protocol, address, what, error, waits)
 
@@ -263,7 +263,7 @@ def _refused(protocol: str, address: Address, what: str, error: OSError, waits: 
 
 
 def endpoints(program: Program) -> Iterator[CheckResult]:
-    """Whether a network leads to each endpoint, and whether there is somebody."""
+    """Check that each endpoint has a route and answers a ping."""
     reachable = {}
     for endpoint in program.table.endpoints.values():
         address = endpoint.address.value
@@ -296,12 +296,12 @@ def _no_way(address: Address) -> str | None:
 
 
 def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
-    """Those of `hosts` that answer a ping in time. Raises PermissionError where this user may not ask."""
+    """Those of `hosts` that answer a ping in time. Raises PermissionError if this user may not ping."""
     answered: set[str] = set()
     with _open_ping() as pinging:
         request = _request(os.getpid() & 0xFFFF)
         for host in hosts:
-            with suppress(OSError):  # no way there after all
+            with suppress(OSError):  # unreachable
                 pinging.sendto(request, (host, 0))
         deadline = monotonic() + patience
         while answered != hosts and (left := deadline - monotonic()) > 0:
@@ -318,7 +318,7 @@ def answering(hosts: set[str], patience: float = PATIENCE) -> set[str]:
 
 
 def _open_ping() -> socket.socket:
-    """Of the kind that everybody may have where the system allows that, else of the kind that root may have."""
+    """An unprivileged ICMP socket if the system allows it, else a raw one."""
     try:
         return socket.socket(socket.AF_INET, socket.SOCK_DGRAM, socket.IPPROTO_ICMP)
     except PermissionError:
@@ -326,7 +326,7 @@ def _open_ping() -> socket.socket:
 
 
 def _request(identity: int) -> bytes:
-    """With a checksum, which the kernel puts in anew where the socket is not raw."""
+    """An echo request with its checksum, which raw sockets need."""
     total = (_ECHO << 8) + identity + 1
     return _ICMP.pack(_ECHO, 0, 0xFFFF - (total % 0xFFFF), identity, 1)
 
@@ -337,7 +337,7 @@ def ros(program: Program) -> Iterator[CheckResult]:
         return
     found = [problem("ROS", what, remedy) for what, remedy in obstacles(os.environ)]
     yield from found
-    if found:  # to load it would end this process
+    if found:  # loading it would end this process
         return
     try:
         from router.ros.node import middleware
@@ -363,7 +363,7 @@ def ros(program: Program) -> Iterator[CheckResult]:
 
 
 def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[CheckResult]:
-    """Whether whoever reaches this computer by a network is in the ROS domain without having to look for it."""
+    """Warn if the ROS domain is open to the networks of this computer."""
     if not (program.publishers or program.subscriptions or program.gateways):
         return
     found_everywhere = variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "") in ("", "SUBNET", "SYSTEM_DEFAULT")

@@ -70,7 +70,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:
-    """What holds for the whole route."""
+    """Settings of the whole route."""
     route, deadman = checked.route, checked.deadman
     if route.ttl is not None:
         yield f"  dropped when older than {duration(route.ttl.value)}"
@@ -134,7 +134,7 @@ def _topic(served: CheckedTarget) -> Iterator[str]:
 
 
 def _served(served: CheckedTarget) -> Iterator[str]:
-    """What a target is served with, and when."""
+    """The condition, rate and mapping of a target."""
     words = phrases(served.declared)
     if when := words.pop("when", None):
         yield f"    {when}"
@@ -146,7 +146,7 @@ def _served(served: CheckedTarget) -> Iterator[str]:
 
 
 def _mapping(rows: Sequence[Row]) -> Iterator[str]:
-    """One line a field; an expression that is long pushes only what stands behind it."""
+    """One line a field, in columns; a long expression shifts only what follows it."""
     cells = [(row.target, row.target_type, row.expression, f": {row.kind}", "auto" * row.automatic) for row in rows]
     widths = [min(max(map(len, column)), _WIDEST_CELL) for column in zip(*cells, strict=True)]
     for target, type_, expression, kind, automatic in (
@@ -156,7 +156,7 @@ def _mapping(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _unset(plan: Plan, prefix: str) -> Iterator[str]:
-    """The fields that nothing fills; a message of which nothing is filled counts as one."""
+    """The fields that nothing fills; a message without any filled field counts as one."""
     match plan:
         case Unset():
             yield prefix
@@ -216,7 +216,7 @@ def _transport(gateway: Gateway) -> str:
 
 
 def _configured(zenoh: ZenohSettings) -> list[str]:
-    """By what: never the values, of which some are secret."""
+    """The file or the keys that configure it; values may be secret."""
     if zenoh.config is None:
         return []
     if zenoh.config.path is not None:
@@ -285,18 +285,18 @@ def _constants(entry: CheckedInbound) -> str:
 
 
 Topics = Mapping[str, str]
-"""What is known of topics, by absolute name: types, and how many publish them where somebody looked."""
+"""Known topics by absolute name: their type, and with `--live` the number of publishers."""
 
 
 def known_topics(table: RouteTable) -> Topics:
-    """What routes and gateways of the table publish or subscribe to."""
+    """The topics that routes and gateways of the table publish or subscribe to."""
     topics = [topic for route in table.routes for topic in route.topics]
     topics += [inbound.topic for gateway in table.gateways.values() for inbound in gateway.inbound]
     return {resolved(topic.topic.value, table.node): topic.type.value for topic in topics}
 
 
 def seen_topics(table: RouteTable, seconds: float) -> Topics:
-    """The same with all that a node has discovered after so long. Raises StartError."""
+    """The same, and all topics that a node discovers in `seconds`. Raises StartError."""
     check_environment(os.environ)
     try:
         from router.ros.node import close_node, open_node
@@ -315,7 +315,7 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
 
 
 def _publishers(types: Iterable[str]) -> str:
-    """That which gateways choose first."""
+    """Types with their number of publishers, the one that gateways choose first."""
     return ", ".join(f"{name} of {times}" for name, times in by_frequency(types).items())
 
 

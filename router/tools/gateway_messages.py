@@ -11,10 +11,10 @@ from router.gateway.packets import HEAD, Packet, PacketError, decompress, unpack
 from router.values import SHOWN_ELEMENTS, Tree, list_text, one_line, plain_text, words
 
 MOST_TEXT = 256 << 20
-"""Bytes of the longest message that a gateway can be told to send."""
+"""Bytes of the longest message that a gateway can be configured to send."""
 
 _MOST_DEEP = 64
-"""Lists and objects within each other. Messages have a few."""
+"""Nesting of lists and objects that is accepted."""
 
 
 class Shape(NamedTuple):
@@ -50,13 +50,13 @@ class Schema(NamedTuple):
 
 
 class Remark(NamedTuple):
-    """A document that is neither: which topics there are, what is taken, what was refused."""
+    """Any other document: the list of topics, an acknowledgement, a rejection."""
 
     document: Mapping[str, Any]
 
 
 class Problem(NamedTuple):
-    """Bytes that mean nothing, and why."""
+    """Bytes that cannot be decoded, and why."""
 
     reason: str
     data: bytes
@@ -66,7 +66,7 @@ Heard = Union[Message, Schema, Remark, Problem]
 
 
 def read(data: bytes) -> Message | Schema | Remark:
-    """What a packet or document says. Raises PacketError."""
+    """Decode a packet or a document. Raises PacketError."""
     # At a packet's ninth byte is 0 or 1, which no text has.
     if data[:1] == b"{" and (len(data) < HEAD.size or data[HEAD.size - 1] > 1):
         return _document(_object(data))
@@ -82,7 +82,7 @@ def _packet(packet: Packet) -> Message | Schema:
 
 
 def _is_schema(content: Mapping[str, Any]) -> bool:
-    """Nothing else tells. In a message these would be lists, all three."""
+    """Whether it is a schema; in a message all three values would be lists."""
     return content.keys() >= {"name", "namespace", "fields"} and isinstance(content["name"], str)
 
 
@@ -143,16 +143,16 @@ Piece = tuple[str, str]
 """Text, and a style of rich."""
 
 _LONGEST_TEXT = 120
-"""Characters of a string."""
+"""Characters shown of a string."""
 
 _MOST_BYTES = 60
-"""Of what is no packet."""
+"""Bytes shown of an undecodable packet."""
 
 _NO_SHAPE: Mapping[str, Shape] = {}
 
 
 def json_line(heard: Heard) -> str:
-    """One JSON object, of what was received as it was received."""
+    """One JSON object with the data as received."""
     return json.dumps(_as_json(heard), separators=(",", ":"))
 
 
@@ -182,7 +182,7 @@ def pieces(heard: Heard) -> list[Piece]:
 
 
 def _remark(document: Mapping[str, Any]) -> Iterable[str]:
-    """Of topics their names."""
+    """A document as words; of a list of topics only their names."""
     if not isinstance(rows := document.get("topics"), list):
         return words(_tree(document, _NO_SHAPE, is_wrapped=False))
     names = (str(row["topic"]) for row in rows if isinstance(row, dict) and "topic" in row)
@@ -190,7 +190,7 @@ def _remark(document: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _clock(seconds: float) -> str:
-    """Local time of day; a sender's clock may say anything."""
+    """Local time of day; beyond the calendar's range the number."""
     try:
         return f"{dt.datetime.fromtimestamp(seconds).astimezone():%H:%M:%S.%f}"[:-3]
     except (OverflowError, OSError, ValueError):
@@ -215,7 +215,7 @@ def _type_text(shape: Shape) -> str:
 
 
 def _tree(values: Mapping[str, Any], shapes: Mapping[str, Shape], is_wrapped: bool) -> Mapping[str, Tree]:
-    """A single value is taken out of its list."""
+    """The members as text. `is_wrapped`: a single value stands in a list of one."""
     tree: dict[str, Tree] = {}
     for name, value in values.items():
         shape = shapes.get(name)

@@ -1,4 +1,4 @@
-"""Where packets and documents of a gateway come from: UDP, TCP and WebSocket; `zenoh_source` has Zenoh."""
+"""Sources of a gateway's packets and documents: UDP, TCP, WebSocket; Zenoh is in `zenoh_source`."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ Say = Callable[[str], None]
 
 
 class Arrival(NamedTuple):
-    """A datagram, packet or document. Schemas count for those of the same `sender` alone."""
+    """A datagram, packet or document. Schemas apply to the same `sender` only."""
 
     data: bytes
     sender: Hashable
 
 
 class Source(Protocol):
-    """Where bytes come from. `place` says it in words; `lost` counts what is known to be missing."""
+    """A source of packets. `place` describes it; `lost` counts those known to be missing."""
 
     place: str
 
@@ -44,10 +44,10 @@ class Source(Protocol):
     def lost(self) -> int: ...
 
     def ask(self) -> None:
-        """Ask for schemas and latest values, where a gateway does not send them unasked."""
+        """Request schemas and latest values from gateways that do not send them unasked."""
 
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
-        """What came in, after at most so many seconds."""
+        """Return what has arrived, after at most `timeout` seconds."""
 
     def close(self) -> None: ...
 
@@ -59,7 +59,10 @@ LONGEST = MOST_TEXT + (1 << 20)
 
 
 class Splitter:
-    """`form` None: the first bytes of the connection tell."""
+    """Splits a TCP stream into packets or documents. `form` None: detected from the first bytes.
+
+    `gateway_v1`: each packet after its length, u32 little-endian. `json_lines`: a document and a newline.
+    """
 
     def __init__(self, form: GatewayFormat | None) -> None:
         self._form = form
@@ -68,11 +71,11 @@ class Splitter:
 
     @property
     def unfinished(self) -> int:
-        """Bytes of what has not come to its end."""
+        """Bytes of an incomplete packet or document."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """What is whole now. Raises PacketError when there is no telling where the next begins."""
+        """Yield what is complete. Raises PacketError if the stream cannot be split."""
         self._buffer += data
         if self._form is None and len(self._buffer) >= _LENGTH.size:
             is_text = self._buffer.startswith(b"{") and self._length() > LONGEST
@@ -113,10 +116,10 @@ CONNECT_TIMEOUT = 2.0
 
 
 class ConnectedSource(ABC):
-    """Every connection is another sender: a gateway begins anew with its schemas."""
+    """A source that connects, and reconnects for ever. Each connection is another `sender`."""
 
     lost = 0
-    """TCP loses nothing; what is unfinished when a connection breaks is told."""
+    """TCP loses nothing."""
 
     def __init__(self, protocol: str, address: Address, say: Say) -> None:
         self.place = f"{protocol} {address}"
@@ -125,7 +128,7 @@ class ConnectedSource(ABC):
         self._connected = ExitStack()
         self._number = 0  # of the connection
         self._is_connected = False
-        self._is_told = False
+        self._is_reported = False
         self._next_attempt = 0.0
 
     def ask(self) -> None:  # noqa: B027 - there is nothing to ask
@@ -145,7 +148,7 @@ class ConnectedSource(ABC):
 
     @abstractmethod
     def _receive(self, timeout: float) -> Sequence[bytes]:
-        """What has come in; calls `_lose` when the connection has ended."""
+        """Return what has arrived; call `_lose` when the connection has ended."""
 
     def _connect(self, timeout: float) -> bool:
         if (rest := self._next_attempt - time.monotonic()) > 0:
@@ -158,18 +161,18 @@ class ConnectedSource(ABC):
         except OSError as error:
             self._lose(f"cannot be reached ({error.strerror or error})")
             return False
-        if self._number or self._is_told:
+        if self._number or self._is_reported:
             self._say(f"{self.place} is connected")
-        self._is_connected, self._is_told = True, False
+        self._is_connected, self._is_reported = True, False
         self._number += 1
         return True
 
     def _lose(self, why: str) -> None:
-        """Says so once, until there is a connection again."""
+        """Close, and report it once until there is a connection again."""
         self._connected.close()
-        if not self._is_told:
+        if not self._is_reported:
             self._say(f"{self.place} {why}; trying again")
-        self._is_connected, self._is_told = False, True
+        self._is_connected, self._is_reported = False, True
         self._next_attempt = time.monotonic() + _TRY_AGAIN
 
 
@@ -177,7 +180,7 @@ _READ_SIZE = 1 << 18
 
 
 class TcpSource(ConnectedSource):
-    """`form` is gateway_v1 or json_lines; None to see from the first bytes."""
+    """`form` is gateway_v1 or json_lines; None: detected."""
 
     def __init__(self, address: Address, form: GatewayFormat | None, say: Say) -> None:
         super().__init__("tcp", address, say)
@@ -241,13 +244,13 @@ class WebsocketSource(ConnectedSource):
 
 
 _RECEIVE_BUFFER = 4 << 20
-"""Bytes that the kernel is asked to keep while we are busy; it may grant less."""
+"""Bytes of the receive buffer; the kernel may grant less."""
 
 _MOST_AT_ONCE = 1000
 
 
 class UdpSource:
-    """Bound to `address`. `gateway` is where schemas are asked for, if they are. Raises UsageError."""
+    """Bound to `address`. `gateway` is the address to request schemas from, or None. Raises UsageError."""
 
     def __init__(self, address: Address, gateway: Address | None, say: Say) -> None:
         self._socket = udp.open_udp(address, "listen")
@@ -258,11 +261,11 @@ class UdpSource:
 
     @property
     def lost(self) -> int:
-        """Datagrams that the kernel threw away because we were too slow."""
+        """Datagrams that the kernel dropped."""
         return drops(self._socket)
 
     def ask(self) -> None:
-        """An empty packet without a type asks for all schemas. It comes from the port that they are to be sent to."""
+        """Send an empty packet without a type, which requests all schemas, from the receiving port."""
         if self._gateway is None:
             return
         request = Packet(time.time(), is_compressed=False, topic="", type_name="", payload=b"")
@@ -272,7 +275,7 @@ class UdpSource:
             self._say(f"cannot ask {self._gateway}: {error.strerror}")
 
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
-        """All that is there at once: a large message comes as more datagrams than the kernel keeps."""
+        """Everything that is there at once, to empty the receive buffer quickly."""
         found: list[Arrival] = []
         if select.select([self._socket], [], [], timeout)[0]:
             with suppress(BlockingIOError):
@@ -289,7 +292,10 @@ _FORMS = "[udp://][HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?co
 
 
 def open_source(text: str, form: GatewayFormat | None, gateway: Address | None, say: Say) -> Source:
-    """`form` is of tcp alone, `gateway` (to ask for schemas) of udp. Raises UsageError and TransportError."""
+    """Open the source that `text` names. `form` belongs to tcp, `gateway` (to request schemas) to udp.
+
+    Raises UsageError and TransportError.
+    """
     scheme, colon, rest = text.rpartition("://")
     scheme = scheme if colon else "udp"
     if form is not None and scheme != "tcp":

@@ -131,11 +131,11 @@ def _numbered(nodes: Sequence[Node]) -> dict[str, str]:
 
 
 def _mermaid_text(text: str) -> str:
-    """In quotation marks Mermaid takes HTML, and anything but a quotation mark; `#` begins entities of its own."""
+    """Escaped for Mermaid's quoted labels, which are HTML; `#` begins Mermaid's own entities."""
     return escape(text, {'"': "&quot;", "#": "&num;"})
 
 
 def _dot_text(text: str) -> str:
-    """Graphviz would read `&lt;` as one character."""
+    """Escaped for Graphviz, which would read `&lt;` as one character."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("&", "&amp;")
     return f'"{escaped}"'

@@ -1,4 +1,4 @@
-"""What a gateway sends, one by one and counted: the reference for those who write clients."""
+"""A reference client of gateways: decodes, counts and filters what a source delivers."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ ASK_AGAIN = 1.0
 
 
 _MOST_SHAPES = 10_000
-"""Schemas that are remembered. More have only those who make senders up."""
+"""Schemas that are remembered; senders may be forged."""
 
 
 @dataclass(slots=True)
 class Tally:
-    """How many there were. `early` messages came before their schema, `unwanted` ones are of other topics."""
+    """Counts. `early` messages came before their schema, `unwanted` ones are of other topics."""
 
     messages: int = 0
     schemas: int = 0
@@ -43,9 +43,9 @@ class Tally:
 
 
 class Listening:
-    """Makes sense of what arrives. `wants` says whether a topic is to be shown, of "" whether all are.
+    """Decodes arrivals. `wants` selects topics; of "" it says whether all are wanted.
 
-    The schema of a type that says of no topic what it is for is shown before the first message that is wanted.
+    A schema without a topic is shown before the first wanted message of its type.
     """
 
     def __init__(self, wants: Callable[[str], bool]) -> None:
@@ -59,7 +59,7 @@ class Listening:
         return self._tally
 
     def hear(self, source: Source, seconds: float) -> Iterator[Heard]:
-        """One after the other, for so many seconds."""
+        """Yield what is heard, for `seconds`."""
         ends, asks = time.monotonic() + seconds, 0.0
         while (now := time.monotonic()) < ends:
             if not self._tally.schemas and now >= asks:
@@ -69,7 +69,7 @@ class Listening:
                 yield from self.take(arrival)
 
     def take(self, arrival: Arrival) -> Iterator[Heard]:
-        """What one arrival says; `now` in monotonic ns."""
+        """Decode one arrival; `now` in monotonic ns."""
         try:
             packets = unbatched(arrival.data)
         except PacketError as error:
@@ -84,7 +84,7 @@ class Listening:
                 yield from self._counted(heard, arrival.sender)
 
     def _counted(self, heard: Message | Schema | Remark, sender: Hashable) -> Iterator[Heard]:
-        """What of it somebody wants to see."""
+        """Count it, and yield what is wanted."""
         if isinstance(heard, Remark):
             yield heard
         elif isinstance(heard, Schema):
@@ -119,7 +119,7 @@ _COMMAND_LINE = SourceSpan("command line", 1, 1)
 
 
 def topic_filter(globs: Sequence[str]) -> Callable[[str], bool]:
-    """Whether any of them matches a topic; without globs each topic does. Raises UsageError."""
+    """A predicate: whether any glob matches a topic. Without globs each topic matches. Raises UsageError."""
     patterns = [TopicPattern(glob, is_regex=False, span=_COMMAND_LINE) for glob in globs]
     for problem in filter(None, map(pattern_problem, patterns)):
         raise UsageError(f"--topic: {problem.what}; {problem.hint}")

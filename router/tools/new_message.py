@@ -21,7 +21,7 @@ SCALARS = {
     "bool": "bool", "float": "float32", "double": "float64", "int32": "int32", "int64": "int64", "uint32": "uint32",
     "uint64": "uint64",
 }  # fmt: skip
-"""What a field can be beside an enum or a message: protobuf's spelling, and ROS's. Boards take all of these."""
+"""Scalar types of a field, by protobuf's name: ROS's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class NewMessage:
 
     @property
     def prefix(self) -> str:
-        """What the names of the board's messages begin with."""
+        """The prefix of the board's message names."""
         return prefix_of(self.board)
 
     @property
@@ -108,7 +108,7 @@ _OF_C = frozenset(
     typeid typename union unsigned using virtual void volatile wchar_t while xor xor_eq
     """.split()  # noqa: SIM905 - ninety words are read more easily without quotes
 )
-"""No names: boards and ROS nodes are compiled from the same declarations."""
+"""Refused as names, since boards and ROS nodes are compiled from the same declarations."""
 _MESSAGE_NAME = re.compile(r"[A-Z][A-Za-z0-9]*")
 _FIELD_NAME = re.compile(r"[a-z](_?[a-z0-9])*")
 _WORD_BORDER = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
@@ -193,7 +193,7 @@ def _check_word(name: str, remedy: str) -> None:
 
 
 def _endpoint(board: str, table: RouteTable) -> Endpoint:
-    """By its name, or without `_board`."""
+    """The endpoint of this name, with or without `_board`."""
     senders = {name: each for name, each in table.endpoints.items() if each.kind is not EndpointKind.TOOL}
     found = senders.get(board) or senders.get(f"{board}_board")
     if found is None:
@@ -204,7 +204,7 @@ def _endpoint(board: str, table: RouteTable) -> Endpoint:
 
 
 def _case(name: str, board: str) -> str:
-    """`radiation_info` of `SensorBoardRadiationInfo`."""
+    """The payload case: `radiation_info` of `SensorBoardRadiationInfo`."""
     prefix = prefix_of(board)
     rest = name.removeprefix(prefix)
     if not _MESSAGE_NAME.fullmatch(name) or rest == name or not _MESSAGE_NAME.fullmatch(rest):

@@ -219,7 +219,7 @@ def _aligned(rows: Iterable[tuple[str, str]], mark: str) -> Iterator[str]:
 
 
 class _Entry(NamedTuple):
-    """One entry of a YAML section: `first` is the index of its key's line, `end` of the one behind its last."""
+    """One entry of a YAML section: index of its first line, and of the line behind its last."""
 
     first: int
     end: int
@@ -239,7 +239,7 @@ def _entries(text: str, section: str) -> list[_Entry]:
 
 
 def _last_line(node: yaml.Node) -> int:
-    """The index of a node's last line. The end of a block is where the next token begins, behind any comments."""
+    """The index of a node's last line. YAML's end mark of a block lies behind the comments that follow it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _last_line(last[1] if isinstance(last, tuple) else last)
@@ -264,8 +264,8 @@ def _in_table(text: str, message: NewMessage, site: Site) -> str:
 
 
 def _route(message: NewMessage, site: Site, width: int) -> list[str]:
-    told = _basestations(message, site.table)
-    destinations = [f"  destinations: [{', '.join(told)}]"] if told else []
+    receivers = _basestations(message, site.table)
+    destinations = [f"  destinations: [{', '.join(receivers)}]"] if receivers else []
     package = site.messages.parent.name
     keys = [f"topic: {message.case}", f"type: {package}/msg/{message.name}", "queue_depth: 10", "fields: auto"]
     topic = f"{{{', '.join(keys)}}}"
@@ -282,7 +282,7 @@ _ONE_LINE = re.compile(r" *\w+: +(\{.*\}) *$")
 
 
 def _in_forwarding_table(text: str, message: NewMessage, table: RouteTable) -> str | None:
-    """A table that sends everything to the same endpoints, with the new case among it. None for any other."""
+    """A table that sends everything to the same endpoints, with the new case added. None for any other table."""
     own = _own_routes(table)
     if not own or len({_forwarding(route) for route in table.routes}) != 1 or _forwarding(own[0])[0] != (ANY,):
         return None
@@ -302,7 +302,7 @@ def _forwarding(route: Route) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _own_routes(table: RouteTable) -> list[Route]:
-    """Those of the file itself, not of the tables that it extends."""
+    """The routes of the file itself, without those of the tables that it extends."""
     return [route for route in table.routes if route.span.file == shown_path(table.path)]
 
 
@@ -315,13 +315,13 @@ def _last_route(text: str, routes: Iterable[Route]) -> _Entry:
 
 
 def _basestations(message: NewMessage, table: RouteTable) -> list[str]:
-    """The endpoints that get everything that a board says."""
+    """The endpoints that get every message of a board."""
     endpoints = table.endpoints.items()
     return [name for name, each in endpoints if each.kind is EndpointKind.BASESTATION and name != message.board]
 
 
 def _in_tests(path: Path, message: NewMessage, site: Site) -> str:
-    """The test file with one more test, below the last one of that board: all that it says comes out unchanged."""
+    """The test file with one more test, below the last one of that board: the message passes unchanged."""
     text = _read(path)
     try:
         entries = _entries(text, "tests")
@@ -346,17 +346,17 @@ def _senders(node: yaml.Node) -> Iterator[str]:
 
 
 def _test(message: NewMessage, site: Site) -> Iterator[str]:
-    told = _basestations(message, site.table)
+    receivers = _basestations(message, site.table)
     subject = message.case.replace("_", " ")
-    yield f"{subject} reaches {'the operator and ROS as it is' if told else 'ROS as the operator sent it'}:"
+    yield f"{subject} reaches {'the operator and ROS as it is' if receivers else 'ROS as the operator sent it'}:"
     yield "  given:"
     yield f"    case: {message.case}"
     yield f"    from: {message.board}"
     fields = _flow({field.name: _sample(field.type, place, site) for place, field in enumerate(message.fields)})
     yield from _wrapped(f"    fields: {fields}", " " * 13)
     yield "  expect:"
-    if told:
-        yield f"    sent: {told[0] if len(told) == 1 else '[' + ', '.join(told) + ']'}"
+    if receivers:
+        yield f"    sent: {receivers[0] if len(receivers) == 1 else '[' + ', '.join(receivers) + ']'}"
     yield f"    published: {{{message.case}: unchanged}}"
 
 

@@ -38,7 +38,7 @@ class Pose:
 
 
 def pose(t: float, epoch: float) -> Pose:
-    """Where the rover is `t` seconds after the start."""
+    """The pose `t` seconds after the start."""
     rate = math.tau / 120
     phase = rate * t
     east, north = 10 * math.sin(phase), 5 * math.sin(2 * phase)
@@ -128,7 +128,7 @@ def _manual_drive(now: Pose, noise: Noise) -> Values:
 
 
 def _manual_brake(now: Pose, noise: Noise) -> Values:
-    """Off while the operator drives: a brake at the driving board is a deadman's."""
+    """Always off, so that a brake at the driving board comes from a deadman."""
     return {"brake": False}
 
 
@@ -143,7 +143,7 @@ MODELS: Mapping[str, Callable[[Pose, Noise], Values]] = {
     "BasestationManualDrive": _manual_drive,
     "BasestationManualBrake": _manual_brake,
 }
-"""By protobuf message; the fields that a model does not give move as their types allow."""
+"""By protobuf message; other fields move as their types allow."""
 
 
 RATES: Mapping[str, float] = {
@@ -164,24 +164,24 @@ RATES: Mapping[str, float] = {
     "object_selection": 1,
     "rock_measure_request": 1,
 }
-"""How often a payload case is sent in real life, Hz."""
+"""Usual rate of a payload case on the rover, Hz."""
 
 USUAL_RATE = 2.0
 
 
 def usual_rate(case: str) -> float:
-    """Hz, also of a payload case that nobody has described here yet."""
+    """Hz, also of a payload case that RATES lacks."""
     return RATES.get(case, USUAL_RATE)
 
 
 NESTING = 3
-"""Messages within themselves are filled to this depth."""
+"""Depth to which recursive messages are filled."""
 
 NAMING = ("_id", "index")
-"""How integer fields end that name a thing; they stand still."""
+"""Suffixes of integer fields that are identifiers; these stay constant."""
 
 HEALTHY = ("OPERATING", "_OK", "NO_ERROR")
-"""How the names of enum values end that say that all is well; a healthy rover stays there."""
+"""Suffixes of enum values that mean health; these fields stay constant."""
 
 
 class PayloadModel:
@@ -250,7 +250,7 @@ def _length(kind: List) -> int:
 
 
 def _enum_value(kind: Enum, wave: float) -> int:
-    """The value that means health if the enum has one, else all of them in turn."""
+    """The value that means health if the enum has one, else each value in turn."""
     for name, number in kind.values:
         if name.endswith(HEALTHY):
             return number

@@ -18,13 +18,13 @@ from router.values import compact, rate_text
 DIGITS = 4
 
 RATE_WINDOW = 3.0
-"""Seconds; over less, one message in two seconds is no rate but a flicker."""
+"""Seconds; with a shorter window the rate of slow streams flickers."""
 
 Key = tuple[str, str]
 """Endpoint and payload case."""
 
 PATIENCE = 2.0
-"""Seconds without an answer after which a missing router is the likely reason."""
+"""Seconds without an answer after which the headline asks for the router."""
 
 _STYLES = {State.WAITING: "dim", State.OBEYING: "green", State.HALTED: "bold yellow", State.STOPPED: "bold red"}
 
@@ -57,7 +57,7 @@ class SimView:
         return self._history[-1][0]
 
     def changes(self, since: float) -> list[Change]:
-        """How the boards' states have changed after `since`, seconds since the start."""
+        """Changes of the boards' states after `since`, seconds since the start."""
         return [change for change in self._statistics.changes if change.at > since]
 
     def headline(self) -> str:
@@ -99,7 +99,7 @@ class SimView:
                 yield endpoint, f"{inbox.undecodable} undecodable datagrams", "bold red"
 
     def statuses(self) -> Table:
-        """What boards make of their commands, and the basestation of frames: one line each."""
+        """The boards' states and the basestation's frames, one line each."""
         table = Table(box=None, pad_edge=False, show_header=False, expand=True)
         table.add_column(no_wrap=True)
         table.add_column(no_wrap=True, ratio=1, overflow="ellipsis")
@@ -130,7 +130,7 @@ class SimView:
     def as_json(self, seconds: float, final: bool) -> dict[str, Any]:
         """All statistics; payloads in protobuf's JSON mapping with the names of the `.proto` files.
 
-        Times and ages in seconds. `boards` are the states, `changes` how they came about, the newest last.
+        Times and ages in seconds. `boards` are the states, `changes` their history, the newest last.
         """
         inboxes = self._statistics.inboxes
         received: dict[str, dict[str, Any]] = defaultdict(dict)

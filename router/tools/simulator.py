@@ -1,6 +1,6 @@
 """All boards and the basestation of a route table on one machine, over real UDP.
 
-Each endpoint binds its own address, sends what the table names it as the source of, and takes what it is sent.
+Each endpoint binds its own address, sends the payload cases of which the table names it as source, and receives.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from router.tools.udp import LOOPBACK, listener_address, open_udp
 from router.types.protobuf import PayloadCase
 
 STRANGER = "(anybody)"
-"""Who sends the payload cases that the table takes from any source."""
+"""The sender of payload cases that the table takes from any source."""
 
 _SILENCE = re.compile(r"(?P<name>\w+):(?P<start>\d+(\.\d+)?)-(?P<end>\d+(\.\d+)?)?")
 
@@ -44,7 +44,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """An endpoint, or whoever sends a payload case, says nothing from `start` to `end`, seconds since the start."""
+    """Nothing is sent by an endpoint, or of a payload case, from `start` to `end`, seconds since the start."""
 
     name: str
     start: float
@@ -63,7 +63,7 @@ def parse_silence(text: str) -> Silence:
 
 
 def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
-    """Raises UsageError for one that silences nobody."""
+    """Raises UsageError for one whose name sends nothing."""
     known = {name for stream in streams for name in (stream.endpoint, stream.case.name)} - {STRANGER}
     for silence in silences:
         if silence.name not in known:
@@ -72,7 +72,7 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
 
 
 def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iterator[Stream]:
-    """What the table's UDP sources send, in the order of the table. Raises UsageError for an unknown name."""
+    """The streams of the table's UDP sources, in the order of the table. Raises UsageError for an unknown name."""
     for route in table.routes:
         if route.is_outbound:
             continue
@@ -88,13 +88,13 @@ def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iter
 
 
 DRAIN = 256
-"""Datagrams taken from one socket before the others, and the sending, have their turn."""
+"""Datagrams read from one socket before the next one is served."""
 
 PATIENCE = 0.2
-"""Seconds after which `stop`, and that commands are missing, is noticed at the latest."""
+"""Seconds until `stop` and missing commands are noticed, at most."""
 
 LATE = 1.0
-"""Seconds behind schedule after which messages are left out rather than sent in a burst."""
+"""Seconds behind schedule after which messages are skipped rather than sent in a burst."""
 
 MOST_CHANGES = 100
 """The newest changes of boards that are kept."""
@@ -102,7 +102,7 @@ MOST_CHANGES = 100
 
 @dataclass(slots=True)
 class Statistics:
-    """What happened since the start. `sent` is by endpoint and payload case, `inboxes` by endpoint.
+    """Counts since the start. `sent` is by endpoint and payload case, `inboxes` by endpoint.
 
     `unsent` are datagrams that the kernel refused to take. `changes` are those of the boards, the newest last.
     """
@@ -117,7 +117,7 @@ class Simulator:
     """Plays the endpoints of a table. Binds every address at once; raises UsageError when one cannot be had, or for a
     table without listeners.
 
-    `deadmen` are those of the program that the table compiles to: a board knows what they send.
+    `deadmen` are those of the compiled program; boards halt on what they send.
     """
 
     def __init__(
@@ -161,13 +161,13 @@ class Simulator:
 
     @property
     def summary(self) -> str:
-        """What is simulated, for people."""
+        """One line for people."""
         endpoints, cases = len(self._senders) - 1, len(self._streams)
         rate = sum(stream.rate for stream in self._streams)
         return f"{endpoints} endpoints send {cases} payload cases, {rate:.0f}/s, to {self._router}"
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
-        """One socket for both ways; a second one to send when the router knows the endpoint by its source port."""
+        """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`."""
         address = endpoint.address.value
         receiver = sender = self._open(address, endpoint.name)
         if endpoint.source_port is not None and endpoint.source_port.value != address.port:
@@ -186,7 +186,7 @@ class Simulator:
             opened.close()
 
     def stop(self) -> None:
-        """Makes `run` return soon; safe in a signal handler."""
+        """Make `run` return soon; safe in a signal handler."""
         self._stopping = True
 
     def run(self, duration: float | None, every: float, report: Callable[[float], None]) -> float:
@@ -217,7 +217,7 @@ class Simulator:
         return now
 
     def _next(self, at: float, rate: float, now: float) -> float:
-        """When the stream is due after `at`; a machine that slept does not make up for it."""
+        """The time after `at` at which the stream is due; after a suspend, missed messages are skipped."""
         missed = int((now - at) * rate) if now - at > LATE else 0
         return at + (1 + missed) / rate
 

@@ -19,7 +19,7 @@ from router.table.model import Listener, RouteTable
 ANY_HOST = "0.0.0.0"
 LOOPBACK = "127.0.0.1"
 ANYWHERE = Address(ANY_HOST, 0)
-"""To send from whichever address and port the kernel likes."""
+"""Any local address and port, chosen by the kernel."""
 
 
 def destination(text: str, table: RouteTable | None) -> Address:
@@ -56,9 +56,9 @@ def origin(text: str, table: RouteTable | None) -> Address:
 
 
 def reachable(address: Address, interface: str | None = None) -> Address:
-    """Where to send so that a socket bound to this address, and to this network interface, receives it.
+    """The address that reaches a socket bound to `address` and `interface`, from this computer.
 
-    From this computer, an interface is reached by its own address. Raises UsageError where it has none.
+    Raises UsageError if the interface has no IPv4 address.
     """
     if address.host != ANY_HOST:
         return address
@@ -69,7 +69,7 @@ def reachable(address: Address, interface: str | None = None) -> Address:
 
 
 def listener_address(listener: Listener) -> Address:
-    """Where to send from this computer so that a router of the table receives it there. Raises UsageError."""
+    """The address that reaches a listener of the table from this computer. Raises UsageError."""
     return reachable(listener.address.value, listener.interface)
 
 
@@ -151,9 +151,9 @@ def paced(count: int | None, rate: float | None) -> Iterator[float]:
 
 @dataclass(slots=True)
 class Sent:
-    """Datagrams handed to the kernel, the seconds from the first to the last, and those that nobody took.
+    """Datagrams sent, and the seconds from the first to the last.
 
-    `refused` counts answers of the other machine that no socket is bound there; they may arrive late.
+    `refused` counts ICMP answers that the port is closed, which may arrive late.
     """
 
     count: int = 0
@@ -162,14 +162,14 @@ class Sent:
 
     @property
     def rate(self) -> float:
-        """Datagrams per second, 0 when one alone leaves no time to measure."""
+        """Datagrams per second; 0 for a single one."""
         return (self.count - 1) / self.seconds if self.seconds > 0 else 0.0
 
 
 def send(sender: socket.socket, to: Address, data: bytes, count: int | None, rate: float | None, sent: Sent) -> None:
     """Send `count` times (None: until interrupted) at `rate` Hz (None: at once), counting in `sent`.
 
-    `sent` is the caller's, so that an interrupt loses no count. Raises TransportError.
+    The caller owns `sent` and has it after an interrupt, too. Raises TransportError.
     """
     try:
         sender.setblocking(True)

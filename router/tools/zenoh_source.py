@@ -1,4 +1,4 @@
-"""What gateways put into a Zenoh network under one key expression."""
+"""What gateways publish in a Zenoh network under one key expression."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from router.table.model import ZenohSettings
 from router.tools.gateway_sources import Arrival, Say
 
 _ANSWER_TIMEOUT = 1.0
-"""Seconds in which gateways answer."""
+"""Seconds to wait for answers of gateways."""
 
 
 class ZenohSource:
-    """Subscribes to data and schemas below the key, and asks for what there is, which gateways answer.
+    """Subscribes to data and schemas below the key, and queries the latest ones.
 
-    Live data waits until the first answers are in, for they hold the schemas. Raises UsageError for what Zenoh does
-    not understand, TransportError when it cannot open.
+    Live data waits for the first answers, which have the schemas. Raises UsageError for invalid settings and
+    TransportError if no session can be opened.
     """
 
     lost = 0
-    """Zenoh does not tell."""
+    """Unknown with Zenoh."""
 
     def __init__(self, settings: ZenohSettings, say: Say) -> None:
         self._key = settings.key.value
@@ -42,7 +42,7 @@ class ZenohSource:
             raise UsageError(f"zenoh: {error}") from error
 
     def ask(self) -> None:
-        """Zenoh calls from threads of its own: `append` for each reply, and the function when there are no more."""
+        """Query; Zenoh's threads call `append` for each reply, and the function at the end."""
         replies: list[zenoh.Reply] = []
         handler = zenoh.handlers.Callback(replies.append, lambda: self._answers.put(replies))
         self._session.get(f"{self._key}/**", handler, timeout=_ANSWER_TIMEOUT)
@@ -71,12 +71,12 @@ class ZenohSource:
 
 
 def _arrival(sample: zenoh.Sample) -> Arrival:
-    """What comes under one key expression counts as one sender's: an answer has the schema of what is published."""
+    """Everything under the key has one sender: the schema in an answer is that of live data."""
     return Arrival(sample.payload.to_bytes(), None)
 
 
 def _session(settings: ZenohSettings) -> zenoh.Session:
-    """Where nothing is named to connect to or to listen on, Zenoh looks for others by multicast."""
+    """Open a session; without `connect` and `listen`, Zenoh discovers others by multicast."""
     config = zenoh.Config()
     try:
         config.insert_json5("mode", json.dumps(settings.mode))
