@@ -507,6 +507,7 @@ IMU_ONLY = """\
 """
 
 
+@pytest.mark.slow
 def test_what_only_the_router_publishes_is_filled_while_a_client_is_there(tmp_path: Path) -> None:
     imu = next(generated("imu_info")).datagram
     with scene(tmp_path, IMU_ONLY) as now:

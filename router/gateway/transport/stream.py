@@ -219,9 +219,10 @@ class StreamTransport(ABC):
         self._log.note(what, logger.warning, what, client=client.label, **details)
         client.close()
 
-    def stalled(self, client: StreamClient) -> None:
-        """The kernel closed the connection of a client that took nothing."""
-        self.close_client(client, "a client was closed: send stalled", seconds=STALLED_SECONDS)
+    def timed_out(self, client: StreamClient) -> None:
+        """Log that the kernel closed the connection of a client that took, or acknowledged, nothing."""
+        what = "a client was closed: send stalled, or its computer does not answer"
+        self.close_client(client, what, seconds=STALLED_SECONDS)
 
     def _watch(self) -> None:
         begun_before = monotonic() - MESSAGE_SECONDS

@@ -86,7 +86,7 @@ class TcpTransport(StreamTransport):
             self.events.refused("too_large")
             self.close_client(client, "a client was closed", why=str(error))
         except TimeoutError:
-            self.stalled(client)
+            self.timed_out(client)
         except (asyncio.IncompleteReadError, OSError):
             pass  # the client left
         except Exception as error:  # noqa: BLE001 - a fault of the router, reported; it ends this client alone

@@ -107,7 +107,7 @@ class WebsocketTransport(StreamTransport):
     def disconnected(self, connection: Connection, error: Exception | None) -> None:
         self._connections.discard(connection)
         if isinstance(error, TimeoutError):
-            self.stalled(connection.client)
+            self.timed_out(connection.client)
 
     async def _serve_client(self, connection: ServerConnection) -> None:
         """Handle one websocket after its handshake."""
