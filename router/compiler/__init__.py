@@ -1,7 +1,4 @@
-"""What a route table means: RouteTable and types in, findings or a Program out.
-
-Knows no socket, no rclpy and no clock.
-"""
+"""The meaning of a route table: from a RouteTable and the types to findings or a Program."""
 
 from __future__ import annotations
 

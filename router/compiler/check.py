@@ -1,4 +1,4 @@
-"""Checks a table and everything that it refers to, and collects what there is to say about it.
+"""Check a table and everything that it refers to, and collect all findings.
 
 The same check serves `validate`, `explain` and `run`.
 """
@@ -45,11 +45,11 @@ class Checked:
 
     @cached_property
     def program(self) -> Program | None:
-        """Made when first asked for: `validate` needs none, nor what makes it."""
+        """Compiled when first asked for; None while there are errors."""
         return self.program_in(None)
 
     def program_in(self, counters: Counters | None) -> Program | None:
-        """A program that counts in these counters, if they are given: they continue those of another one."""
+        """Compile the program, which counts in `counters` if they are given; None while there are errors."""
         from router.compiler.link import link
 
         if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
@@ -60,7 +60,7 @@ class Checked:
 def check_table(
     path: Path, environ: Mapping[str, str] | None = None, definitions: Definitions | None = None
 ) -> Checked:
-    """Checks a table and everything that it refers to. Never raises for what a person may have written.
+    """Check a table and everything that it refers to. Never raises for what a person may have written.
 
     `environ` fills the table's variables, None means the process environment. Pass one `definitions` to
     several calls to read `.proto` files and ROS interfaces once.
@@ -94,7 +94,7 @@ def check_table(
 
 
 def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:
-    """Raises TableError."""
+    """The protos of the table and its envelope. Raises TableError."""
     if table.envelope is None:
         return without_protos()
     schema = definitions.protos(table.envelope)
@@ -102,5 +102,5 @@ def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Env
 
 
 def sorted_findings(findings: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """Each once, in the order in which a person reads the files."""
+    """Findings without duplicates, by file and position."""
     return sorted(dict.fromkeys(findings), key=lambda finding: (finding.span, finding.code.value, finding.message))

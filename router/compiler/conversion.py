@@ -49,7 +49,7 @@ def convert(value: Typed, target: Type, scope: Scope) -> Plan:
 
 
 def same_named(holder: Typed, member: Field, scope: Scope) -> Typed | None:
-    """The field of a message that is called as `member` is, None when `holder` has none."""
+    """The field of `holder` with the name of `member`, or None."""
     found = holder.kind.type.field(member.name) if isinstance(holder.kind, MessageKind) else None
     return scope.field_of(holder, found, holder.span) if found else None
 
@@ -186,7 +186,7 @@ def _to_int(value: Typed, target: Int) -> ast.expr:
 
 
 def _saturate(value: Typed, target: Int) -> ast.expr:
-    """The usual value passes with one comparison; only one that does not fit costs a call."""
+    """An enum limited to an integer's range: one comparison, and a call only for a value outside."""
     if target.low <= INT32.low and INT32.high <= target.high:
         return value.node
     if isinstance(value.constant, int):
@@ -299,12 +299,12 @@ def _to_bytes(value: Typed, target: Bytes) -> ast.expr:
 
 
 def _is_octet(kind: Kind) -> bool:
-    """Whether an element of this kind can be a byte; one of which only the value tells is checked at run time."""
+    """Whether an element of this kind can be a byte; an integer of unknown range is checked at run time."""
     if not isinstance(kind, IntKind):
         return False
     return kind.bounds is None or OCTET.low <= kind.bounds[0] <= kind.bounds[1] <= OCTET.high
 
 
 def _limited(function: str, value: Typed, *limits: int) -> ast.expr:
-    """The value, passed at run time by one of the checks of `implementations`."""
+    """The value, checked at run time by a function of `namespace`."""
     return placed(call(function, value.node, *map(ast.Constant, limits)), value.span)

@@ -1,6 +1,6 @@
-"""Checks deadmen: the payload that is sent when commands stop coming, and commands to boards that have none.
+"""Check deadmen: their timing, the payload that they send, and commands to boards without one.
 
-Of deadmen for what a gateway's clients publish, the part that is the same.
+`gateways` uses it for the deadmen of topics that clients publish on.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 SHORTEST_REPEAT = 10_000_000
-"""ns. Faster is no brake but a flood, for a board that may still be busy with the last one."""
+"""ns. Shorter would flood a board, which may still be busy with the last datagram."""
 
 _NOTHING = MessageType("a deadman")
-"""What a deadman's payload is made of: there is no message that it could be filled from."""
+"""The source message of a deadman's payload: one without fields."""
 
 
 def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
-    """The deadman of a route, None where it has none or where the payload is none."""
+    """The deadman of a route, None if it has none or the payload is invalid."""
     deadman = route.deadman
     if deadman is None:
         _want_deadman(lookup, route)
@@ -47,7 +47,7 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
-    """Warns of the first board that gets commands which nothing stops."""
+    """Warn of the first board that gets commands from a route without deadman."""
     for destination in route.destinations:
         name = destination.endpoint.value
         endpoint = lookup.table.endpoints.get(name)
@@ -74,7 +74,7 @@ def _want_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
 
 
 def timing_findings(deadman: Deadman | InboundDeadman, max_rate: float | None, sends: str) -> Iterator[Diagnostic]:
-    """A deadman that trips while commands come, or that floods. `max_rate` limits all that feeds it, in Hz."""
+    """A deadman that trips while commands come, or that floods. `max_rate` (Hz) limits all its commands."""
     if max_rate is not None and deadman.timeout.value * max_rate <= NS_PER_SECOND:
         message = f"it would trip between commands that `max_rate` holds down to {max_rate:g} Hz"
         yield Diagnostic(deadman.timeout.span, Code.BAD_VALUE, message, "a longer timeout, or a higher max_rate")
@@ -84,7 +84,7 @@ def timing_findings(deadman: Deadman | InboundDeadman, max_rate: float | None, s
 
 
 def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> None:
-    """A command that waits must be stale when it is older than the timeout: sent, it would undo the deadman."""
+    """Report commands that may wait longer than the timeout: sent late, they would undo the deadman."""
     if route.ttl is not None and route.ttl.value <= deadman.timeout.value:
         return
     for destination in route.destinations:
@@ -98,7 +98,7 @@ def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> No
 
 
 def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...]:
-    """The routes whose commands disarm it. Of each case that it names there must be one."""
+    """The routes whose commands disarm the deadman; there must be one for each case in `hands_over_to`."""
     table = lookup.table
     found = [
         each for each in table.routes if any(takes_over(each, to.endpoint.value, route) for to in each.destinations)
@@ -129,9 +129,9 @@ def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | No
 def constant_plan(
     lookup: Lookup, fields: FieldMap, target: MessageType, span: SourceSpan, ros_type: MessageType | None = None
 ) -> Record | None:
-    """The plan of a message that is filled from none, None where it has findings. All zero is one.
+    """The plan of a message that is filled with constants, None if there are findings. No field need be filled.
 
-    `ros_type` is that whose constants can be named.
+    Expressions can name the constants of `ros_type`.
     """
     scope = replace(lookup.scope(_NOTHING, ParsedReads(), ros_type), given=())
     mapping = build(fields, target, scope, span)
@@ -148,9 +148,9 @@ def deadmen_of(table: RouteTable, route: Route, destination: Destination) -> tup
 
 
 def feeding(route: Route, deadman: Deadman) -> list[Destination]:
-    """The destinations that commands have to reach for a route's own deadman: those that it stops.
+    """The destinations whose commands feed a route's own deadman: those that it stops.
 
-    Where it stops others than the route commands, all of the route's.
+    If the route sends to none of those, all of its destinations.
     """
     stopped = {to.value for to in deadman.to}
     return [each for each in route.destinations if each.endpoint.value in stopped] or list(route.destinations)

@@ -21,7 +21,7 @@ from router.types.model import MessageType
 
 
 def check_gateways(lookup: Lookup) -> tuple[CheckedGateway, ...]:
-    """Those of the table, findings beside them."""
+    """The gateways of the table; findings go to `lookup`."""
     checked = []
     for gateway in lookup.table.gateways.values():
         lookup.findings += [*_name_findings(lookup.table, gateway), *_pattern_findings(gateway)]
@@ -38,7 +38,7 @@ def check_gateways(lookup: Lookup) -> tuple[CheckedGateway, ...]:
 
 
 def _name_findings(table: RouteTable, gateway: Gateway) -> Iterator[Diagnostic]:
-    """Metrics have listeners, routes and gateways under the same labels, `explain` takes payload cases as well."""
+    """Names that a listener or a route has too: they share the labels of metrics, and the arguments of `explain`."""
     names = {
         "listener": set(table.listeners),
         "route": {name for route in table.routes for name in (route.name, route.case.value)},
@@ -56,7 +56,7 @@ def _pattern_findings(gateway: Gateway) -> Iterator[Diagnostic]:
 
 
 def check_client_topics(lookup: Lookup, gateway: Gateway) -> tuple[CheckedInbound, ...]:
-    """Those of a gateway whose types exist."""
+    """The topics that clients of a gateway may publish on, without those whose types do not exist."""
     found: dict[str, CheckedInbound | None] = {}
     for inbound in gateway.inbound:
         name = resolved(inbound.topic.topic.value, lookup.table.node)

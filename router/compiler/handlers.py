@@ -67,10 +67,8 @@ class HandlerSource:
         with self._function("cdr"):
             with self.out.block("try:", span):
                 subscription.reads.write(self.out, span)
-                if subscription.for_each is not None:
-                    self.out.line(
-                        f"elements = {self.out.expression(subscription.for_each.node)}", subscription.for_each.span
-                    )
+                if for_each is not None:
+                    self.out.line(f"elements = {self.out.expression(for_each.node)}", for_each.span)
             self._all_lost(named, span, one_received)
             if subscription.stamp is not None:
                 self._born(subscription.stamp)

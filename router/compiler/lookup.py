@@ -21,14 +21,17 @@ from router.types.ros import RosInterfaces, definition, ros_interfaces
 
 
 class Definitions:
-    """`known` are protos that were read before. They are what they were as long as the folder's files are."""
+    """Protos and ROS interfaces, read once for several tables.
+
+    `known` are protos that were read before; they are used as long as the files of their folder are unchanged.
+    """
 
     def __init__(self, known: ProtoSchema | None = None) -> None:
         self._protos: dict[tuple[Path, str, Path], ProtoSchema] = {}
         self._known = known
 
     def protos(self, settings: EnvelopeSettings) -> ProtoSchema:
-        """Raises TableError; a folder that is broken is read again, and reported, by every table."""
+        """The protos of an envelope. Raises TableError; an invalid folder is read and reported again for each table."""
         key = settings.protos.value, settings.message.value, lock_path(settings.protos, settings.lock)
         if key not in self._protos:
             known = self._unchanged(settings)
@@ -54,7 +57,7 @@ NO_NAMES: Mapping[str, Typed] = {}
 
 @dataclass(slots=True)
 class Lookup:
-    """Looks up names for the routes of one table; `findings` fills up. `board_limit`: see `board_findings`."""
+    """Looks up the names of one table and collects findings. `board_limit`: see `board_findings`."""
 
     table: RouteTable
     schema: ProtoSchema
@@ -75,7 +78,7 @@ class Lookup:
         return found
 
     def endpoint(self, name: Located[str], also: Iterable[str] = ()) -> Endpoint | None:
-        """`also` is what else could be meant. Where a declaration left out has a finding of its own, there is none."""
+        """The endpoint, or None with a finding, unless its declaration has one. `also` are other valid names."""
         found = self.table.endpoints.get(name.value)
         if found is None and f"endpoints/{name.value}" not in self.table.broken:
             known = [*self.table.endpoints, *also]
@@ -120,14 +123,14 @@ class Lookup:
         ros_type: MessageType | None = None,
         names: Mapping[str, Typed] = NO_NAMES,
     ) -> Scope:
-        """What expressions over `message` can see; the constants of `ros_type` and of what is nested in it as well."""
+        """The scope of expressions over `message`, with the constants of `ros_type` and of the types in it."""
         nested = tuple(nested_types(ros_type)) if ros_type else ()
         return Scope(message, tuple(self.schema.enums.values()), nested, reads, names)
 
     def value(
         self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str, hint: str = ""
     ) -> Typed | None:
-        """An expression of one of `kinds`; `wanted` says so where it is of none."""
+        """A checked expression of one of `kinds`, or None with a finding that begins with `wanted`."""
         try:
             typed = check(expression, scope)
             if not isinstance(typed.kind, kinds):
@@ -145,7 +148,7 @@ class Lookup:
 
 
 def nested_types(declared: Type) -> Iterable[MessageType]:
-    """A ROS message type and all types in it, each once."""
+    """A ROS message type and all message types in it, each once."""
     found: dict[str, MessageType] = {}
     waiting: list[Type] = [declared]
     while waiting:
@@ -159,7 +162,7 @@ def nested_types(declared: Type) -> Iterable[MessageType]:
 
 
 def layout(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
-    """What its bytes are laid out after: the fields of the type and of each type in it, as rclpy spells them."""
+    """By name of the type and of each type in it, the fields as rclpy spells them: they determine the layout of CDR."""
     return {nested.name: definition(nested) for nested in nested_types(message)}
 
 

@@ -19,7 +19,7 @@ from router.types.model import Field, MessageType, Type
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of what a mapping came to, for people: target field and type, source text and kind."""
+    """One line of a mapping for `explain`: target field and type, source text and kind."""
 
     target: str
     target_type: str
@@ -30,7 +30,7 @@ class Row:
 
 @dataclass(slots=True)
 class FieldMapping:
-    """The outcome: a plan, what it came to, and what is wrong with it."""
+    """A checked mapping: its plan, rows for `explain`, and findings."""
 
     plan: Record
     rows: list[Row] = field(default_factory=list)
@@ -39,7 +39,7 @@ class FieldMapping:
 
 @dataclass(slots=True)
 class _Branch:
-    """A message of the target for which something is given: entries for its fields, branches for messages in it."""
+    """A message of the target that entries fill: entries for its fields, branches for messages in it."""
 
     type: MessageType
     given: dict[str, Union[FieldEntry, _Branch]] = field(default_factory=dict)
@@ -48,9 +48,9 @@ class _Branch:
 def build(
     fields: FieldMap | None, target: MessageType, scope: Scope, span: SourceSpan, whole: Typed | None = None
 ) -> FieldMapping:
-    """The mapping of a message of type `target`. `span` is blamed for what no entry can be.
+    """Map a message of type `target`. `span` is the position of findings that concern no single entry.
 
-    `auto` takes fields of `whole`, of the source message where that is None.
+    `auto` takes fields of `whole`, or of the source message if that is None.
     """
     builder = _Builder(scope, fields.span if fields else span, "item." if whole else "")
     given = builder.sort(fields.entries if fields else (), target)
@@ -66,9 +66,9 @@ def build(
 
 
 class _Builder:
-    """One mapping. `automatic` is everywhere the message whose fields fill those of the same name, if one does.
+    """Builds one mapping. `automatic` is the message whose fields fill those of the same name, or None.
 
-    `origin` leads to these fields in what a person reads: `item.`, or nothing where they are the source message's.
+    `origin` is the prefix of these fields in rows: `item.`, or nothing for the source message.
     """
 
     def __init__(self, scope: Scope, span: SourceSpan, origin: str) -> None:
@@ -81,7 +81,7 @@ class _Builder:
     # entries by field
 
     def sort(self, entries: Sequence[FieldEntry], target: MessageType) -> _Branch:
-        """The entries by field, those with unknown fields or given twice reported and left out."""
+        """The entries by field. Unknown fields and fields that are given twice are reported and left out."""
         root = _Branch(target)
         for entry in entries:
             if holders := self._holders(entry, target):
@@ -89,7 +89,7 @@ class _Builder:
         return root
 
     def _holders(self, entry: FieldEntry, target: MessageType) -> list[MessageType]:
-        """The types that the parts of the entry's path are fields of; none when it leads to no field."""
+        """The message types along the path of an entry, empty if it leads to no field."""
         holders: list[MessageType] = []
         holder: Type = target
         for name, span in zip(entry.path, entry.path_spans, strict=True):
@@ -164,7 +164,7 @@ class _Builder:
 
 
 def _text(expression: Expression) -> str:
-    """As the table has it, on one line."""
+    """An expression as the table has it, on one line."""
     if expression.items is not None:
         return f"[{', '.join(map(_text, expression.items))}]"
     return " ".join(expression.text.split())

@@ -35,14 +35,14 @@ Values = TypeVar("Values", bound=Sized)
 
 
 class Entry(NamedTuple):
-    """One entry of a protobuf map, with the names that its declaration gives both parts."""
+    """One entry of a protobuf map."""
 
     key: Any
     value: Any
 
 
 def entries(values: Mapping[Any, object]) -> tuple[Entry, ...]:
-    """A protobuf map as the list that it is on the wire, in the order of its keys: its own differs from run to run."""
+    """The entries of a protobuf map, sorted by key: its own order differs from run to run."""
     return tuple(Entry(key, values[key]) for key in sorted(values))
 
 
@@ -50,14 +50,14 @@ def entries(values: Mapping[Any, object]) -> tuple[Entry, ...]:
 
 
 def fit(x: int, low: int, high: int) -> int:
-    """Passes an integer that the target can hold."""
+    """Return an integer between `low` and `high`."""
     if low <= x <= high:
         return x
     raise MappingError(f"{x} is outside {low}..{high}")
 
 
 def fit_text(x: str | bytes, bound: int) -> str | bytes:
-    """Passes text or bytes of at most `bound` bytes."""
+    """Return text or bytes of at most `bound` bytes."""
     length = len(x.encode() if isinstance(x, str) else x)
     if length <= bound:
         return x
@@ -65,7 +65,7 @@ def fit_text(x: str | bytes, bound: int) -> str | bytes:
 
 
 def fit_wide_text(x: str, bound: int) -> str:
-    """Passes text of at most `bound` UTF-16 code units."""
+    """Return text of at most `bound` UTF-16 code units."""
     length = len(x.encode("utf-16-le")) // 2
     if length <= bound:
         return x
@@ -73,7 +73,7 @@ def fit_wide_text(x: str, bound: int) -> str:
 
 
 def fit_length(values: Values, least: int, most: int) -> Values:
-    """Passes a list of `least` to `most` elements."""
+    """Return a list of `least` to `most` elements."""
     if least <= len(values) <= most:
         return values
     wanted = str(most) if least == most else f"at most {most}"

@@ -1,4 +1,4 @@
-"""Who is who on the network: clashes between addresses, and destinations that lead back to the router."""
+"""Addresses: clashes between them, destinations that lead back to the router, and how senders are recognised."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOPBACK = "127."
 
 @dataclass(frozen=True, slots=True)
 class _Held:
-    """A local address, and how sentences call who wants it. UDP and TCP are out of each other's way."""
+    """A local address, and what findings call its owner. UDP and TCP addresses do not clash."""
 
     owner: str
     address: Located[Address]
@@ -60,7 +60,7 @@ def _held(table: RouteTable) -> Iterator[_Held]:
 
 
 def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Gateways that send to the router itself, or cannot be told apart in their Zenoh network."""
+    """Gateways that send to the router itself, or have the same Zenoh key."""
     keys: dict[str, Gateway] = {}
     for gateway in table.gateways.values():
         if gateway.address is not None and gateway.transport.value is Transport.UDP:
@@ -73,7 +73,7 @@ def _gateway_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 
 def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable) -> Iterator[Diagnostic]:
-    """Also where another gateway receives: two that name each other would send each other all for ever."""
+    """A gateway that sends to a listener or to a gateway of this table, which could go on for ever."""
     own = {f"listener '{listener.name}'": listener.address.value for listener in table.listeners.values()}
     for other in table.gateways.values():
         if other.receive is not None:
@@ -85,7 +85,7 @@ def _own_address(gateway: Gateway, address: Located[Address], table: RouteTable)
 
 
 def _overlap(one: _Held, other: _Held) -> bool:
-    """Whether the kernel refuses the second: it does unless both are bound to an interface, each to another one."""
+    """Whether the kernel refuses to bind both: it does unless they are bound to different interfaces."""
     if one.interface and other.interface and one.interface != other.interface:
         return False
     hosts = one.address.value.host, other.address.value.host
@@ -93,7 +93,7 @@ def _overlap(one: _Held, other: _Held) -> bool:
 
 
 def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
-    """Endpoints that name a listener there is not, and listeners that every endpoint which sends passes by."""
+    """Endpoints that name an unknown listener, and listeners that none of the sending endpoints may use."""
     for endpoint in table.endpoints.values():
         named = endpoint.listener
         if named and named.value not in table.listeners and not table.broken & {"listen", f"listen/{named.value}"}:
@@ -112,7 +112,7 @@ def _listener_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 
 def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | None:
-    """Two endpoints that a received datagram could both be from."""
+    """A finding if a received datagram could be from either endpoint."""
     if one.address.value.host != other.address.value.host or not sources & {one.name, other.name}:
         return None
     if one.listener and other.listener and one.listener.value != other.listener.value:
@@ -133,7 +133,7 @@ def _clash(one: Endpoint, other: Endpoint, sources: set[str]) -> Diagnostic | No
 def loop_finding(
     table: RouteTable, endpoint: Endpoint, span: SourceSpan, case: str, sources: AbstractSet[str]
 ) -> Diagnostic | None:
-    """A destination at `span` to which payloads of `case` from `sources` are sent: back to one, or to the router."""
+    """A finding if a destination, named at `span`, is one of `sources` of the same `case`, or the router itself."""
     if endpoint.name in sources:
         message = f"'{endpoint.name}' would get its own '{case}' back"
         return Diagnostic(span, Code.FORWARDING_LOOP, message, "remove it from the destinations or from the source")
@@ -153,12 +153,11 @@ def _reaches(address: Address, own: Address) -> bool:
 def recognisers(
     endpoints: Mapping[str, Endpoint], listener: str | None
 ) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
-    """How a sender's address becomes an endpoint's name: by IP address, and by (IP address, port).
+    """The names of endpoints by IP address, and by (IP address, port), for what `listener` receives.
 
-    Those are for what `listener` receives: an endpoint that is believed by another listener is not among them. None is
-    for datagrams that came by no listener of the table, and has all endpoints.
-    An IP address that several endpoints share without source ports recognises none of them; the table
-    may have that only where none is a source.
+    Endpoints of other listeners are left out. None is for datagrams that came by no listener of the table, and has all
+    endpoints. An IP address that several endpoints share without source ports recognises none of them; the table may
+    have that only where none is a source.
     """
     by_address: dict[tuple[str, int], str] = {}
     by_host: dict[str, list[str]] = {}

@@ -1,7 +1,7 @@
-"""The code that builds a payload of its plan with the protobuf classes, and puts the envelope around its bytes.
+"""Generate the code that builds a payload with the protobuf classes, and puts the envelope around its bytes.
 
-Fields are set one by one: that takes less time than constructors, and what protobuf refuses is blamed on the line
-of the table that it comes from. Expects a plan without findings.
+Fields are set one by one: that takes less time than constructors, and an error of protobuf has the position of the
+line of the table that it comes from. Expects a plan without findings.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _ONE_BYTE = 128
 
 
 def write_envelope(out: Source, plan: Record, case: PayloadCase, name: str) -> str:
-    """Appends the code that builds a payload. Returns the expression that is the bytes of the envelope with it.
+    """Append the code that builds a payload, and return the expression that is the bytes of its envelope.
 
-    `name` goes into the names of what the code calls; payloads of one function have different ones.
+    `name` is part of the names that the code calls, and different for each payload of a function.
     """
     methods = case.message_class  # called on the class: a field may have the name of a method
     make = out.constant(f"make_{name}", case.message_class)
@@ -46,7 +46,7 @@ def constant_envelope(plan: Record, case: PayloadCase) -> bytes:
 
 
 def _envelope(number: int) -> Callable[[bytes], bytes]:
-    """What puts tag and length of the payload case with this field number in front of a payload's bytes."""
+    """Return a function that puts tag and length of a payload case in front of a payload's bytes."""
     tag = _varint(number << 3 | 2)
     heads = tuple(tag + _varint(size) for size in range(_ONE_BYTE))
 
@@ -107,7 +107,7 @@ class _Writer:
     # repeated fields and maps
 
     def _add(self, where: str, inner: str, element: Plan) -> None:
-        """One element. `where` is the repeated field, `inner` a variable for an element that is a message."""
+        """Append one element. `where` is the repeated field, `inner` the variable for an element that is a message."""
         match element:
             case Leaf():
                 self.out.line(f"{where}.append({self._value(element)})", element.span)
@@ -131,7 +131,7 @@ class _Writer:
         self.out.line(f"{where}.extend({values})", each.span)
 
     def _put(self, where: str, inner: str, entry: Record) -> None:
-        """One entry of a map; of two with one key the later one stays."""
+        """Set one entry of a map; of two with the same key the later one stays."""
         plans = {member.name: made for member, made in entry.members}
         key, value = plans["key"], plans["value"]
         assert isinstance(key, Leaf)  # noqa: S101 - both parts are required
@@ -150,7 +150,7 @@ class _Writer:
         return self.out.expression(node)
 
     def _is_fit(self, leaf: Leaf) -> bool:
-        """protobuf refuses all that a field cannot hold, but makes an infinity of what is too large for a float32."""
+        """Whether protobuf takes the value as it is: it turns what is too large for a float32 into infinity."""
         return leaf.type != Float(32) or _is_read(leaf.node, self.computed)
 
     def _values(self, each: Each) -> str:
@@ -162,7 +162,7 @@ class _Writer:
 
 
 def _is_read(node: ast.expr, computed: set[str]) -> bool:
-    """Whether this is what a field holds, or was checked: where a float32 is wanted, no other than one can come."""
+    """Whether the value was read from a field, or checked: where a float32 is filled, it is one already."""
     match node:
         case ast.Constant() | ast.Attribute() | ast.Call(func=ast.Name("float32")):
             return True

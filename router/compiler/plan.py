@@ -1,6 +1,6 @@
-"""The plan of a message: a tree like the message, which says of each field where its value comes from.
+"""The plan of a message: a tree with its structure that says where the value of each field comes from.
 
-`mapping` makes plans, which fit their types; how they are written (CDR, protobuf) is for others.
+`mapping` makes plans; `cdr.writing` and `payload` generate code of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from router.types.model import Field, List, MessageType, Type
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One scalar. `constant` is its value where that is known now, else `node` computes it."""
+    """One scalar, which `node` computes; `constant` is its value if that is known at compile time."""
 
     type: Type
     node: ast.expr
@@ -37,7 +37,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Items:
-    """A list whose elements are each known by themselves."""
+    """A list with a plan for each element."""
 
     type: List
     items: tuple[Plan, ...]
@@ -46,7 +46,7 @@ class Items:
 
 @dataclass(frozen=True, slots=True)
 class Each:
-    """A list made of a list (or bytes): `element` fills one element from the one called `variable`."""
+    """A list made of a list (or bytes) `values`: `element` fills one element from the variable `variable`."""
 
     type: List
     values: ast.expr
@@ -57,7 +57,7 @@ class Each:
 
 @dataclass(frozen=True, slots=True)
 class Unset:
-    """A field that nothing fills: it keeps its default, or in protobuf stays absent."""
+    """A field that nothing fills: it keeps its default, or stays absent in protobuf."""
 
     type: Type
     default: object

@@ -32,7 +32,7 @@ from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
 _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Code.NO_DEADMAN})
-"""What a route may seem to do wrong because a part of it, which has a finding of its own, was left out."""
+"""Findings that are dropped for a route of which an invalid part, with a finding of its own, was left out."""
 
 
 def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
@@ -90,7 +90,7 @@ def _sources(lookup: Lookup, route: Route) -> None:
 
 
 def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:
-    """Those of a route, each with its endpoint, None where there is none; what is wrong with them is reported."""
+    """The destinations of a route, each with its endpoint, or None and a finding where there is none."""
     sources = {source.value for source in route.sources}
     seen: set[str] = set()
     for destination in route.destinations:
@@ -148,7 +148,7 @@ def _publish(
 
 
 def _frame_names(case: PayloadCase, span: SourceSpan) -> dict[str, Typed]:
-    """What the topics of a route that collects see beside the fields of the frame's first part."""
+    """What expressions of topics see beside the fields of a frame's first part."""
     items = Typed.at(span, ListKind(MessageKind(case.type)), load("items"))
     return {"items": items, "count": Typed.at(span, UINT32, load("count"))}
 
@@ -197,7 +197,7 @@ def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRo
 def _subscription(
     lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, found: Destinations
 ) -> CheckedSubscription | None:
-    """None where it is not known what `item` is: all that names it would only seem wrong."""
+    """A topic with its targets. None if the type of `item` is unknown, since every use of it would be a finding."""
     reads = CdrReads(ros_type)
     scope = lookup.scope(ros_type, reads, ros_type)
     stamp = _stamp(scope, topic.span) if route.ttl else None
@@ -230,7 +230,7 @@ def _subscription(
 
 
 def _stamp(scope: Scope, span: SourceSpan) -> Typed | None:
-    """`header.stamp` of a message that has one."""
+    """The field `header.stamp`, or None."""
     header = scope.message.field("header")
     if header is None or not isinstance(header.type, MessageType) or header.type.name != HEADER:
         return None
@@ -239,7 +239,7 @@ def _stamp(scope: Scope, span: SourceSpan) -> Typed | None:
 
 
 def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Typed | None:
-    """The list of `for_each`. An empty literal is no list that anything could be of."""
+    """The list of `for_each`, or None with a finding, also for an empty literal, whose elements have no type."""
     typed = lookup.value(expression, scope, (ListKind,), "'for_each' takes a list")
     if typed is not None and isinstance(typed.kind, ListKind) and typed.kind.element is None:
         lookup.report(typed.span, Code.TYPE_MISMATCH, "'for_each' takes a list with elements, not an empty one")
@@ -248,7 +248,7 @@ def _elements(lookup: Lookup, expression: Expression, scope: Scope) -> Typed | N
 
 
 def _element_names(elements: Typed) -> dict[str, Typed]:
-    """What expressions see beside the fields of the message that has the list."""
+    """What expressions see beside the fields of the message, with `for_each`."""
     assert isinstance(elements.kind, ListKind)  # noqa: S101 - see _elements
     assert elements.kind.element is not None  # noqa: S101
     return {
@@ -275,14 +275,14 @@ def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
 
 
 def _origins(route: Route, table: RouteTable) -> dict[str, Located[str]]:
-    """Where a route takes messages from: topics by their absolute names, which no endpoint has, or endpoints."""
+    """The sources of a route: topics by absolute name, which begins with `/`, or endpoints."""
     if route.is_outbound:
         return {resolved(topic.topic.value, table.node): topic.topic for topic in route.topics}
     return {source.value: source for source in route.sources}
 
 
 def _taken(key: str, taken: Mapping[str, SourceSpan]) -> str | None:
-    """What of `taken` stands in the way. `any` overlaps with all endpoints."""
+    """The entry of `taken` that clashes with `key`, or None. `any` clashes with all endpoints."""
     if key in taken:
         return key
     if key == ANY:

@@ -16,7 +16,7 @@ _WILDCARDS = re.compile(r"[*?]")
 _PART = re.compile(r"\*\*|(?:[A-Za-z0-9_?]|\*(?!\*))+")
 _ANY_PARTS = "**"
 _REMEMBERED = 4096
-"""Topics whose answers are kept: they are asked for again whenever the gateway looks for topics."""
+"""Topics whose answers are kept, as they are asked for at each discovery."""
 
 
 class PatternProblem(NamedTuple):
@@ -44,14 +44,14 @@ def pattern_problem(pattern: TopicPattern) -> PatternProblem | None:
 
 
 class _Answer(NamedTuple):
-    """What a topic is included by, and what its rate is of."""
+    """The pattern that includes a topic, and the entry of `rates` that applies to it."""
 
     chosen: TopicPattern | None
     rate: TopicRate | None
 
 
 class TopicSelector:
-    """The choice of one gateway. `inbound` are the absolute names of what its own clients publish."""
+    """Selects topics for one gateway. `inbound` are the absolute names of those that its clients publish on."""
 
     def __init__(self, settings: Gateway, inbound: Collection[str]) -> None:
         include = settings.include or (TopicPattern("/**", is_regex=False, span=settings.span),)
@@ -67,19 +67,19 @@ class TopicSelector:
         return self.chosen_by(topic) is not None
 
     def chosen_by(self, topic: str) -> TopicPattern | None:
-        """The first pattern that includes the topic; None where it is not sent.
+        """The first pattern that includes the topic, or None.
 
-        Hidden topics, and those that its clients publish, are sent only under their very name.
+        Hidden topics, and those that clients publish on, are included only by their own name.
         """
         return self._answers(topic).chosen
 
     def period(self, topic: str) -> int:
-        """In ns, or EACH."""
+        """The period of a topic in ns, or EACH."""
         rate = self._answers(topic).rate
         return rate.period if rate else self._publish_period
 
     def rated_by(self, topic: str) -> TopicPattern | None:
-        """The pattern of `rates` that the period is of; None where it is `publish_period`."""
+        """The pattern of `rates` that sets the period, or None for `publish_period`."""
         rate = self._answers(topic).rate
         return rate.pattern if rate else None
 
@@ -96,12 +96,12 @@ class TopicSelector:
 
 
 def is_hidden(topic: str) -> bool:
-    """ROS hides what has a part that begins with `_`, such as the topics of actions."""
+    """Whether ROS hides the topic: a part of its name begins with `_`, as with the topics of actions."""
     return any(part.startswith("_") for part in _parts(topic))
 
 
 def is_name(pattern: TopicPattern) -> bool:
-    """The pattern is the name of one topic."""
+    """Whether the pattern is the name of one topic."""
     return not pattern.is_regex and not _WILDCARDS.search(pattern.text)
 
 
@@ -117,7 +117,7 @@ def matcher(pattern: TopicPattern) -> Callable[[str], object]:
 
 
 def _regex(glob: str) -> str:
-    """`**` may stand for no part at all, but at the end: `/a/**` is what is below `/a`."""
+    """The regular expression of a glob. `**` matches any number of parts, at the end at least one."""
     *inner, last = _parts(glob)
     parts = [r"(?:/[^/]+)*" if part == _ANY_PARTS else _part_regex(part) for part in inner]
     return "".join([*parts, r"(?:/[^/]+)+" if last == _ANY_PARTS else _part_regex(last)])

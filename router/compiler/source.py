@@ -23,13 +23,13 @@ PLACEABLE = (ast.expr, ast.stmt, ast.excepthandler, ast.arg)
 
 
 def place(node: ast.expr | ast.stmt | ast.excepthandler | ast.arg, span: SourceSpan) -> None:
-    """Gives a syntax node the table's line and columns, these in characters (see `Source.compile`)."""
+    """Set the position of a syntax node to a line and columns of the table, in characters (see `Source.compile`)."""
     node.lineno = node.end_lineno = span.line
     node.col_offset, node.end_col_offset = span.column - 1, span.end_column - 1
 
 
 def placed(made: ast.expr, span: SourceSpan) -> ast.expr:
-    """The same expression, its new nodes placed at `span`; nodes that have a place keep it."""
+    """Set the position of nodes that have none to `span`, and return the expression."""
     for node in ast.walk(made):
         if isinstance(node, ast.expr) and not hasattr(node, "lineno"):
             place(node, span)
@@ -67,7 +67,7 @@ def _is_named(node: ast.AST) -> bool:
 
 
 class Source:
-    """One function in the making."""
+    """The source of one function, line by line."""
 
     def __init__(self) -> None:
         self.constants: dict[str, object] = {}
@@ -76,12 +76,12 @@ class Source:
         self._depth = 0
 
     def line(self, text: str, span: SourceSpan) -> None:
-        """Appends one line; `text` may hold what `expression` returned, and a comment."""
+        """Append one line; `text` may contain what `expression` returned, and a comment."""
         self._lines.append((INDENT * self._depth + text, span))
 
     @contextmanager
     def block(self, text: str, span: SourceSpan) -> Iterator[None]:
-        """Appends a line that ends in a colon, and indents what is appended inside."""
+        """Append a line that ends in a colon, and indent what is appended inside."""
         self.line(text, span)
         with self.indented():
             yield
@@ -93,12 +93,12 @@ class Source:
         self._depth -= 1
 
     def expression(self, node: ast.expr) -> str:
-        """A stand-in for a syntax tree, to be put into a line."""
+        """Return a placeholder for a syntax tree, to be put into a line."""
         self._expressions.append(node)
         return f"_expression_{len(self._expressions) - 1}_"
 
     def constant(self, name: str, value: object) -> str:
-        """A name for a value in the function's namespace: `name`, or `name_2` when that is taken."""
+        """Add a value to the function's namespace, and return its name: `name`, or `name_2` if that is taken."""
         unique, number = name, 1
         while unique in self.constants:
             number += 1
@@ -107,7 +107,7 @@ class Source:
         return unique
 
     def text(self) -> str:
-        """What `router explain` prints."""
+        """The source as text, which `router explain` prints."""
         return "\n".join(self._shown(line) for line, _ in self._lines) + "\n"
 
     def _shown(self, line: str) -> str:
@@ -123,7 +123,7 @@ class Source:
         return _PLACEHOLDER.sub(replaced, line)
 
     def tree(self) -> ast.Module:
-        """The same as a syntax tree with the table's positions."""
+        """The source as a syntax tree with the positions of the table."""
         module = ast.parse("\n".join(line for line, _ in self._lines))
         for node in ast.walk(module):
             if isinstance(node, PLACEABLE):
@@ -132,7 +132,7 @@ class Source:
         return grafted
 
     def compile(self, file: str) -> CodeType:
-        """Code whose tracebacks name `file` and have their carets under what is blamed in it."""
+        """Compile it. Tracebacks name `file`, with carets under the part of the table that is at fault."""
         tree = self.tree()
         linecache.checkcache(file)
         _count_bytes(tree, linecache.getlines(file))
@@ -140,9 +140,9 @@ class Source:
 
 
 def _count_bytes(tree: ast.Module, lines: Sequence[str]) -> None:
-    """Turns columns from characters into UTF-8 bytes, which is what they are for Python when it sets carets.
+    """Turn columns from characters into UTF-8 bytes, which Python expects for carets.
 
-    `lines` are from where a traceback will have them; a line that cannot be shown will have no carets.
+    `lines` are those that a traceback will show; a line that cannot be shown has no carets.
     """
     for node in ast.walk(tree):
         if isinstance(node, PLACEABLE) and node.lineno <= len(lines):

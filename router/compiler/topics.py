@@ -26,11 +26,11 @@ PROFILES: Mapping[str, QosPlan] = {
     "system_default": QosPlan("system_default", "system_default", "system_default", DEFAULT_DEPTH),
     "best_available": QosPlan("best_available", "best_available", "keep_last", DEFAULT_DEPTH),
 }
-"""rmw's profiles by rclpy's names."""
+"""The profiles of rmw, by rclpy's names."""
 
 
 def diagnostics_topic(node: NodeSettings) -> Topic | None:
-    """What ROS's monitors read, where the table asks for it."""
+    """The topic /diagnostics, if the table asks for it."""
     if node.diagnostics is None:
         return None
     span = node.diagnostics
@@ -57,7 +57,7 @@ def resolved(name: str, node: NodeSettings) -> str:
 
 
 def qos_of(topic: Topic) -> QosPlan:
-    """The complete QoS: the profile, what the table adds to it, and `queue_depth` as its depth."""
+    """The complete QoS: the profile, what the table says beside it, and `queue_depth` as its depth."""
     given = topic.qos
     plan = PROFILES[given.profile.value if given and given.profile else "default"]
     words = ("reliability", "durability", "history", "depth", "deadline", "lifespan", "liveliness",
@@ -69,7 +69,7 @@ def qos_of(topic: Topic) -> QosPlan:
 
 
 def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
-    """What one topic's QoS says twice, can never mean, or would let a subscriber do to the router."""
+    """Contradictions in the QoS of one topic, and a QoS with which one subscriber could block the router."""
     given = topic.qos
     if given is None:
         return
@@ -96,7 +96,7 @@ def qos_findings(topic: Topic, *, publishes: bool) -> Iterator[Diagnostic]:
 
 @dataclass(frozen=True, slots=True)
 class _Use:
-    """One mention of a topic in the table. `owner` is how sentences call the route or gateway that names it."""
+    """One mention of a topic in the table. `owner` is what findings call the route or gateway that names it."""
 
     topic: Topic
     owner: str
@@ -107,10 +107,10 @@ class _Use:
 
 
 def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagnostic]:
-    """Topics that several name: one type, one QoS for each direction, QoS that matches, no way back, and no deadman
-    that meets the messages of others.
+    """Check topics that several routes or gateways name.
 
-    Of a gateway these are the topics that its clients publish on.
+    They have one type, one QoS for each direction, matching QoS of publisher and subscriber, no way back to a sender,
+    and no deadman that publishes against others. Of a gateway these are the topics that its clients publish on.
     """
     for name, uses in _uses(table, routes).items():
         firsts = [uses[0], *[use for use in uses if use.publishes != uses[0].publishes][:1]]
@@ -126,7 +126,7 @@ def topic_findings(table: RouteTable, routes: Sequence[Route]) -> Iterator[Diagn
 
 
 def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_Use]]:
-    """By absolute name."""
+    """All mentions of topics by absolute name."""
     uses: dict[str, list[_Use]] = {}
     for use in _all_uses(table, routes):
         if topic_name_finding(use.topic) is None:
@@ -145,7 +145,7 @@ def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
 
 
 def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnostic]:
-    """Endpoints that would get back through a topic what they sent themselves."""
+    """Endpoints that would get their own messages back through a topic."""
     sources = {source.value for source in publisher.sources}
     for destination in subscriber.destinations:
         sender = destination.endpoint
@@ -156,7 +156,7 @@ def _echoes(name: str, publisher: Route, subscriber: Route) -> Iterator[Diagnost
 
 
 def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnostic]:
-    """A gateway's deadman knows only its own clients: it publishes against others, and feeds the deadmen of routes."""
+    """Deadmen of gateways that would publish against others, or keep the deadman of a route from tripping."""
     if use.deadman is None:
         return
     for other in others:
@@ -191,7 +191,7 @@ def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
 
 
 def _unheard(offered: QosPlan, requested: QosPlan) -> str:
-    """Why DDS would not match the two, empty when it does."""
+    """Why DDS would not match the two, or an empty string."""
     if offered.reliability == "best_effort" and requested.reliability == "reliable":
         return "it wants reliable and gets best_effort"
     if offered.durability == "volatile" and requested.durability == "transient_local":
@@ -206,5 +206,5 @@ def _unheard(offered: QosPlan, requested: QosPlan) -> str:
 
 
 def _is_longer(offered: int | None, requested: int | None) -> bool:
-    """None is for ever."""
+    """Whether a duration is longer than another; None is infinite."""
     return requested is not None and (offered is None or offered > requested)

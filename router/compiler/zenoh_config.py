@@ -1,4 +1,4 @@
-"""Checks the `config` of Zenoh gateways by the library itself, which opens nothing for that. Prints no value of it."""
+"""Check the `config` of Zenoh gateways with the library, which opens nothing for that. Findings quote no values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from router.table.model import Gateway, Networks, ZenohConfig
 from router.table.nodes import Path
 
 OWN_KEYS = {"mode": "mode", "connect/endpoints": "connect", "listen/endpoints": "listen"}
-"""Keys of the library that the table has beside `config`, and how it calls them."""
+"""Keys of the library that the table has beside `config`, with their names there."""
 
 
 CLIENT = "client"
@@ -22,7 +22,7 @@ CLIENT = "client"
 
 
 def library_config(config: ZenohConfig | None) -> zenoh.Config:
-    """Raises ZError, whose text may hold what is secret: see `reason`."""
+    """The library's configuration. Raises ZError, whose text may contain secrets: see `reason`."""
     made: zenoh.Config
     if config is None:
         made = zenoh.Config()
@@ -48,7 +48,7 @@ def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
 
 
 def scouting_findings(gateway: Gateway, networks: Networks) -> Iterator[Diagnostic]:
-    """What a gateway of Zenoh's does without being told an address: listen on all networks, and look for others."""
+    """A Zenoh gateway that listens on all networks, or looks for others, beside `networks`."""
     settings = gateway.zenoh
     try:
         config = library_config(settings.config) if settings else None
@@ -74,12 +74,12 @@ def scouting_findings(gateway: Gateway, networks: Networks) -> Iterator[Diagnost
 
 
 def is_default(config: zenoh.Config, key: str) -> bool:
-    """Whether it says of `key` what the library says by itself."""
+    """Whether `key` has its default."""
     return bool(config.get_json(key) == zenoh.Config().get_json(key))
 
 
 def reason(error: object) -> str:
-    """What an error of the library says, without the values that it quotes and the places in its own source."""
+    """The text of an error without the values that it quotes and the positions in the library's source."""
     text = re.sub(r" at /\S+:\d+\.?$", "", str(error).strip())
     if '{"access_control":' in text or "is invalid" in text:
         return "its values contradict each other, as a user without a password does"
@@ -95,7 +95,7 @@ _PLACED = (
     r"Error\(\"(?P<what>.*)\", line: (?P<line>\d+), column: (?P<column>\d+)\)",
     r"problem: \"(?P<what>[^\"]*)\", problem_mark: Mark { line: (?P<line>\d+), column: (?P<column>\d+)",
 )
-"""How the library tells places in JSON5 and in YAML. JSON5's has the line itself between place and sentence."""
+"""The forms in which the library reports positions in JSON5 and YAML. JSON5's has the line itself before the text."""
 
 
 def _without_values(text: str) -> str:
@@ -116,7 +116,7 @@ def _refusal(config: ZenohConfig, error: zenoh.ZError) -> Diagnostic:
 
 
 def _blamed(value: Any, here: Path, message: str) -> Path:
-    """The path of the innermost member of `value` that the library refuses in the same words without the others."""
+    """The path of the innermost member of `value` that alone makes the library refuse it with the same message."""
     if isinstance(value, (dict, list)) and _refused(here, type(value)()) != message:
         for step, member in value.items() if isinstance(value, dict) else enumerate(value):
             is_missing = message.startswith("missing field") and not isinstance(member, (dict, list))

@@ -1,8 +1,8 @@
-"""ROS messages as CDR bytes: code that fills them straight from a mapping's plan, and code that reads them.
+"""ROS messages as CDR bytes: generated code that writes them from a mapping's plan, and code that reads them.
 
 Plain CDR, little-endian (XCDR1, as Fast DDS and Cyclone DDS speak it): four bytes of header, then each
 scalar aligned to its own size counted from behind the header. Up to the first string or sequence of
-unknown length all offsets are known when the code is made, so that whole stretch is one `struct` call.
+unknown length all offsets are known when the code is generated, so that one `struct` call does.
 """
 
 from __future__ import annotations

@@ -48,18 +48,18 @@ def scalar_format(declared: Type) -> str:
 
 
 def refuse(representation: bytes) -> None:
-    """Raises MappingError for a message in another representation than CDR_LE, or without any."""
+    """Raise MappingError for a message in another representation than CDR_LE, or in none."""
     name = _OTHERS.get(representation, "of an unknown kind")
     raise MappingError(f"the message is {name} (0x{representation.hex()}), not CDR_LE")
 
 
 def cut_off(cdr: bytes) -> None:
-    """Raises MappingError for a message that ends before its last field does."""
+    """Raise MappingError for a message that ends before its last field."""
     raise MappingError(f"the message ends after {len(cdr)} bytes, within a string or list")
 
 
 def text(data: bytes) -> str:
-    """A string from its bytes with the final NUL. Some writers leave it out where the string is empty."""
+    """A string from its bytes with the final NUL, which some writers leave out of empty strings."""
     if data and data[-1]:
         raise MappingError("a string does not end with NUL")
     return data[:-1].decode()
@@ -80,14 +80,14 @@ def wide_texts(many: Iterable[bytes]) -> list[str]:
 
 
 def numbers(letter: str, size: int, data: bytes) -> tuple[int | float, ...]:
-    """Scalars in a row; `size` is that of one."""
+    """Scalars of `size` bytes each."""
     return struct.unpack(f"<{len(data) // size}{letter}", data)
 
 
 def object_class(declared: MessageType) -> type[tuple[object, ...]]:
-    """A class whose objects are made of a tuple of all fields and have those as attributes.
+    """A class whose objects are made of a tuple of all fields, which are its attributes.
 
-    A tuple below, because nothing else is made as quickly. Fields may be called as Python keywords are.
+    It is a tuple since that is the fastest to make. Fields may have the names of Python keywords.
     """
     fields = {member.name: property(itemgetter(index)) for index, member in enumerate(declared.fields)}
     return type(declared.short_name, (tuple,), {"__slots__": (), **fields})
@@ -97,7 +97,7 @@ def object_class(declared: MessageType) -> type[tuple[object, ...]]:
 
 
 def put_text(data: bytearray, text: str) -> None:
-    """Appends a string: its length with the final NUL, its bytes, the NUL."""
+    """Append a string: its length with the final NUL, its bytes, the NUL."""
     encoded = text.encode()
     if b"\0" in encoded:
         raise MappingError("a ROS string cannot hold a NUL")
@@ -108,7 +108,7 @@ def put_text(data: bytearray, text: str) -> None:
 
 
 def put_wide_text(data: bytearray, text: str) -> None:
-    """Appends a wstring: its length in UTF-16 code units, and each of those in 32 bits, as rmw_fastrtps does it.
+    """Append a wstring: its length in UTF-16 code units, and each of those in 32 bits, as rmw_fastrtps does it.
 
     There is no final NUL.
     """
@@ -119,14 +119,14 @@ def put_wide_text(data: bytearray, text: str) -> None:
 
 
 def put_numbers(data: bytearray, letter: str, size: int, values: Sequence[object]) -> None:
-    """Appends the elements of a list of scalars, without its length."""
+    """Append the elements of a list of scalars, without its length."""
     if values:
         data += _PADDING[-len(data) % size]
         data += struct.pack(f"<{len(values)}{letter}", *values)
 
 
 def put_length(data: bytearray, length: int, bound: int | None) -> None:
-    """Appends the length of a sequence."""
+    """Append the length of a sequence."""
     if bound is not None and length > bound:
         raise MappingError(f"{length} elements are more than {bound}")
     data += _PADDING[-len(data) & 3]
@@ -134,6 +134,6 @@ def put_length(data: bytearray, length: int, bound: int | None) -> None:
 
 
 def want_length(length: int, wanted: int) -> None:
-    """Raises MappingError when a list is not as long as the array that it fills."""
+    """Raise MappingError if a list is not as long as the array that it fills."""
     if length != wanted:
         raise MappingError(f"{length} elements where an array takes {wanted}")

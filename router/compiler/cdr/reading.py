@@ -24,7 +24,7 @@ from router.types.model import Field, List, MessageType, String, Type
 
 @dataclass(frozen=True, slots=True)
 class Take:
-    """Bytes of known size: `format` is what struct makes of them, `variable` where that goes, None for nowhere."""
+    """Bytes of known size: `format` is for struct, `variable` gets the value, None skips it."""
 
     format: str
     alignment: int
@@ -36,12 +36,12 @@ class Take:
 
 
 LENGTH = Take("I", 4, "length")
-"""What stands before a Stretch, before a Loop of no known count, and before a Leap."""
+"""The length before a Stretch, a Leap, and a Loop without a known count."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """A string or a sequence of scalars: `length` units of `size` bytes. `letter` where they become numbers."""
+    """A string or a sequence of scalars: `length` units of `size` bytes. With `letter`, they become numbers."""
 
     size: int
     variable: str | None
@@ -50,7 +50,7 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """`body` again and again, `count` times or else `length`; it leaves in `element` what the list `variable` gets."""
+    """`body`, repeated `count` times, or `length` times if that is None; the list `variable` gets each `element`."""
 
     count: int | None
     body: tuple[Step, ...]
@@ -60,14 +60,14 @@ class Loop:
 
 @dataclass(frozen=True, slots=True)
 class Leap:
-    """A sequence that nobody wants, of `length` messages of known size: no need to look at each."""
+    """An unwanted sequence of `length` messages of known size, skipped at once."""
 
     element: tuple[Take, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Object:
-    """An object of a message's class, of the expressions that are its fields."""
+    """An object made for a message, from the expressions `fields`."""
 
     variable: str
     type: MessageType
@@ -76,7 +76,7 @@ class Object:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A time or a duration, in ns, of its two fields."""
+    """A time or a duration in ns, made from its two fields."""
 
     variable: str
     seconds: str
@@ -85,7 +85,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Unpack:
-    """An array of scalars, of which a Take has left the bytes in `variable`."""
+    """An array of scalars, made from the bytes that a Take has left in `variable`."""
 
     variable: str
     letter: str
@@ -93,13 +93,13 @@ class Unpack:
 
 
 Made = Union[Object, Moment, Unpack]
-"""What is made of others that were read before."""
+"""Values that are made from others that were read before."""
 
 Step = Union[Take, Stretch, Loop, Leap, Made]
 
 
 def steps(message: MessageType, wanted: Collection[Path], variable: Callable[[Path], str]) -> Sequence[Step]:
-    """`wanted` are paths of fields, or of messages that become objects; `variable` names what is at a path."""
+    """The steps that read `wanted`: paths of fields, or of messages that become objects. `variable` names paths."""
     found = list(_Walk(wanted, variable).message(message, ()))
     while found and not _is_wanted(found[-1]):
         found.pop()
@@ -122,13 +122,13 @@ class _Walk:
     variable: Callable[[Path], str]
 
     def value(self, declared: Type, path: Path) -> str:
-        """The expression that is a field's whole value, once its steps are done."""
+        """The expression that is a field's whole value after its steps."""
         variable = self.variable(path)
         decode = decoder(declared)
         return f"{decode}({variable})" if decode else variable
 
     def steps(self, declared: Type, path: Path, whole: bool) -> Iterator[Step]:
-        """`whole` where all of a message around it is wanted."""
+        """The steps of one field. `whole` says that all of a message around it is wanted."""
         whole = whole or path in self.wanted
         variable = self.variable(path) if whole else None
         match declared:
@@ -172,7 +172,7 @@ class _Walk:
             yield Unpack(variable, letter, size)
 
     def _elements(self, declared: List, path: Path, variable: str | None) -> Iterator[Step]:
-        """Of a list whose elements are messages or strings."""
+        """The steps of a list whose elements are messages or strings."""
         item = (*path, "item")
         body = tuple(self.steps(declared.element, item, variable is not None))
         fixed = tuple(step for step in body if isinstance(step, Take))
@@ -185,7 +185,7 @@ class _Walk:
 
 
 def decoder(declared: Type) -> str | None:
-    """The function that makes text of what is read for a field; None where that is the value already."""
+    """The function that decodes the text of a field, None for other types."""
     match declared:
         case String():
             return "wide_text" if declared.wide else "text"
@@ -197,13 +197,13 @@ def decoder(declared: Type) -> str | None:
 
 _PHASES = range(8)
 _ORIGIN = len(HEADER)
-"""Where in the bytes alignment counts from."""
+"""The offset that alignment counts from."""
 _WIDEST = 80
-"""How many characters of names are put on one line."""
+"""Characters of names on one line."""
 
 
 def _layout(takes: Iterable[Take], start: int) -> tuple[str, int]:
-    """Struct format and size of what begins at `start`, where this many more bytes than it takes mean nothing."""
+    """Struct format and size of takes that begin at offset `start`."""
     letters, skipped, at = ["<"], 0, start
     for take in takes:
         padding = (_ORIGIN - at) % take.alignment
@@ -219,9 +219,9 @@ def _layout(takes: Iterable[Take], start: int) -> tuple[str, int]:
 
 
 def _leaps(element: Sequence[Take]) -> tuple[list[int], int]:
-    """The size of a first message of known size by the phase it begins at, and that of each one which follows.
+    """The size of a first message by the phase it begins at, and the size of each following one.
 
-    Behind a scalar the phase is known modulo its size, so from the second message on all are of one size.
+    Behind a scalar the phase is known modulo its size, so all messages from the second on have one size.
     """
     sizes = [_layout(element, phase)[1] for phase in _PHASES]
     second = sizes[0] % 8
@@ -229,14 +229,14 @@ def _leaps(element: Sequence[Take]) -> tuple[list[int], int]:
 
 
 class ReadingCode:
-    """Appends to a function the lines that read `cdr`. `at` is known now as long as that is possible."""
+    """Appends to a function the lines that read `cdr`. `at` is the offset as long as it is known, then None."""
 
     def __init__(self, out: Source, span: SourceSpan, at: int | None = _ORIGIN) -> None:
         self.out = out
         self.span = span
         self.at = at
         self.is_checked = True
-        """Whether `struct` has seen that the bytes reach as far as has been read."""
+        """Whether `struct` has checked that the bytes reach as far as has been read."""
         self._is_behind = False
         self._together: list[Take] = []
         self._made: list[Made] = []
@@ -255,7 +255,7 @@ class ReadingCode:
         self._flush()
 
     def _vary(self, step: Stretch | Loop | Leap) -> None:
-        """What has its length in the message."""
+        """Append a step whose length is in the message."""
         match step:
             case Stretch():
                 self._stretch(step)
@@ -265,7 +265,7 @@ class ReadingCode:
                 self._leap(step)
 
     def _advance(self) -> None:
-        """Brings `at` behind what was unpacked last; not needed where nothing follows."""
+        """Move `at` behind what was unpacked last; not needed if nothing follows."""
         if self._is_behind:
             self._line("at += size")
             self._is_behind = False
@@ -274,7 +274,7 @@ class ReadingCode:
         self.out.line(text, self.span)
 
     def _spread(self, before: str, names: Sequence[str], after: str) -> None:
-        """A statement with a tuple in it, one name a line where they are too many for one."""
+        """Append a statement around a tuple, one name a line if they are too many."""
         together = f"({names[0]},)" if len(names) == 1 else f"({', '.join(names)})"
         if len(together) <= _WIDEST:
             self._line(f"{before}{together}{after}")
@@ -286,7 +286,7 @@ class ReadingCode:
         self._line(f"){after}")
 
     def _flush(self) -> None:
-        """Reads what has come together, and makes what waits for it."""
+        """Append the code for collected takes, and for the values that are made from them."""
         takes, made = self._together, self._made
         self._together, self._made = [], []
         if takes:
@@ -328,7 +328,7 @@ class ReadingCode:
                 self._spread(f"{made.variable} = {make}(", made.fields, ")")
 
     def _float(self) -> None:
-        """From here on `at` is a variable."""
+        """Make `at` a variable from here on."""
         if self.at is not None:
             self._line(f"at = {self.at}")
             self.at = None
@@ -373,10 +373,10 @@ class ReadingCode:
 
 
 class CdrReads(Reads):
-    """A serialized ROS message. What is read: every field that was asked for, up to the last of them.
+    """Reads of a serialized ROS message: the fields that were asked for, up to the last of them.
 
-    The code raises MappingError or struct.error when the bytes are no such message. Strings are decoded where they
-    are used: a bad one concerns only who uses it.
+    The code raises MappingError or struct.error if the bytes are no such message. Strings are decoded where they
+    are used, so that an invalid one affects only the targets that use it.
     """
 
     def __init__(self, message: MessageType) -> None:

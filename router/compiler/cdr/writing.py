@@ -20,12 +20,12 @@ from router.errors import SourceSpan
 from router.types.model import Bool, Float, List, MessageType, String, Type
 
 _EMPTY = b"\0"
-"""What stands for a message without fields: IDL has none, so rosidl adds `structure_needs_at_least_one_member`."""
+"""A message without fields: IDL has none, so rosidl adds the byte `structure_needs_at_least_one_member`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Put:
-    """A scalar: `format` is its struct letter, so its size and alignment; `node` computes it."""
+    """A scalar, which `node` computes. `format` is its struct letter, and gives its size and alignment."""
 
     format: str
     node: ast.expr
@@ -40,7 +40,7 @@ class Put:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """Bytes known now, aligned as their first scalar."""
+    """Bytes known at compile time, aligned as their first scalar."""
 
     data: bytes
     alignment: int
@@ -52,7 +52,7 @@ class Blob:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A string that only the value tells; `wide` for a wstring."""
+    """A string known at run time; `wide` for a wstring."""
 
     node: ast.expr
     wide: bool
@@ -61,7 +61,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Repeat:
-    """`body` once for each of `values`, which it finds in `variable`."""
+    """`body` once for each of `values`, each in the variable `variable`."""
 
     type: List
     values: ast.expr
@@ -98,7 +98,7 @@ def steps(plan: Plan) -> Iterable[Step]:  # noqa: C901 - a case a plan
 
 
 def _default(declared: Type, default: Any) -> Iterable[Step]:
-    """A field that nothing fills, as rclpy's constructor leaves it; `default` is None or what its type holds."""
+    """The steps of a field that nothing fills: the same value as rclpy's constructor gives it."""
     match declared:
         case MessageType():
             for member in declared.fields:
@@ -116,7 +116,7 @@ def _default(declared: Type, default: Any) -> Iterable[Step]:
 
 
 def _zero(declared: Type) -> object:
-    """What ROS gives a scalar field without a declared default."""
+    """The default that ROS gives a scalar field."""
     match declared:
         case Bool():
             return False
@@ -160,14 +160,14 @@ def message_size(plan: Record) -> tuple[int, bool]:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """Scalars and known bytes in a row."""
+    """Consecutive scalars and known bytes."""
 
     parts: tuple[Put | Blob, ...]
 
     def static(self, prefix: bytes) -> tuple[str, list[Put | bytes]]:
-        """Struct format and arguments where the run begins at offset 0, behind `prefix`.
+        """Struct format and arguments for a run at offset 0, behind `prefix`.
 
-        Known neighbours and the padding between them become one argument.
+        Neighbouring known bytes and the padding between them become one argument.
         """
         letters, arguments, known, offset = ["<"], list[Union[Put, bytes]](), bytearray(prefix), 0
         for part in self.parts:
@@ -185,7 +185,7 @@ class _Run:
         return "".join(letters), arguments
 
     def floating(self, phase: int) -> tuple[str, list[Put | bytes]]:
-        """The same where the run begins at an offset of `phase` modulo 8: equal arguments for each phase."""
+        """Struct format and arguments for a run at an offset of `phase` modulo 8; all phases have equal arguments."""
         letters, arguments, offset = ["<"], list[Union[Put, bytes]](), phase
         for part in self.parts:
             padding = -offset % part.alignment
@@ -208,9 +208,9 @@ def _add_known(data: bytes, letters: list[str], arguments: list[Put | bytes]) ->
 
 
 def write_message(out: Source, plan: Record, name: str) -> str:
-    """Appends the code that makes the CDR bytes of a message. Returns the expression that is the bytes.
+    """Append the code that makes the CDR bytes of a message, and return the expression that is the bytes.
 
-    `name` goes into the names of packers and known bytes; messages of one function have different ones.
+    `name` is part of the names of packers and known bytes, and different for each message of a function.
     """
     runs = _runs(steps(plan))
     first = runs[0] if isinstance(runs[0], _Run) else _Run(())
@@ -225,7 +225,7 @@ def write_message(out: Source, plan: Record, name: str) -> str:
 
 
 def _runs(sequence: Iterable[Step]) -> list[_Run | Text | Repeat]:
-    """Never empty; neighbouring scalars and known bytes are one run."""
+    """The steps with neighbouring scalars and known bytes joined into runs; never empty."""
     found: list[_Run | Text | Repeat] = []
     together: list[Put | Blob] = []
     for step in sequence:
@@ -242,7 +242,7 @@ def _runs(sequence: Iterable[Step]) -> list[_Run | Text | Repeat]:
 def _call(
     out: Source, statement: str, name: str, function: str, arguments: Sequence[Put | bytes], span: SourceSpan
 ) -> None:
-    """A statement around a call with one argument a line."""
+    """Append a statement around a call, one argument a line."""
     before, _, after = statement.partition("{}")
     out.line(f"{before}{function}(", span)
     with out.indented():
@@ -255,7 +255,7 @@ def _call(
 
 
 def _write(out: Source, runs: Iterable[_Run | Text | Repeat], name: str, span: SourceSpan) -> None:
-    """What comes after the first string or sequence: offsets are known when it runs, modulo 8."""
+    """Append the code behind the first string or sequence, where offsets are known at run time, modulo 8."""
     for run in runs:
         match run:
             case _Run():

@@ -1,7 +1,7 @@
 """The expressions of a table: a closed subset of Python, checked, typed and turned into Python syntax.
 
-`checker` walks an expression and asks the modules beside it for the rules. None of them knows of the field that an
-expression fills, but for the bounds that clamp() and wrap() take from it: whether a value fits is `conversion`'s.
+`checker` walks an expression and applies the rules of the modules beside it. Whether the value fits the field that it
+fills is checked in `conversion`.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from router.table.model import Expression
 from router.types.model import Enum, Int, List, MessageType, String, Type
 
 DEEPEST = 60
-"""How deep an expression may nest: what handles syntax trees, ours and Python's own, does so recursively."""
+"""How deep an expression may nest, since Python's and our functions on syntax trees are recursive."""
 
 
 def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Typed:
@@ -44,7 +44,7 @@ def _element(expected: Type | None) -> Type | None:
 
 @dataclass(slots=True)
 class _Checker:
-    """One expression. Each method takes a syntax node of the user's and returns it checked and resolved."""
+    """Checks one expression. Each method takes a syntax node of the user and returns it checked and resolved."""
 
     text: Parsed
     scope: Scope
@@ -102,7 +102,7 @@ class _Checker:
         return call_of(function, [self.check(argument) for argument in node.args], span, expected)
 
     def _has(self, node: ast.Call, span: SourceSpan) -> Typed:
-        """Looks at a field rather than at its value, so the argument's path counts; checked it is all the same."""
+        """`has(field)` takes the path of its argument instead of the value; the argument is checked as well."""
         path = field_path(node.args[0], self.scope) if len(node.args) == 1 else None
         if not path:
             raise ExpressionError(span, Code.WRONG_ARGUMENTS, "has() takes one field")
@@ -111,7 +111,7 @@ class _Checker:
 
 
 def named(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -> Typed:
-    """A name that stands alone. `expected` is what it is to fill."""
+    """A name that stands alone. `expected` is the type of the field that it fills."""
     if text in scope.names:
         return scope.variable(text, span)
     if member := scope.message.field(text):
@@ -144,7 +144,7 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
 
 
 def _of_an_enum(text: str, scope: Scope) -> str:
-    """A hint for an enum's value that stands without its enum; one of the message's own fields comes first."""
+    """A hint for an enum value without its enum; enums of the message's own fields come first."""
     homes = [enum for enum in scope.enums if text in dict(enum.values)]
     types = [member.type for member in scope.message.fields]
     own = [home for home in homes if home in types] or homes
@@ -206,7 +206,7 @@ def _constants(holder: Enum | MessageType) -> Mapping[str, object]:
 
 
 def field_path(node: ast.expr, scope: Scope) -> tuple[str, ...] | None:
-    """The names that lead from the source message to what `node` looks like; None when it is no chain of names."""
+    """The path from the source message that `node` stands for; None if it is no chain of names."""
     path = dotted(node)
     if path is None or path[0] in scope.names:
         return None

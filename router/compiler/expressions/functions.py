@@ -110,7 +110,7 @@ def _double(kinds: Sequence[Kind]) -> Kind:
 
 
 def _integer(kinds: Sequence[Kind]) -> Kind:
-    """Integers stay what they are; of a float only the value at run time tells."""
+    """The same integer, or one of unknown range for a float."""
     return as_int(kinds[0]) or ANY_INT
 
 
@@ -128,7 +128,7 @@ def _absolute(kinds: Sequence[Kind]) -> Kind:
 
 
 def _extreme(pick: Callable[[list[int]], int]) -> Rule:
-    """For min() and max(): the picked one of the low bounds to the picked one of the high bounds."""
+    """For min() and max(): from the picked low bound to the picked high bound."""
 
     def result(kinds: Sequence[Kind]) -> Kind:
         known = [bounds for kind in kinds if (bounds := _bounds(kind))]
@@ -155,7 +155,7 @@ def _wrapped(kinds: Sequence[Kind]) -> Kind:
     if low is None or high is None:
         return ANY_INT
     _want_ordered(low[0], high[1])
-    # Only the value tells where the bounds may be the wrong way round.
+    # If the bounds may be the wrong way round, the range is known at run time only.
     return IntKind(low[0], high[1]) if low[1] <= high[0] else ANY_INT
 
 
@@ -270,7 +270,7 @@ FUNCTIONS: Mapping[str, Function] = {function.name: function for function in _DE
 """By name, without `has`."""
 
 NOT_FINITE: Mapping[str, float] = {"nan": math.nan, "inf": math.inf}
-"""What no literal gives, by the name that it has in expressions; a field of that name wins."""
+"""Values without literals, by name; a field of that name wins."""
 
 HAS = "has"
-"""`has(field)` looks at a field rather than at its value, and so is part of the syntax."""
+"""`has(field)` takes a field instead of its value, so it is part of the syntax."""

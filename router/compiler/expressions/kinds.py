@@ -1,7 +1,7 @@
 """What an expression can be: the static types of the expression language, with integer ranges.
 
-A kind says more than a field's type (the range of an integer, the length of a list) and less (a
-`uint8` and an `int32` are both integers). Knows no syntax and no code generation.
+A kind says more than a field's type (the range of an integer, the length of a list) and less (a `uint8` and an `int32`
+are both integers).
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ TIME_TYPES = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/D
 """ROS messages that expressions see as one value: a time or a duration, in nanoseconds."""
 
 INT32 = Int(32, signed=True)
-"""What an enum can be."""
+"""The values of an enum."""
 
 OCTET = Int(8, signed=False)
-"""What an element of bytes can be."""
+"""An element of bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +29,14 @@ class BoolKind:
 
 @dataclass(frozen=True, slots=True)
 class IntKind:
-    """An integer between `low` and `high`; None where only the value at run time tells."""
+    """An integer between `low` and `high`; None if the bounds are known at run time only."""
 
     low: int | None
     high: int | None
 
     @property
     def bounds(self) -> tuple[int, int] | None:
-        """Both, or None where only the value at run time tells."""
+        """Both bounds, or None if they are known at run time only."""
         return None if self.low is None or self.high is None else (self.low, self.high)
 
     def __str__(self) -> str:
@@ -51,7 +51,7 @@ class IntKind:
 
 @dataclass(frozen=True, slots=True)
 class FloatKind:
-    """`bits` is 64 when a double went in, so that filling a float32 would lose digits that were there."""
+    """`bits` is 64 if a double went in, so that a float32 would lose digits."""
 
     bits: int
 
@@ -97,7 +97,7 @@ class MessageKind:
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
-    """`length` is None where only the value at run time tells. An empty literal has no element."""
+    """`length` is None if it is known at run time only. An empty literal has no `element`."""
 
     element: Kind | None
     length: int | None = None
@@ -108,7 +108,7 @@ class ListKind:
 
 ANY_INT = IntKind(None, None)
 UINT32 = IntKind(0, 0xFFFF_FFFF)
-"""How many there are of something, and which of them one is."""
+"""A number of elements, and the index of one."""
 
 Kind = Union[BoolKind, IntKind, FloatKind, StringKind, BytesKind, EnumKind, TimeKind, MessageKind, ListKind]
 Number = (IntKind, FloatKind, EnumKind)
@@ -116,7 +116,7 @@ Number = (IntKind, FloatKind, EnumKind)
 
 
 def kind_of(declared: Type) -> Kind:
-    """What reading a field of this type gives."""
+    """The kind of a field of this type."""
     match declared:
         case Bool():
             return BoolKind()
@@ -144,7 +144,7 @@ def as_int(kind: Kind) -> IntKind | None:
 
 
 def float_bits(kind: Kind) -> int:
-    """How wide a float result is when this number goes in; integers leave it to the others."""
+    """The width that this number requires of a float result; integers require 32."""
     return kind.bits if isinstance(kind, FloatKind) else 32
 
 

@@ -32,7 +32,7 @@ from router.compiler.expressions.syntax import forbidden
 from router.errors import Code, SourceSpan
 
 WIDEST = 512
-"""How many bits an integer may have on the way to a field."""
+"""Bits of the widest integer in an expression."""
 
 
 def constant(value: object, span: SourceSpan) -> Typed:
@@ -52,14 +52,14 @@ def constant(value: object, span: SourceSpan) -> Typed:
 
 
 def within_bounds(kind: Kind, span: SourceSpan) -> Kind:
-    """Keeps powers of powers from taking all memory, here and at run time."""
+    """Refuse integers of more than WIDEST bits, so that powers of powers do not take all memory."""
     if isinstance(kind, IntKind) and kind.bounds and max(bound.bit_length() for bound in kind.bounds) > WIDEST:
         raise ExpressionError(span, Code.OUT_OF_RANGE, f"an integer has at most {WIDEST} bits")
     return kind
 
 
 def folded(result: Typed) -> Typed:
-    """Arithmetic of two literals is done here, so that what it comes to is checked against the target."""
+    """The literal that arithmetic of two literals gives, so that it is checked against the target."""
     try:
         value = eval(compile(ast.Expression(result.node), "<literal>", "eval"), {})  # noqa: S307 - two literals
     except ArithmeticError as error:
@@ -101,7 +101,7 @@ _MONOTONE: dict[type[ast.operator], Callable[[int, int], int]] = {
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
 }
-"""Operators whose extremes are at the extremes of their operands."""
+"""Operators whose result is extreme at the extremes of the operands."""
 
 _DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
 
@@ -160,7 +160,7 @@ def _arithmetic(op: ast.operator, left: Kind, right: Kind, span: SourceSpan) -> 
 
 
 def _extremes(op: ast.operator, left: tuple[int, int], right: tuple[int, int]) -> list[int]:
-    """Integers among which are the smallest and the largest that `left op right` can be."""
+    """Integers that include the smallest and the largest value of `left op right`."""
     low, high = right
     if compute := _MONOTONE.get(type(op)):
         return [compute(x, y) for x in left for y in right]
@@ -214,7 +214,7 @@ def comparison(ops: list[ast.cmpop], operands: Sequence[Typed], span: SourceSpan
 
 
 def _comparable_value(held: Typed, written: Typed) -> str:
-    """A hint where an enum meets the name of one of its values in quotes, else nothing."""
+    """A hint if an enum is compared with the quoted name of one of its values, else an empty string."""
     if not isinstance(held.kind, EnumKind) or not isinstance(written.node, ast.Constant):
         return ""
     enum, value = held.kind.enum, written.node.value
@@ -242,7 +242,7 @@ def _want_comparable(op: ast.cmpop, left: Typed, right: Typed, span: SourceSpan)
 
 
 def choice(test: Typed, body: Typed, orelse: Typed, span: SourceSpan) -> Typed:
-    """`body if test else orelse`; that the test is a bool was seen to before."""
+    """`body if test else orelse`, where `test` is a bool."""
     kind = join(body.kind, orelse.kind)
     if kind is None:
         message = f"this is {body.kind} or {orelse.kind}, which no field holds"

@@ -28,7 +28,7 @@ class ExpressionError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Typed:
-    """A checked expression: what it is, as Python, and which stretch of the table says so.
+    """A checked expression: its kind, its Python syntax, and its position in the table.
 
     `items` are the elements of a list literal; `path` leads to a submessage of the source message.
     """
@@ -49,7 +49,7 @@ class Typed:
         items: tuple[Typed, ...] | None = None,
         path: tuple[str, ...] | None = None,
     ) -> Typed:
-        """The same for syntax that was just made: what of it has no place yet is placed at `span`."""
+        """Make it of new syntax, whose nodes without a position get `span`."""
         return cls(kind, placed(node, span), span, items, path)
 
     @property
@@ -63,14 +63,14 @@ Path = tuple[str, ...]
 
 
 def value_of(message: ast.expr, member: Field) -> ast.expr:
-    """A field of a message that is there as an object. A protobuf map is read as the list of its entries."""
+    """A field of a message object. A protobuf map is read as the list of its entries."""
     value = attribute(message, member.name)
     element = member.type.element if isinstance(member.type, List) else None
     return call("entries", value) if isinstance(element, MessageType) and element.is_map_entry else value
 
 
 class Reads(ABC):
-    """The source message as the expressions of one or several targets see it. Remembers what they ask for."""
+    """Variables for the source message in the expressions of one or several targets. Collects what they use."""
 
     def __init__(self) -> None:
         self.variables: dict[Path, str] = {(): "m"}
@@ -86,19 +86,19 @@ class Reads(ABC):
 
     @abstractmethod
     def need_objects(self, node: ast.expr) -> None:
-        """Told of each expression that is more than a path: a message in it must be there as an object."""
+        """Called for each expression that is more than a path: messages in it have to be objects."""
 
     @abstractmethod
     def write(self, out: Source, span: SourceSpan) -> None:
-        """Appends the statements that make what the expressions use; to be called when all of them are checked."""
+        """Append the statements that make the variables, once all expressions are checked."""
 
     def loop(self) -> str:
-        """A variable for the elements of a list, another one each time."""
+        """A new variable for the elements of a list."""
         self._loops += 1
         return f"item_{self._loops}"
 
     def _variable(self, path: Path) -> str:
-        """The variable for what is at a path, the same each time."""
+        """The variable for a path, the same each time."""
         if path not in self.variables:
             variable = "_".join((self.variables[()], *path))
             while variable in self.variables.values():  # a.b_c and a_b.c
@@ -108,7 +108,7 @@ class Reads(ABC):
 
 
 class ParsedReads(Reads):
-    """A parsed protobuf message `m`: each submessage that expressions look into is bound once."""
+    """Reads of a parsed protobuf message `m`: each submessage that expressions use is bound once."""
 
     def field(self, holder: Path, member: Field) -> ast.expr:
         return value_of(self.message(holder), member)
@@ -119,7 +119,7 @@ class ParsedReads(Reads):
         return load(self._variable(path))
 
     def need_objects(self, node: ast.expr) -> None:
-        """They always are."""
+        """Messages in a parsed message are always objects."""
 
     def write(self, out: Source, span: SourceSpan) -> None:
         for path, variable in self.variables.items():
@@ -137,8 +137,8 @@ class Scope:
     """What names mean in the expressions of one target.
 
     `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
-    variables beside the message's fields; they win over fields of the same name. `given` is what can be named of
-    MESSAGE, SOURCE and RECEIVED_AT: nothing where no message is.
+    variables beside the message's fields; they win over fields of the same name. `given` are those of
+    MESSAGE, SOURCE and RECEIVED_AT that can be named.
     """
 
     message: MessageType
@@ -149,11 +149,11 @@ class Scope:
     given: Collection[str] = (MESSAGE, SOURCE, RECEIVED_AT)
 
     def field_names(self) -> list[str]:
-        """All that a name which stands alone can mean of the message and beside it."""
+        """The fields of the message and the names beside them."""
         return [*self.names, *(member.name for member in self.message.fields)]
 
     def variable(self, name: str, span: SourceSpan) -> Typed:
-        """One of `names`, as it is used at `span`."""
+        """One of `names`, positioned at `span`."""
         given = self.names[name]
         node = copy.deepcopy(given.node)
         for inner in ast.walk(node):
@@ -162,7 +162,7 @@ class Scope:
         return replace(given, node=node, span=span)
 
     def holder_names(self) -> set[str]:
-        """Everything that constants can be asked of: enums by full and short name, ROS types by short name."""
+        """The names of everything that has constants: enums by full and short name, ROS types by short name."""
         enums = {known for enum in self.enums for known in (enum.name, enum.name.rpartition(".")[2])}
         return enums | {ros.short_name for ros in self.ros_types if ros.constants}
 
@@ -177,7 +177,7 @@ class Scope:
         return Typed.at(span, MessageKind(self.message), self.reads.message(()), path=())
 
     def field_of(self, holder: Typed, member: Field, span: SourceSpan) -> Typed:
-        """A field of a message that an expression gave; through a local variable where a path leads to it."""
+        """A field of the message that `holder` is; through a local variable if a path leads to it."""
         if holder.path is None:
             return Typed.at(span, kind_of(member.type), value_of(holder.node, member))
         return self.read(holder.path, member, span)

@@ -1,4 +1,4 @@
-"""From the text of an expression to Python's syntax tree, whose nodes know their place in the table.
+"""Parse the text of an expression into Python's syntax tree, with positions in the table.
 
 Anything that Python can parse passes here; `forbidden` words the finding for what the language does not have.
 """
@@ -14,7 +14,7 @@ from router.table.model import Expression
 
 
 class Parsed:
-    """`tree` is the syntax as the user wrote it. Raises ExpressionError for what is no expression of Python's."""
+    """A parsed expression with its syntax `tree`. Raises ExpressionError if it is no Python expression."""
 
     def __init__(self, expression: Expression) -> None:
         text = expression.text.replace("\n", " ")
@@ -42,23 +42,23 @@ class Parsed:
             ) from None
 
     def _blamed(self, error: SyntaxError) -> SourceSpan:
-        """Syntax errors count characters, from 1; some have no place, and some end on another line."""
+        """The position of a syntax error, which counts characters from 1, may have none, or end on another line."""
         start = max(error.offset or 1, 1) - 1
         end = error.end_offset - 1 if error.end_offset and error.end_lineno == error.lineno else start + 1
         return self._expression.place.part(self._indent + start, self._indent + end)
 
     def span(self, node: ast.expr) -> SourceSpan:
-        """The stretch of the table that a node stands for."""
+        """The span of a node in the table."""
         end = node.end_col_offset if node.end_col_offset is not None else node.col_offset + 1
         return self._expression.place.part(self._characters(node.col_offset), self._characters(end))
 
     def last_span(self, node: ast.Attribute) -> SourceSpan:
-        """The last name of `a.b.c` alone."""
+        """The span of the last name of `a.b.c`."""
         end = self._characters(node.end_col_offset or 0)
         return self._expression.place.part(end - len(node.attr), end)
 
     def _characters(self, offset: int) -> int:
-        """ast counts UTF-8 bytes, people count characters."""
+        """The offset in characters for one in UTF-8 bytes, which ast counts."""
         return self._indent + len(self._encoded[:offset].decode(errors="replace"))
 
 
