@@ -221,7 +221,7 @@ def decoder(message: MessageType, style: Style) -> Decode:
     file = f"<message from json of {message.name}>"
     span = SourceSpan(file)
     writing = _Writing(style, span)
-    read = msgspec.json.Decoder(writing.struct(message)).decode
+    read: Callable[[bytes], Any] = msgspec.json.Decoder(writing.struct(message)).decode
     out = Source()
     with out.block("def write(it):", span):
         out.line(f"return {write_message(out, writing.plan(message, 'it', ''), 'message')}", span)
@@ -289,7 +289,7 @@ class _Writing:
             case String():
                 if declared.wide and self._is_wrapped:
                     unit = Annotated[int, msgspec.Meta(ge=0, le=_LARGEST_UNIT)]
-                    return Annotated[list[unit], msgspec.Meta(max_length=declared.bound)]  # type: ignore[valid-type]
+                    return Annotated[list[unit], msgspec.Meta(max_length=declared.bound)]
                 return str
             case List():
                 most = declared.bound if declared.length is None else declared.length

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 import time
 from pathlib import Path
 
@@ -81,6 +82,24 @@ async def test_what_comes_faster_than_each_can_be_handed_on_is_in_the_books(tmp_
     assert stage.count("messages_received", "it", "ros") == 251
     age = time.time_ns() - stage.count("route_last_message_timestamp_seconds", "it")
     assert 0 <= age < 2 * PATIENCE_S * 1e9
+
+
+@asynchronous
+async def test_small_messages_pass_a_large_one_that_is_being_converted(tmp_path: Path) -> None:
+    graph = Graph({"/large": STRING, "/small": STRING})
+    may_convert = threading.Event()
+    async with Stage(program(tmp_path, f"it: {{{TCP}}}"), graph) as stage:
+        played = stage.played["it"]
+        await played.start()
+        await until(lambda: len(graph.taps) == 2)
+        stage.context.converting.submit(may_convert.wait)
+        graph.taps["/large"].put(cdr("x" * 100_000))
+        await until(lambda: stage.count("messages_received", "it", "ros") == 1)
+        graph.taps["/small"].put(cdr("y"))
+        await until(lambda: played.client.values)
+        may_convert.set()
+        await until(lambda: len(played.client.values) == 2)
+        assert [frame.topic for frame in played.client.values] == ["/small", "/large"]
 
 
 @asynchronous
