@@ -136,14 +136,20 @@ def _width(character: str) -> int:
     return 2 if unicodedata.east_asian_width(character) in "WF" else 1
 
 
-@functools.lru_cache(maxsize=16)
 def _lines(file: str) -> tuple[str, ...]:
     """The lines of a file that has a finding; none if it cannot be read, which is the finding then."""
+    path = Path(file)
     try:
-        with Path(file).open("rb") as stream:
-            data = stream.read(4 << 20) if Path(file).is_file() else b""
+        return _read_lines(path.absolute(), path.stat().st_mtime_ns) if path.is_file() else ()
     except (OSError, ValueError):
         return ()
+
+
+@functools.lru_cache(maxsize=16)
+def _read_lines(path: Path, changed_at: int) -> tuple[str, ...]:
+    """The lines of a file as it was when it changed last, in ns."""
+    with path.open("rb") as stream:
+        data = stream.read(4 << 20)
     return tuple(re.split(r"\r\n|\r|\n", data.decode("utf-8", "replace").removeprefix("\ufeff")))
 
 
