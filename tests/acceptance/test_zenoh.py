@@ -26,6 +26,8 @@ from tests.ports import free_port
 from tests.tables import PROTOS
 from tests.test_docs import examples
 
+pytestmark = pytest.mark.slow  # discovery between three programs, with TLS
+
 KEY = "rovers/rover_1"
 
 

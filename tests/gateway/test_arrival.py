@@ -176,7 +176,7 @@ async def test_what_zenoh_hears_while_the_loop_is_away_is_as_old_as_that() -> No
     config.insert_json5("connect/endpoints", json.dumps([where]))
     config.insert_json5("scouting/multicast/enabled", "false")
     events = Events()
-    async with opened(ZenohTransport(ZenohSettings(key, "peer", (), (where,)), events)):
+    async with opened(ZenohTransport(ZenohSettings(key, "peer", (), (where,)), events, 1000)):
         with zenoh.open(config) as far:
 
             def put() -> None:

@@ -24,6 +24,7 @@ from tests.gateway.transport_events import Events, data, opened
 from tests.ports import free_port
 
 KEY = "rovers/loki_1"
+MOST = 1 << 20
 
 
 def settings(mode: str = "peer", connect: tuple[str, ...] = (), listen: tuple[str, ...] = ()) -> ZenohSettings:
@@ -80,7 +81,7 @@ def schema(type_name: str) -> Frame:
 @asynchronous
 async def test_data_is_found_by_topic_and_schemas_by_type() -> None:
     events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events)
+    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
     async with serving(transport):
         assert transport.is_ready
         [client] = events.clients
@@ -130,7 +131,7 @@ async def _hears(events: Events, far: zenoh.Session) -> None:
 @asynchronous
 async def test_what_is_put_under_inbound_is_heard() -> None:
     events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events, most=100)
+    transport = ZenohTransport(settings(listen=(where,)), events, 100)
     async with serving(transport):
         with session("peer", connect=where) as far:
             await _hears(events, far)
@@ -151,7 +152,7 @@ async def test_what_is_put_under_inbound_is_heard() -> None:
 async def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gateway_zenoh, "MOST_RECEIVED", 5)
     events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events)
+    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
     async with serving(transport):
         with session("peer", connect=where) as far:
             await _hears(events, far)
@@ -168,7 +169,7 @@ async def test_samples_that_come_faster_than_they_are_taken_are_refused_each(mon
 async def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -> None:
     events, where = Events(), locator()
     events.shown = [schema("std_msgs/msg/Bool"), data(b"true", "/on"), data(b"false", "/off")]
-    transport = ZenohTransport(settings(listen=(where,)), events)
+    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
     async with serving(transport):
         with session("client", connect=where) as far:
 
@@ -196,7 +197,7 @@ async def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -
 async def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> None:
     large = b"x" * 7_000_000
     events, where = Events(), locator()
-    transport = ZenohTransport(patient(where), events)
+    transport = ZenohTransport(patient(where), events, MOST)
     async with serving(transport):
         [client] = events.clients
         with session("client", connect=where) as far:
@@ -213,7 +214,7 @@ async def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it
 @asynchronous
 async def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None:
     events, where = Events(), locator()
-    transport = ZenohTransport(patient(where), events)
+    transport = ZenohTransport(patient(where), events, MOST)
     async with serving(transport):
         [client] = events.clients
         with session("client", connect=where) as far:
@@ -231,7 +232,7 @@ async def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -
 @asynchronous
 async def test_much_that_is_written_at_once_is_put_and_the_client_drains() -> None:
     events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events)
+    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
     async with serving(transport):
         [client] = events.clients
         client.write([data(b"x" * 10_000)] * 100)
@@ -244,7 +245,7 @@ async def test_much_that_is_written_at_once_is_put_and_the_client_drains() -> No
 async def test_a_router_that_is_not_there_yet_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gateway_zenoh, "RETRY_SECONDS", 0.02)
     events, where = Events(), locator()
-    transport = ZenohTransport(settings("client", connect=(where,)), events)
+    transport = ZenohTransport(settings("client", connect=(where,)), events, MOST)
     with capture_logs() as logs:
         async with opened(transport):
             assert not transport.is_ready
@@ -262,7 +263,7 @@ async def test_a_router_that_is_not_there_yet_is_tried_again(monkeypatch: pytest
 
 @asynchronous
 async def test_closing_while_the_router_is_not_there_is_prompt() -> None:
-    transport = ZenohTransport(settings("client", connect=(locator(),)), Events())
+    transport = ZenohTransport(settings("client", connect=(locator(),)), Events(), MOST)
     async with opened(transport):
         pass
 
@@ -271,7 +272,7 @@ async def test_closing_while_the_router_is_not_there_is_prompt() -> None:
 async def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         where = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        transport = ZenohTransport(settings(listen=(where,)), Events())
+        transport = ZenohTransport(settings(listen=(where,)), Events(), MOST)
         with pytest.raises(StartError, match=rf"{where} cannot be used: .* has the port"):
             await transport.open()
 
@@ -280,13 +281,13 @@ async def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
 async def test_a_key_that_is_none_is_refused() -> None:
     bad = Located("rovers//loki?", SourceSpan("routes/rover.yaml"))
     with pytest.raises(StartError, match="rovers//loki"):
-        await ZenohTransport(ZenohSettings(bad), Events()).open()
+        await ZenohTransport(ZenohSettings(bad), Events(), MOST).open()
 
 
 @pytest.mark.parametrize("where", ["nonsense", "tcp/", "carrier-pigeon/127.0.0.1:7447"])
 @asynchronous
 async def test_a_locator_that_zenoh_does_not_know_is_refused(where: str) -> None:
-    transport = ZenohTransport(settings(connect=(where,)), Events())
+    transport = ZenohTransport(settings(connect=(where,)), Events(), MOST)
     with pytest.raises(StartError):
         await transport.open()
     await transport.close()
@@ -330,7 +331,7 @@ async def test_a_config_that_zenoh_refuses_when_it_opens_is_refused_with_its_lin
     config: object, where: str, why: str
 ) -> None:
     given = ZenohConfig(SourceSpan("rover.yaml", 7, 9), json.dumps(config)) if config else None
-    transport = ZenohTransport(replace(settings(listen=(where,)), config=given), Events())
+    transport = ZenohTransport(replace(settings(listen=(where,)), config=given), Events(), MOST)
     with pytest.raises(StartError, match=why):
         await transport.open()
 
@@ -340,7 +341,7 @@ async def test_who_has_no_password_yet_is_tried_again() -> None:
     """Zenoh says no more of a refused password than of a router that is not there."""
     where = locator()
     given = ZenohConfig(SourceSpan("rover.yaml"), "{}")
-    transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), Events())
+    transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), Events(), MOST)
     with capture_logs() as logs:
         async with opened(transport):
             assert not transport.is_ready

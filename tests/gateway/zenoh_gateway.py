@@ -86,7 +86,7 @@ async def main(key: str, where: str, config: str, mode: str) -> None:
     settings = ZenohSettings(Located(key, HERE), mode, (where,), (), ZenohConfig(HERE, config))
     if mode == "listening":
         settings = replace(settings, mode="peer", connect=(), listen=(where,))
-    transport = ZenohTransport(settings, events)
+    transport = ZenohTransport(settings, events, 1000)
     print(json.dumps({"ready": False, "others": [], "contentions": 0}), flush=True)
     await asyncio.to_thread(sys.stdin.readline)
     with capture_logs() as logs:

@@ -32,17 +32,13 @@ READ_PER_TURN = 32
 
 
 class UdpTransport:
-    """Has one client, from the start. Without `local`, it sends from any port and receives nothing.
+    """Has one client, from the start. Without `local`, it sends from any port and receives nothing."""
 
-    `most` bounds a datagram that is received, in bytes.
-    """
-
-    def __init__(self, remote: Address, local: Address | None, events: Events, most: int = LARGEST_DATAGRAM) -> None:
+    def __init__(self, remote: Address, local: Address | None, events: Events) -> None:
         self.address: Address | None = None
         self._remote = remote
         self._local = local
         self._events = events
-        self._most = most
         self._binding = Binding("udp", local or Address("0.0.0.0", 0), self._bind)
         self._client: UdpClient | None = None
         self._socket: socket.socket | None = None
@@ -98,7 +94,7 @@ class UdpTransport:
     def _receive(self, opened: socket.socket, client: UdpClient) -> None:
         for _ in range(READ_PER_TURN):
             try:
-                data, sender = opened.recvfrom(self._most + 1)
+                data, sender = opened.recvfrom(LARGEST_DATAGRAM)
             except BlockingIOError:
                 return
             except OSError as error:
@@ -106,8 +102,6 @@ class UdpTransport:
                 return
             if sender[0] != self._remote.host:
                 self._events.refused("source_mismatch")
-            elif len(data) > self._most:
-                self._events.refused("too_large")
             else:
                 self._events.received(client, data, self._arrived_at())
 

@@ -34,9 +34,6 @@ from router.table.addresses import Address
 from router.table.model import ZenohSettings
 from router.threads import DaemonThread
 
-MOST = 16 << 20
-"""Bytes that are received as one, unless said otherwise."""
-
 CLOSING_SECONDS = 2.0
 """How long a session has to end."""
 
@@ -72,7 +69,7 @@ class ZenohTransport:
     any, others are found by multicast.
     """
 
-    def __init__(self, settings: ZenohSettings, events: Events, most: int = MOST) -> None:
+    def __init__(self, settings: ZenohSettings, events: Events, most: int) -> None:
         self.address: Address | None = None
         self._settings = settings
         self._events = events
