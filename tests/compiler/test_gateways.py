@@ -292,6 +292,7 @@ def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText
         ("datagrams_sent", "it", "udp"),
         ("sent_bytes", "it", "udp"),
         ("gateway_clients", "it"),
+        ("gateway_client_clock_ahead", "it"),
         *(("gateway_topics", "it", state) for state in TOPIC_STATES),
         *(("client_messages_dropped", "it", reason) for reason in CLIENT_DROP_REASONS),
         ("route_last_message_timestamp_seconds", "it"),
