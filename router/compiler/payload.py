@@ -47,17 +47,18 @@ def constant_envelope(plan: Record, case: PayloadCase) -> bytes:
 
 def _envelope(number: int) -> Callable[[bytes], bytes]:
     """Return a function that puts tag and length of a payload case in front of a payload's bytes."""
-    tag = _varint(number << 3 | 2)
-    heads = tuple(tag + _varint(size) for size in range(_ONE_BYTE))
+    tag = varint(number << 3 | 2)
+    heads = tuple(tag + varint(size) for size in range(_ONE_BYTE))
 
     def envelope(payload: bytes) -> bytes:
         size = len(payload)
-        return (heads[size] if size < _ONE_BYTE else tag + _varint(size)) + payload
+        return (heads[size] if size < _ONE_BYTE else tag + varint(size)) + payload
 
     return envelope
 
 
-def _varint(value: int) -> bytes:
+def varint(value: int) -> bytes:
+    """Encode an integer as protobuf encodes tags and lengths."""
     encoded = bytearray()
     while value >= _ONE_BYTE:
         encoded.append(value & 0x7F | 0x80)

@@ -15,6 +15,7 @@ from google.protobuf.message import Message
 
 from router.clock import wall_ns
 from router.compiler.network import recognisers
+from router.compiler.payload import varint
 from router.engine import MAX_DATAGRAM
 from router.engine.slow_path import LEN, restored
 from router.table.model import Framing, RouteTable
@@ -196,15 +197,6 @@ class Classifier:
         """Return the table's name of who sent to this listener; empty for a stranger."""
         by_host, by_address = self._recognisers.get(listener, _NOBODY)
         return by_address.get(peer) or by_host.get(peer[0]) or ""
-
-
-def varint(value: int) -> bytes:
-    """Encode as protobuf encodes tags and lengths."""
-    encoded = bytearray()
-    while value > 0x7F:
-        encoded.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes((*encoded, value))
 
 
 _NOBODY: tuple[dict[str, str], dict[Peer, str]] = {}, {}
