@@ -19,7 +19,7 @@ from router.compiler.program import Program
 from router.compiler.routes import check_routes, clash_findings
 from router.compiler.topics import diagnostics_topic, topic_findings
 from router.errors import Diagnostic, Severity, TableError
-from router.table import load_table
+from router.table import in_order, load_table
 from router.table.model import RouteTable, Topic
 from router.types.lock import LockComparison
 from router.types.model import MessageType
@@ -67,12 +67,12 @@ def check_table(
     """
     table, findings = load_table(path, environ)
     if table is None:
-        return Checked(path, sorted_findings(findings))
+        return Checked(path, in_order(findings))
     definitions = definitions or Definitions()
     try:
         schema, envelope = _wire(table, definitions)
     except TableError as error:
-        return Checked(path, sorted_findings([*findings, *error.diagnostics, *network_findings(table)]), table)
+        return Checked(path, in_order([*findings, *error.diagnostics, *network_findings(table)]), table)
     lock = LockComparison(schema, envelope) if table.envelope else None
     board_limit = lock.max_size if lock and lock.max_size else envelope.max_size
     lookup = Lookup(table, schema, envelope, definitions, board_limit)
@@ -90,7 +90,7 @@ def check_table(
         *topic_findings(table, [checked.route for checked in routes]),
     ]
     own_topics = [(own, own_type)] if own and own_type else []
-    return Checked(path, sorted_findings(findings), table, schema, envelope, routes, gateways, own_topics)
+    return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, own_topics)
 
 
 def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:
@@ -99,8 +99,3 @@ def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Env
         return without_protos()
     schema = definitions.protos(table.envelope)
     return schema, find_envelope(schema, table.envelope.oneof)
-
-
-def sorted_findings(findings: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """Findings without duplicates, by file and position."""
-    return sorted(dict.fromkeys(findings), key=lambda finding: (finding.span, finding.code.value, finding.message))

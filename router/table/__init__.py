@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from router.errors import Diagnostic, Severity, TableError
@@ -43,8 +43,8 @@ def read_table(path: Path) -> RouteTable:
     return table
 
 
-def in_order(findings: list[Diagnostic]) -> list[Diagnostic]:
-    """Each finding once (aliases repeat them), by its place."""
+def in_order(findings: Iterable[Diagnostic]) -> list[Diagnostic]:
+    """Each finding once, in the order of the files."""
     return sorted(dict.fromkeys(findings), key=lambda found: (found.span, found.code.value, found.message))
 
 

@@ -280,22 +280,28 @@ DEFAULT_REPEAT = Located(100_000_000, SourceSpan("the default"))
 """How often a deadman sends, in ns."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeadmanKeys:
+    """The keys that the deadmen of routes and of gateways have in common. Durations in ns."""
+
+    timeout: Annotated[Located[int], DURATION]
+    repeat: Annotated[Located[int], DURATION] = DEFAULT_REPEAT
+    at_start: Annotated[bool, AT_START] = True
+
+
 @dataclass(frozen=True, slots=True)
-class Deadman:
+class Deadman(DeadmanKeys):
     """What is sent in place of commands that stopped coming: the payload `case` with `fields`, to `to`.
 
-    `span` is the key `deadman`. Durations in ns. `hands_over_to` are payload cases. `at_start` says whether it is sent
-    when the router starts as well.
+    `span` is the key `deadman`. `hands_over_to` are payload cases. `at_start` says whether it is sent when the router
+    starts as well.
     """
 
     span: SourceSpan
-    timeout: Annotated[Located[int], DURATION]
     case: Located[str]
     fields: FieldMap
     to: tuple[Located[str], ...]
-    repeat: Annotated[Located[int], DURATION] = DEFAULT_REPEAT
     hands_over_to: tuple[Located[str], ...] = ()
-    at_start: Annotated[bool, AT_START] = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -438,17 +444,14 @@ class ZenohSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class InboundDeadman:
+class InboundDeadman(DeadmanKeys):
     """What is published in place of a client's messages that stopped coming, and at the start if `at_start` says so.
 
-    `span` is the key `deadman`. Durations in ns.
+    `span` is the key `deadman`.
     """
 
     span: SourceSpan
-    timeout: Annotated[Located[int], DURATION]
     fields: Annotated[FieldMap, Named("send")]
-    repeat: Annotated[Located[int], DURATION] = DEFAULT_REPEAT
-    at_start: Annotated[bool, AT_START] = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import jsonschema
 import pytest
 
 from router.assets import asset
-from router.cli import BAD_TABLE, BAD_USAGE, OK, findings, main
+from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 from router.cli.test import FAILED
 from router.compiler.lookup import Definitions
 from router.rehearsal.reading import read_test_file
@@ -34,7 +34,6 @@ def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         shutil.copy(ROUTES / name, folder)
     (tmp_path / "protos").symlink_to(PROTOS)
     monkeypatch.chdir(tmp_path)
-    findings._lines.cache_clear()  # which knows other files under these relative names
     return folder / "rover.yaml"
 
 
