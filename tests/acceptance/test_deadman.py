@@ -70,11 +70,15 @@ class Driver:
             self.place.send("basestation", self.datagram)
 
     def drive(self) -> None:
-        """Gives commands until the board gets them and not what the deadman sends."""
+        """Gives commands until the board gets them and not what the deadman sends.
+
+        Those that the talker publishes before it is discovered come seconds later, and are stale.
+        """
+        before = self.sent()
 
         def driven() -> bool:
             self.give()
-            return not self.is_active()
+            return self.sent() > before and not self.is_active()
 
         wait_until(driven, "the release")
         self.await_next(self.datagram)
@@ -93,6 +97,9 @@ class Driver:
     def all_taken(self) -> bool:
         """Whether the router has taken all commands that were given."""
         return total(self.place.scrape(), "messages_received", route=self.route) == self._given
+
+    def sent(self) -> float:
+        return total(self.place.scrape(), "datagrams_sent", route=self.route)
 
     def is_active(self) -> bool:
         return bool(self.place.samples()[key("deadman_active", route=self.route)])
