@@ -22,8 +22,8 @@ from pathlib import Path
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM, InboundEngine, Report
+from tests.engine.fakes import plain_outlets
 from tests.engine.ledger import Ledger
-from tests.engine.plain import plain_outlets
 from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent

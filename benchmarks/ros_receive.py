@@ -27,7 +27,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 
 from router.ros.node import close_node, open_node
-from tests.ros.ros_opening import HELLO, open_ros, string_topic
+from tests.ros.opening import HELLO, open_ros, string_topic
 
 SUBSCRIBED = tuple(f"command_{number}" for number in range(6))
 PUBLISHED = tuple(f"telemetry_{number}" for number in range(24))

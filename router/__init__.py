@@ -1,7 +1,4 @@
-"""A configuration-driven declarative router between protobuf over UDP and ROS 2.
-
-Importing it imports nothing else. `main` is the command `router`.
-"""
+"""A configuration-driven declarative router between protobuf over UDP and ROS 2. `main` is the command `router`."""
 
 from __future__ import annotations
 
@@ -13,21 +10,20 @@ _KEYBOARD_INTERRUPT = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; its exit code."""
+    """Run one verb and return its exit code."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     hold_signals(arguments)
     try:
-        from router.cli import main as run_verb  # after the signals: what a verb imports takes up to a second
+        from router.cli import main as run_verb  # after the signals: the imports of a verb take up to a second
     except KeyboardInterrupt:
         return _KEYBOARD_INTERRUPT
     return run_verb(arguments)
 
 
 def hold_signals(arguments: Sequence[str]) -> None:
-    """Has SIGHUP and SIGUSR1 wait if these are the arguments of `router run`, which serves them once it routes.
+    """Block SIGHUP and SIGUSR1 for `router run`, which handles them with sigwait once it routes.
 
-    Blocked in all threads, signals wait for sigwait: no handler runs, no system call is interrupted. Other verbs end
-    by them, as programs do when their terminal closes.
+    Blocked in all threads, they run no handler and interrupt no system call. Other verbs are ended by them, as usual.
     """
     verb = next((argument for argument in arguments if not argument.startswith("-")), None)
     if verb == "run":

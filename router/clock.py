@@ -1,4 +1,4 @@
-"""The two clocks: one that only goes forward, for durations, and the calendar, for stamps. Both in nanoseconds."""
+"""The monotonic clock, for durations, and the wall clock, for time stamps. Both in ns."""
 
 from time import monotonic_ns
 from time import time_ns as wall_ns

@@ -1,7 +1,4 @@
-"""The log: readable lines on a terminal, JSON lines elsewhere, both to stderr; floods are summarised.
-
-Knows nothing about what is logged.
-"""
+"""The log: readable lines on a terminal, JSON lines elsewhere, both to stderr; floods are summarised."""
 
 from __future__ import annotations
 
@@ -28,10 +25,10 @@ MOST_KEYS = 1000
 
 
 def configure_log(level: str = "info", *, coloured: bool = False) -> None:
-    """Sets up structlog for the whole process. `level` is one of LEVELS; colours are for terminals only."""
+    """Set up structlog for the whole process. `level` is one of LEVELS; colours are for terminals only."""
     on_terminal = sys.stderr.isatty()
     rendering: list[structlog.typing.Processor] = (
-        # The plain traceback names file and line of the route table and nothing else is worth drawing boxes for.
+        # A plain traceback, without frames and locals, shows file and line of the route table.
         [
             structlog.dev.ConsoleRenderer(
                 colors=coloured, sort_keys=False, exception_formatter=structlog.dev.plain_traceback
@@ -47,15 +44,15 @@ def configure_log(level: str = "info", *, coloured: bool = False) -> None:
             *rendering,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(getattr(logging, level.upper())),
-        logger_factory=structlog.PrintLoggerFactory(_Expendable(sys.stderr)),  # type: ignore[arg-type]
+        logger_factory=structlog.PrintLoggerFactory(_NonBlockingStream(sys.stderr)),  # type: ignore[arg-type]
         cache_logger_on_first_use=True,
     )
 
 
-class _Expendable:
-    """A stream whose reader may go away or stand still, or whose disk may fill up: that costs lines, never the caller.
+class _NonBlockingStream:
+    """A stream that drops lines if its reader is gone or slow, or its disk is full; it never blocks or raises.
 
-    The counters still tell what the lines would have told. Lines are written whole, when flushed.
+    The counters have what the lines would have said. Lines are written whole, when flushed.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -80,7 +77,7 @@ class _Expendable:
 def _is_file(stream: TextIO) -> bool:
     try:
         stream.fileno()
-    except io.UnsupportedOperation:  # a test's, in memory
+    except io.UnsupportedOperation:  # in memory, for tests
         return False
     return True
 
@@ -91,7 +88,7 @@ Emit = Callable[..., None]
 
 @dataclass(slots=True)
 class _Flood:
-    """One kind of event: when its last line was written, and what has happened since."""
+    """Events of one kind: the time of the last line, and the number of events since."""
 
     emit: Emit
     event: str
@@ -102,10 +99,10 @@ class _Flood:
 
 @dataclass(slots=True)
 class FloodLog:
-    """Writes the first event of a kind at once, then at most one line per 10 s: the last one, and how many there were.
+    """Logs the first event of a kind at once, then at most one line per 10 s, with the last event and their number.
 
-    Thread-safe. `flush()` has to be called now and then, so that the end of a flood is told as well.
-    Beyond `MOST_KEYS` kinds, further ones share a summary.
+    Thread-safe. `flush()` has to be called regularly, for the last events of a flood. Kinds beyond `MOST_KEYS` share
+    a summary.
     """
 
     clock_ns: Callable[[], int] = monotonic_ns
@@ -113,7 +110,7 @@ class FloodLog:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def note(self, key: Hashable, emit: Emit, event: str, exc_info: BaseException | None = None, **values: Any) -> None:
-        """One more event of the kind `key`. The first line carries the traceback of `exc_info`."""
+        """Log or count an event of the kind `key`. The first line has the traceback of `exc_info`."""
         now = self.clock_ns()
         with self._lock:
             flood = self._floods.get(key)
@@ -130,7 +127,7 @@ class FloodLog:
         emit(event, exc_info=exc_info, **values)
 
     def flush(self, *, final: bool = False) -> None:
-        """Writes the summaries that are due; all that are pending when `final`."""
+        """Write the summaries that are due, or with `final` all that are pending."""
         now = self.clock_ns()
         with self._lock:
             for flood in self._floods.values():

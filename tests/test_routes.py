@@ -15,7 +15,7 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import InboundEngine
 from router.table.model import Route, RouteTable, Transport
-from tests.engine.plain import plain_outlets
+from tests.engine.fakes import plain_outlets
 from tests.tables import ROUTES
 
 Publish = Callable[..., dict[str, bytes]]

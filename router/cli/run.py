@@ -1,6 +1,6 @@
-"""`router run [TABLE] [--ros-args ...]`: compile the table, open everything, route until a signal says stop.
+"""`router run [TABLE] [--ros-args ...]`: compile the table, open everything, route until a signal.
 
-The table is TABLE, or what the ROS parameter `routes_path` says.
+The ROS parameter `routes_path` may name the table instead of TABLE.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # `router.main` has done it already
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
-    named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE is
+    named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE
     if args.table and named and args.table.resolve() != Path(named).resolve():
         print(f"router run: TABLE is {args.table}, {_ROUTES_PATH} is {named}; name one table", file=sys.stderr)
         return BAD_USAGE
@@ -72,19 +72,19 @@ def run(args: argparse.Namespace) -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, ending)
     with Router(checked.program, ["--ros-args", *args.ros_args], environ) as router:
         tune_interpreter()
-        del checked  # a reload is to free what it replaces
+        del checked  # so that a reload can free it
         with supervised(router.progress):
             _serve_signals(router, ending)
         for number in ending:
-            signal.signal(number, signal.SIG_DFL)  # a second one ends the process at once
+            signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)
     return OK
 
 
 def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:
-    """Until one of `ending` comes. What comes while another one is served waits."""
+    """Handle signals one after the other until one of `ending` comes."""
     while True:
-        last = signal.sigpending() & set(ending)  # left to itself, sigwait takes SIGHUP first, however often that comes
+        last = signal.sigpending() & set(ending)  # sigwait alone would prefer SIGHUP, however often it comes
         match signal.sigwait(last or {*ending, signal.SIGHUP, signal.SIGUSR1}):
             case signal.SIGHUP:
                 router.reload()
@@ -95,9 +95,9 @@ def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:
 
 
 def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:
-    """`["-p", "listen_port:=5001"]` -> `{"listen_port": "5001"}`; so too `--params-file`, which `ros2 launch` passes.
+    """Parse `["-p", "listen_port:=5001"]` to `{"listen_port": "5001"}`, also `--params-file`, which `ros2 launch` uses.
 
-    The last one wins, as in ROS. Which node a parameter is meant for is left out. Raises StartError.
+    The last value wins, as in ROS. Node names of parameters are ignored. Raises StartError.
     """
     parameters: dict[str, str] = {}
     for option, word in pairwise(ros_args):
@@ -110,7 +110,7 @@ def ros_parameters(ros_args: Sequence[str]) -> dict[str, str]:
 
 
 def table_variables(parameters: Mapping[str, str]) -> dict[str, str]:
-    """The variables that ROS parameters give values to: `listen_port` is `${LISTEN_PORT}`."""
+    """The table's variables that ROS parameters set: `listen_port` is `${LISTEN_PORT}`."""
     return {name.upper(): value for name, value in parameters.items() if name != _ROUTES_PATH}
 
 
@@ -122,7 +122,7 @@ def _read_yaml(path: Path) -> object:
 
 
 def _parameters(tree: object) -> Iterator[tuple[str, object]]:
-    """Those of all nodes, however deep in namespaces they stand."""
+    """Yield the parameters of all nodes, in any depth of namespaces."""
     for key, value in tree.items() if isinstance(tree, dict) else ():
         if key == "ros__parameters" and isinstance(value, dict):
             yield from ((str(name), member) for name, member in value.items())

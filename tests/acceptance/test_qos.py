@@ -10,8 +10,8 @@ import pytest
 from tests.acceptance.conftest import Rover
 from tests.acceptance.rover_map import TOPICS, TOPICS_FROM_ROS
 from tests.acceptance.site import key, wait_until
-from tests.ros.ros_publisher import Publisher
-from tests.ros.ros_subscriber import Subscriber
+from tests.ros.publisher import Publisher
+from tests.ros.subscriber import Subscriber
 
 
 @pytest.mark.parametrize(

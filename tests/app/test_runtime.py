@@ -109,7 +109,7 @@ def test_a_datagram_is_forwarded_unchanged(site: Site) -> None:
 
 def test_a_message_reaches_the_topic_and_every_step_is_counted(site: Site) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    from tests.ros.ros_subscriber import Subscriber
+    from tests.ros.subscriber import Subscriber
 
     program = site.program(TOPIC)
     with Router(program) as router, closing(Subscriber("ph", "comms/msg/SensorBoardPHInfo")) as subscriber:

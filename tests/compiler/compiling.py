@@ -19,7 +19,7 @@ from router.errors import Diagnostic, SourceSpan
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
-from tests.engine.plain import plain_outlets
+from tests.engine.fakes import plain_outlets
 from tests.oracles.reference import fill
 from tests.oracles.reference_cdr import cdr
 from tests.oracles.reference_expressions import Context, View

@@ -17,8 +17,7 @@ from router.engine import collecting
 from router.engine.collecting import MOST_CLOSED, MOST_FRAMES, MOST_PARTS, Collector
 from router.engine.pacing import NS
 from router.errors import MappingError
-from tests.engine.served import serve
-from tests.engine.target import Topic
+from tests.engine.fakes import Topic, serve
 
 MS = 1_000_000
 Part = tuple[Hashable, int, int]

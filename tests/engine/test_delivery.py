@@ -8,7 +8,7 @@ import pytest
 
 from router.compiler.metrics import DROP_REASONS
 from router.errors import MappingError, NonFiniteError
-from tests.engine.target import Destination, Topic
+from tests.engine.fakes import Destination, Topic
 
 
 def test_a_datagram_counts_with_its_bytes() -> None:

@@ -1,4 +1,4 @@
-"""Which datagram reaches which handler, and why the others do not; held against an oracle that knows no shortcut."""
+"""Which datagram reaches which handler, and why the others do not; held against an oracle without shortcuts."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.fuzz_engine import fuzz
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM
 from router.engine.dispatch import Peer
-from tests.engine.naive import Naive
 from tests.engine.rig import (
     BASESTATION,
     DRIVING_BOARD,
@@ -28,6 +28,7 @@ from tests.engine.rig import (
     program,
 )
 from tests.engine.wire import LEN, damaged, framed, tag, varint
+from tests.oracles.engine import Naive
 
 ROUTES = """\
   imu_info:
@@ -347,3 +348,11 @@ def test_an_endpoint_is_seen_whatever_it_sent(rig: Rig) -> None:
     seen = {name for name in rig.program.table.endpoints if rig.count("endpoint_last_seen_timestamp_seconds", name)}
     assert seen == {"sensor_board", "right_tool"}
     assert rig.count("endpoint_last_seen_timestamp_seconds", "right_tool") == rig.WALL + 5
+
+
+def test_damaged_datagrams_are_counted_and_nothing_else() -> None:
+    outcome = fuzz(50_000, seed=7)
+    assert outcome.findings == []
+    assert outcome.fates["accepted"] > 5_000
+    unheard_of = [reason for reason in REJECT_REASONS if not outcome.fates[f"rejected {reason}"]]
+    assert unheard_of == ["ignored"], "the rover ignores nothing; all else should have happened"

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from router.engine import MAX_DATAGRAM
 from router.engine.pacing import BURST, LEAST_OVERDRAFT, LEAST_QUEUE, NS, OVERDRAFT, Pacer
 from router.table.model import Priority
-from tests.engine.served import play, serve
-from tests.engine.target import Destination
+from tests.engine.fakes import Destination, play, serve
 
 COMMAND, TELEMETRY, BULK = Priority
 MS = 1_000_000

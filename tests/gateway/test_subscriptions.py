@@ -26,8 +26,8 @@ from router.gateway.samples import ReadyType, Sample
 from router.gateway.subscriptions import READ_PER_TURN, Subscriptions, TopicSubscription
 from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces, ros_interfaces
 from tests.gateway.asynchronous import asynchronous, until
-from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, padded, string_topic
-from tests.ros.ros_publisher import Publisher
+from tests.ros.opening import HELLO, STRING, cdr, open_ros, padded, string_topic
+from tests.ros.publisher import Publisher
 
 INT32 = "std_msgs/msg/Int32"
 FIVE = bytes.fromhex("0001000005000000")

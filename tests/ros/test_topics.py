@@ -1,4 +1,4 @@
-"""What a node sees of topics, and taps on them, with the publishers in processes of their own."""
+"""Discovered topics, taps and the listener of `router tap`, with publishers in processes of their own."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2")
 
+from rclpy.serialization import serialize_message
+from std_msgs.msg import String
+
 from router.clock import wall_ns
 from router.errors import StartError
 from router.ros.router_node import RouterNode
-from router.ros.topics import DiscoveredPublisher, TopicTap
-from tests.ros.ros_opening import HELLO, STRING, cdr, open_ros, string_topic
-from tests.ros.ros_publisher import Publisher
-from tests.ros.ros_subscriber import wait_until
+from router.ros.topics import DiscoveredPublisher, TopicListener, TopicTap
+from tests.ros.opening import HELLO, STRING, cdr, open_ros, string_topic
+from tests.ros.publisher import Publisher
+from tests.ros.subscriber import wait_until
 
 INT32 = "std_msgs/msg/Int32"
 FIVE = bytes.fromhex("0001000005000000")
@@ -173,3 +176,55 @@ def test_a_type_that_is_not_installed_like_that_is_refused(
 def test_a_name_that_is_none_is_refused(ros: RouterNode) -> None:
     with pytest.raises(StartError, match="topic '/2bad' cannot be subscribed to"):
         tapped(ros, topic="/2bad")
+
+
+GREETING, WORLD = (bytes(serialize_message(String(data=text))) for text in ("hello, rover...", "hello, world..."))
+
+
+def first(listener: TopicListener) -> bytes:
+    while not (taken := listener.take(timeout=20)):
+        pass
+    return taken[0][0]
+
+
+@pytest.mark.parametrize("quality", ["--best-effort", "--flood"])
+def test_it_hears_whatever_a_publisher_offers(publisher: Publish, quality: str) -> None:
+    peer = publisher(STRING, quality)
+    with closing(TopicListener("greeting", "std_msgs/msg/String")) as listener:
+        assert peer.line() == "matched"
+        peer.publish([GREETING])
+        assert first(listener) == GREETING
+
+
+def test_the_type_is_the_publishers(publisher: Publish) -> None:
+    peer = publisher(STRING)
+    with closing(TopicListener("greeting")) as listener:
+        assert listener.type_name == "std_msgs/msg/String"
+        assert peer.line() == "matched"
+        peer.publish([WORLD])
+        assert listener.message(first(listener)).data == "hello, world..."
+
+
+def test_what_was_kept_for_late_joiners_is_heard(publisher: Publish) -> None:
+    publisher(STRING, "--transient-local").publish([GREETING])
+    with closing(TopicListener("greeting")) as listener:
+        assert first(listener) == GREETING
+
+
+def test_nothing_comes_when_nobody_publishes() -> None:
+    with closing(TopicListener("greeting", "std_msgs/msg/String")) as listener:
+        assert listener.take(timeout=0.01) == []
+
+
+@pytest.mark.parametrize(
+    ("topic", "type_name", "complaint"),
+    [
+        ("2bad", "std_msgs/msg/String", "topic '2bad' cannot be listened to"),
+        ("2bad", None, "topic '2bad' cannot be listened to"),
+        ("greeting", "std_msgs", "'std_msgs' is no message type"),
+        ("greeting", "std_msgs/msg/NoSuch", "std_msgs/msg/NoSuch is not installed"),
+    ],
+)
+def test_what_cannot_be_listened_to_is_refused(topic: str, type_name: str | None, complaint: str) -> None:
+    with pytest.raises(StartError, match=complaint):
+        TopicListener(topic, type_name)

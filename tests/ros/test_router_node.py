@@ -26,9 +26,9 @@ from router.errors import StartError
 from router.ros.qos import ActualQos, incompatible_policies
 from router.ros.router_node import RouterNode
 from router.types.ros import definition, ros_interfaces
-from tests.ros.ros_opening import HELLO, RELIABLE, SPAN, STRING, open_ros, string_topic
-from tests.ros.ros_publisher import Publisher
-from tests.ros.ros_subscriber import Subscriber, wait_until
+from tests.ros.opening import HELLO, RELIABLE, SPAN, STRING, open_ros, string_topic
+from tests.ros.publisher import Publisher
+from tests.ros.subscriber import Subscriber, wait_until
 
 
 @pytest.fixture
@@ -353,7 +353,7 @@ def test_a_publisher_closes_when_nobody_is_in_it_and_refuses_after_that(blocked:
 _UDP_ONLY = """
 import sys
 from router.clock import monotonic_ns
-from tests.ros.ros_opening import HELLO, open_ros, string_topic
+from tests.ros.opening import HELLO, open_ros, string_topic
 ros = open_ros(string_topic())
 with open("/proc/self/maps") as maps:
     print(sum("/dev/shm/fastrtps" in line for line in maps), flush=True)

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from router.errors import StartError
 from router.ros.receiving import RawSubscription
 from router.ros.router_node import RouterNode
-from tests.ros.ros_opening import RELIABLE, SPAN, cdr, open_ros, string_topic
+from tests.ros.opening import RELIABLE, SPAN, cdr, open_ros, string_topic
 
 DEEP = replace(RELIABLE, depth=1000)
 SPANS = {"greeting": SPAN, "farewell": SPAN}

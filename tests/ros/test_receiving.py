@@ -23,9 +23,9 @@ from router.errors import StartError
 from router.ros.events import WaitSet
 from router.ros.node import close_node, open_node
 from router.ros.receiving import TURN, RawSubscription
-from tests.ros.ros_opening import HELLO, RELIABLE, STRING, cdr, open_ros, string_topic
-from tests.ros.ros_publisher import Publisher
-from tests.ros.ros_subscriber import wait_until
+from tests.ros.opening import HELLO, RELIABLE, STRING, cdr, open_ros, string_topic
+from tests.ros.publisher import Publisher
+from tests.ros.subscriber import wait_until
 
 BEST_EFFORT = QosPlan("best_effort", "volatile", "keep_last", 1000)
 DEEP = QosPlan("reliable", "volatile", "keep_last", 1000)
