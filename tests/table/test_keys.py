@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import is_dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from router.table import model
-from router.table.keys import flat, keys_of
-from router.table.model import RouteTable
+from router.table.build import structure
+from router.table.compose import compose
+from router.table.keys import Words, flat, keys_of, phrases
+from router.table.model import Destination, Keep, RouteTable
+from router.table.nodes import MappingNode
 from router.table.schema import table_schema
+from router.table.source import read_source
+from router.table.units import DURATION
 from tests.table.tables import load
 
 TABLE = """\
@@ -33,24 +38,24 @@ def numbers(low: int, high: int, *units: str) -> st.SearchStrategy[str]:
     return st.builds("{}{}".format, st.integers(low, high), st.sampled_from(units))
 
 
-DURATION = numbers(10, 5000, "ms", "s", "min", "h")
+TIMES = numbers(10, 5000, "ms", "s", "min", "h")
 SETTINGS = {
     "listener": {
         "receive_buffer": numbers(64, 1000, "kB", "KiB", "MiB"),
         "coalesce": st.just("never") | numbers(1, 9999, "us"),
     },
-    "endpoint": {"stale_after": st.just("never") | DURATION, "budget": numbers(1, 5000, "kB/s", "KiB/s", "MB/s")},
+    "endpoint": {"stale_after": st.just("never") | TIMES, "budget": numbers(1, 5000, "kB/s", "KiB/s", "MB/s")},
     "record": {
         "continuous": st.sampled_from(["true", "false"]),
-        "last": DURATION,
+        "last": TIMES,
         "max_size": numbers(2, 5000, "MB", "MiB", "GiB"),
-        "max_age": DURATION,
+        "max_age": TIMES,
         "keep": numbers(2, 5000, "MB", "GB", "GiB"),
     },
     "gateway": {
-        "publish_period": st.just("each") | DURATION,
-        "schema_period": DURATION,
-        "discovery_period": DURATION,
+        "publish_period": st.just("each") | TIMES,
+        "schema_period": TIMES,
+        "discovery_period": TIMES,
         "max_datagram": numbers(1, 60, "kB", "KiB"),
         "max_message": numbers(1, 200, "kB", "MiB"),
     },
@@ -116,3 +121,21 @@ def _with_units(node: Any, key: str) -> Iterator[str]:
 def test_the_schema_is_searched_for_numbers_with_units() -> None:
     found = set(_with_units(table_schema(), ""))
     assert {"ttl", "keep", "budget", "publish_period", "max_rate", "receive_buffer"} <= found
+
+
+@dataclass(frozen=True, slots=True)
+class Delayed(Destination):
+    """A destination with a key of its own."""
+
+    delay: Annotated[int | None, DURATION, Words("{} later")] = None
+
+
+def test_a_field_of_the_model_is_all_that_a_key_needs_to_be_read_and_shown(tmp_path: Path) -> None:
+    path = tmp_path / "destination.yaml"
+    path.write_text("{endpoint: arm, delay: 1500ms, max_rate: 20}")
+    settings = compose(read_source(path), {}, [])
+    assert isinstance(settings, MappingNode)
+    found = structure(Delayed, settings, span=settings.span)
+    assert (found.delay, found.max_rate, found.keep) == (1_500_000_000, 20.0, Keep.FIRST)
+    assert flat(found) == {"max_rate": "20 Hz", "keep": "first", "endpoint": "arm", "delay": "1.5 s"}
+    assert phrases(found) == {"max_rate": "at most 20 Hz", "keep": "keeping the first", "delay": "1.5 s later"}
