@@ -54,11 +54,11 @@ def _seconds(text: str) -> float:
 @explained
 def run(args: argparse.Namespace) -> int:
     from router.table.model import GatewayFormat
+    from router.tools.gateway_client import GatewayClient, topic_filter
     from router.tools.gateway_messages import Message
     from router.tools.gateway_sources import open_source, remote
-    from router.tools.listening import Listening, topic_filter
 
-    listening = Listening(topic_filter(args.topic or ()))
+    client = GatewayClient(topic_filter(args.topic or ()))
     form = GatewayFormat(args.format) if args.format else None
     gateway = remote(args.ask) if args.ask else None
     show = _printer(args.json)
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         _say(f"listening: {source.place}; Ctrl-C ends it")
         rest = args.count
         try:
-            for heard in listening.hear(source, args.seconds or math.inf):
+            for heard in client.hear(source, args.seconds or math.inf):
                 record(heard)
                 show(heard)
                 if rest and isinstance(heard, Message):
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             pass
         finally:
-            _say(str(listening.tally(source)))
+            _say(str(client.tally(source)))
     return 0
 
 

@@ -232,18 +232,23 @@ def _entries(text: str, section: str) -> list[_Entry]:
     root = yaml.compose(text, yaml.SafeLoader)
     top = root.value if isinstance(root, yaml.MappingNode) else []
     found = next((value for key, value in top if key.value == section), None)
-    return [
-        _Entry(key.start_mark.line, max(_last_line(value), key.start_mark.line) + 1, key.start_mark.column, value)
-        for key, value in (found.value if isinstance(found, yaml.MappingNode) else [])
-    ]
+    lines, entries = text.split("\n"), []
+    for key, value in found.value if isinstance(found, yaml.MappingNode) else []:
+        first = key.start_mark.line
+        last = max(first, _last_line(value))
+        while not lines[last].strip():
+            last -= 1
+        entries.append(_Entry(first, last + 1, key.start_mark.column, value))
+    return entries
 
 
 def _last_line(node: yaml.Node) -> int:
-    """The index of a node's last line. YAML's end mark of a block lies behind the comments that follow it."""
+    """The index of a node's last line, or of a blank one behind it. The end mark of a block lies behind comments."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _last_line(last[1] if isinstance(last, tuple) else last)
-    return int(node.end_mark.line)
+    is_block = isinstance(node, yaml.ScalarNode) and node.style in ("|", ">")
+    return int(node.end_mark.line) - (is_block and node.end_mark.column == 0)
 
 
 def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str = "") -> str:

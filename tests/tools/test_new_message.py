@@ -271,6 +271,10 @@ def test_a_type_in_a_file_with_a_fault_is_missed_with_the_fault(site: Path, caps
         "pump_info: {\n    source: sensor_board, destinations: [basestation],\n    topics: []\n  }\n",
         "pump_info: {source: sensor_board, topics: [\n  ], destinations: [basestation]\n}\n",
         "pump_info:\n  - source: sensor_board\n    destinations: [basestation]\n",
+        (
+            "pump_info:\n    source: sensor_board\n    destinations:\n      - endpoint: basestation\n"
+            "        when: >-\n          enabled\n          or speed_rpm > 1\n"
+        ),
     ],
 )
 def test_the_route_goes_below_one_that_is_laid_out_in_another_way(site: Path, stanza: str) -> None:

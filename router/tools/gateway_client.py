@@ -42,7 +42,7 @@ class Tally:
         return text + (f", {self.unwanted} of other topics" if self.unwanted else "")
 
 
-class Listening:
+class GatewayClient:
     """Decodes arrivals. `wants` selects topics; of "" it says whether all are wanted.
 
     A schema without a topic is shown before the first wanted message of its type.

@@ -12,9 +12,9 @@ from router.gateway.documents import data_document, schema_document
 from router.gateway.packets import Packet, datagrams, pack
 from router.table.addresses import Address
 from router.table.model import GatewayFormat
+from router.tools.gateway_client import GatewayClient, topic_filter
 from router.tools.gateway_messages import Heard, Message, Problem, Schema, Shape, json_line, pieces
 from router.tools.gateway_sources import Arrival, Source, open_source, remote
-from router.tools.listening import Listening, topic_filter
 from tests.ports import free_port
 
 EVERY = topic_filter([])
@@ -53,7 +53,7 @@ class Played:
     def close(self) -> None: ...
 
 
-def heard(listening: Listening, source: Source) -> list[Heard]:
+def heard(listening: GatewayClient, source: Source) -> list[Heard]:
     found: list[Heard] = []
     try:
         found.extend(listening.hear(source, 100.0))
@@ -69,14 +69,14 @@ def arrivals(*packets: bytes, sender: object = "a") -> list[Arrival]:
 def test_batches_become_packets() -> None:
     packets = [packet(SCHEMA), packet('{"x":[1]}'), packet(json.dumps({"x": ["y" * 5000]}))]
     sent = arrivals(*datagrams(packets, 1400, 5.0))
-    listening, source = Listening(EVERY), Played(sent)
+    listening, source = GatewayClient(EVERY), Played(sent)
     assert [type(one) for one in heard(listening, source)] == [Schema, Message, Message]
     assert str(listening.tally(source)) == "2 messages, 1 schemas, 0 undecodable, 0 lost"
 
 
 def test_a_message_before_its_schema_is_shown_and_counted() -> None:
     sent = arrivals(packet('{"x":[1]}'), packet(SCHEMA), packet('{"x":[2]}'))
-    listening, source = Listening(EVERY), Played(sent)
+    listening, source = GatewayClient(EVERY), Played(sent)
     first, _, second = heard(listening, source)
     assert isinstance(first, Message)
     assert isinstance(second, Message)
@@ -86,14 +86,14 @@ def test_a_message_before_its_schema_is_shown_and_counted() -> None:
 
 def test_another_sender_has_to_send_its_schema_first() -> None:
     documents = schema_document("p/msg/T", 5.0, SCHEMA), data_document("/t", "p/msg/T", 5.0, b'{"x":1}')
-    listening, source = Listening(EVERY), Played(arrivals(*documents), arrivals(documents[1], sender="b"))
+    listening, source = GatewayClient(EVERY), Played(arrivals(*documents), arrivals(documents[1], sender="b"))
     heard(listening, source)
     assert listening.tally(source).early == 1
 
 
 def test_other_topics_are_counted_and_not_shown() -> None:
     sent = arrivals(packet(SCHEMA, "/a"), packet('{"x":[1]}', "/a"), packet(SCHEMA, "/b"), packet('{"x":[2]}', "/b"))
-    listening, source = Listening(lambda topic: topic == "/b"), Played(sent)
+    listening, source = GatewayClient(lambda topic: topic == "/b"), Played(sent)
     assert [getattr(one, "topic", None) for one in heard(listening, source)] == ["/b", "/b"]
     assert str(listening.tally(source)) == "1 messages, 2 schemas, 0 undecodable, 0 lost, 1 of other topics"
 
@@ -101,7 +101,7 @@ def test_other_topics_are_counted_and_not_shown() -> None:
 def test_schemas_of_other_topics_are_not_shown() -> None:
     schemas = [schema_document(name, 5.0, SCHEMA) for name in ("p/msg/S", "p/msg/T", "p/msg/U")]
     values = [data_document(topic, name, 5.0, b'{"x":1}') for topic, name in (("/a", "p/msg/S"), ("/b", "p/msg/T"))]
-    listening, source = Listening(lambda topic: topic == "/b"), Played(arrivals(*schemas, *values, values[1]))
+    listening, source = GatewayClient(lambda topic: topic == "/b"), Played(arrivals(*schemas, *values, values[1]))
     schema, *messages = heard(listening, source)
     assert isinstance(schema, Schema)
     assert schema.type_name == "p/msg/T"
@@ -111,7 +111,7 @@ def test_schemas_of_other_topics_are_not_shown() -> None:
 
 def test_what_means_nothing_is_shown_with_its_bytes_and_ends_nothing() -> None:
     batch = b"".join(datagrams([packet("no JSON"), packet('{"x":[1]}')], 1400, 5.0))
-    listening, source = Listening(EVERY), Played(arrivals(b"", b"garbage and more", batch))
+    listening, source = GatewayClient(EVERY), Played(arrivals(b"", b"garbage and more", batch))
     first, second, third, fourth = heard(listening, source)
     assert first == Problem("0 bytes are no packet", b"")
     assert isinstance(second, Problem)
@@ -142,7 +142,7 @@ HOSTILE = st.one_of(
 
 @given(st.lists(HOSTILE, max_size=4))
 def test_whatever_arrives_can_be_shown(sent: list[bytes]) -> None:
-    listening = Listening(EVERY)
+    listening = GatewayClient(EVERY)
     for arrival in arrivals(packet(SCHEMA), *sent):
         for one in listening.take(arrival):
             assert all(text.isprintable() for text, _ in pieces(one))
@@ -150,31 +150,31 @@ def test_whatever_arrives_can_be_shown(sent: list[bytes]) -> None:
 
 
 def test_what_a_source_knows_to_be_lost_counts() -> None:
-    listening, source = Listening(EVERY), Played(lost=3)
+    listening, source = GatewayClient(EVERY), Played(lost=3)
     heard(listening, source)
     assert listening.tally(source).lost == 3
 
 
 def test_schemas_are_asked_for_at_the_start() -> None:
     source = Played([], [], arrivals(packet(SCHEMA)))
-    heard(Listening(EVERY), source)
+    heard(GatewayClient(EVERY), source)
     assert source.asked == 1
 
 
 def test_schemas_are_asked_for_until_one_came(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("router.tools.listening.ASK_AGAIN", 0.01)
+    monkeypatch.setattr("router.tools.gateway_client.ASK_AGAIN", 0.01)
 
     class Patient(Played):
         def arrivals(self, timeout: float) -> Sequence[Arrival]:
             return super().arrivals(timeout) if self.asked > 2 else ()
 
     source = Patient(arrivals(packet(SCHEMA)))
-    heard(Listening(EVERY), source)
+    heard(GatewayClient(EVERY), source)
     assert source.asked == 3
 
 
 def test_listening_ends_when_its_time_is_over() -> None:
-    assert list(Listening(EVERY).hear(Played([], [], []), 0.0)) == []
+    assert list(GatewayClient(EVERY).hear(Played([], [], []), 0.0)) == []
 
 
 def silent(line: str) -> None:
