@@ -36,8 +36,12 @@ from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, Messa
 _TIMES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
 """Messages that a time fills: whole seconds, and nanoseconds that are never negative."""
 
+_EXACT_INTEGER_BITS = {32: 24, 64: 53}
+"""Up to this many bits every integer is exactly a float of that width."""
+
 
 def convert(value: Typed, target: Type, scope: Scope) -> Plan:
+    """The plan of a field of type `target` that `value` fills. Raises ExpressionError if it does not fit."""
     if isinstance(target, MessageType):
         return _to_message(value, target, scope)
     if isinstance(target, List):
@@ -55,6 +59,7 @@ def same_named(holder: Typed, member: Field, scope: Scope) -> Typed | None:
 
 
 def unset(member: Field, span: SourceSpan) -> Unset:
+    """The plan of a field that nothing fills."""
     return Unset(member.type, member.default, span)
 
 
@@ -124,8 +129,7 @@ def _want_length(value: Typed, target: List, length: int) -> None:
         )
 
 
-EXACT_INTEGER_BITS = {32: 24, 64: 53}
-"""Up to this many bits every integer is exactly a float of that width."""
+# scalars
 
 
 def converted(value: Typed, target: Type) -> ast.expr:
@@ -149,7 +153,7 @@ def converted(value: Typed, target: Type) -> ast.expr:
 
 
 def _want_finite(value: Typed, target: Type) -> None:
-    """Raises ExpressionError when `nan` or `inf` would fill what is no float."""
+    """Raise ExpressionError if `nan` or `inf` would fill what is no float."""
     if isinstance(value.constant, float) and not isinstance(target, Float) and not math.isfinite(value.constant):
         hint = f"text has quotes of its own: \"'{value.constant}'\"" if isinstance(target, String) else ""
         message = f"{value.constant} does not fill {target}"
@@ -159,6 +163,7 @@ def _want_finite(value: Typed, target: Type) -> None:
 
 
 def mismatch(value: Typed, target: Type, hint: str = "") -> ExpressionError:
+    """The error for a value whose kind cannot fill the type."""
     return ExpressionError(value.span, Code.TYPE_MISMATCH, f"{value.kind} does not fill {target}", hint)
 
 
@@ -213,7 +218,7 @@ def _fit(value: Typed, target: Int, bounds: tuple[int, int] | None) -> ast.expr:
 
 
 def _to_float(value: Typed, target: Float) -> ast.expr:
-    limit = 1 << EXACT_INTEGER_BITS[target.bits]
+    limit = 1 << _EXACT_INTEGER_BITS[target.bits]
     match value.kind:
         case FloatKind(bits):
             literal = value.constant if isinstance(value.constant, float) else 0.0
@@ -249,7 +254,7 @@ def _to_string(value: Typed, target: String) -> ast.expr:
 
 
 def _want_text(value: Typed, text: str, target: String) -> None:
-    """Raises ExpressionError when a literal cannot stand in the field."""
+    """Raise ExpressionError if a literal cannot stand in the field."""
     try:
         length = len(text.encode("utf-16-le")) // 2 if target.wide else len(text.encode())
     except UnicodeEncodeError as error:

@@ -171,6 +171,7 @@ def _text(expression: Expression) -> str:
 
 
 def presence_findings(plan: Plan) -> Iterator[Diagnostic]:
+    """Messages of a plan with two members of one oneof, or without a required field."""
     match plan:
         case Record():
             yield from _oneof_findings(plan)

@@ -31,9 +31,6 @@ from router.errors import MappingError, SourceSpan
 Values = TypeVar("Values", bound=Sized)
 
 
-# what fields are read through
-
-
 class Entry(NamedTuple):
     """One entry of a protobuf map."""
 
@@ -46,7 +43,7 @@ def entries(values: Mapping[Any, object]) -> tuple[Entry, ...]:
     return tuple(Entry(key, values[key]) for key in sorted(values))
 
 
-# what fields ask of the values that fill them; tables cannot call these
+# checks of values that fill fields; tables cannot call these
 
 
 def fit(x: int, low: int, high: int) -> int:
@@ -80,28 +77,17 @@ def fit_length(values: Values, least: int, most: int) -> Values:
     raise MappingError(f"{len(values)} elements where {wanted} fit")
 
 
+_CALLED = (
+    entries, fit, fit_length, fit_text, fit_wide_text,
+    put_text, put_wide_text, put_numbers, put_length, want_length,
+    refuse, cut_off, text, texts, wide_text, wide_texts, numbers,
+)  # fmt: skip
 NAMESPACE: Mapping[str, object] = {
     **{name: function.implementation for name, function in FUNCTIONS.items()},
-    "entries": entries,
-    "fit": fit,
-    "fit_length": fit_length,
-    "fit_text": fit_text,
-    "fit_wide_text": fit_wide_text,
+    **{function.__name__: function for function in _CALLED},
     "HEADER": HEADER,
     "CDR_LE": CDR_LE,
     "ZERO": b"\0",
-    "put_text": put_text,
-    "put_wide_text": put_wide_text,
-    "put_numbers": put_numbers,
-    "put_length": put_length,
-    "want_length": want_length,
-    "refuse": refuse,
-    "cut_off": cut_off,
-    "text": text,
-    "texts": texts,
-    "wide_text": wide_text,
-    "wide_texts": wide_texts,
-    "numbers": numbers,
 }
 
 

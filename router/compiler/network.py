@@ -26,6 +26,7 @@ class _Held:
 
 
 def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
+    """Findings for the addresses of a table and for what listens on them."""
     for first, second in combinations(_held(table), 2):
         if first.is_udp == second.is_udp and _overlap(first, second):
             message = f"{second.owner} has the address of {first.owner}"

@@ -36,6 +36,7 @@ _OF_GAPS = frozenset({Code.NO_TARGET, Code.NOTHING_MAPPED, Code.QOS_CONFLICT, Co
 
 
 def check_routes(lookup: Lookup) -> tuple[CheckedRoute, ...]:
+    """The routes of the table whose payload case exists; findings go to `lookup`."""
     _coverage(lookup)
     return tuple(checked for route in lookup.table.routes if (checked := _checked(lookup, route)))
 
@@ -111,6 +112,7 @@ def _priority(route: Route, endpoint: Endpoint | None) -> Priority:
 
 
 def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
+    """Check destinations, topics and `collect` of a route from UDP."""
     targets = [_forward(lookup, route, case, to, endpoint) for to, endpoint in destinations(lookup, route, case)]
     names = _frame_names(case, route.collect.span) if route.collect else {}
     for topic in route.topics:
@@ -176,6 +178,7 @@ HEADER = "std_msgs/msg/Header"
 
 
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
+    """Check the topics that feed a route from ROS, and what each destination gets of them."""
     if not route.topics:
         message = f"'{route.name}' comes from ROS, but from no topic"
         lookup.report(route.span, Code.NO_TARGET, message, "name it under 'topics'")

@@ -20,6 +20,8 @@ _REMEMBERED = 4096
 
 
 class PatternProblem(NamedTuple):
+    """Why a pattern is invalid, and what to do."""
+
     what: str
     hint: str
 

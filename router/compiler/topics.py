@@ -38,6 +38,7 @@ def diagnostics_topic(node: NodeSettings) -> Topic | None:
 
 
 def topic_name_finding(topic: Topic) -> Diagnostic | None:
+    """A finding if the name of a topic is invalid."""
     name = topic.topic.value
     if not _NAME.fullmatch(name):
         hint = "names are letters, digits and '_' with '/' between; no part begins with a digit"

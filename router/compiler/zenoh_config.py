@@ -34,6 +34,7 @@ def library_config(config: ZenohConfig | None) -> zenoh.Config:
 
 
 def config_findings(config: ZenohConfig) -> Iterator[Diagnostic]:
+    """What the library refuses in a `config`, and keys that belong beside it."""
     try:
         made = library_config(config)
     except zenoh.ZError as error:

@@ -21,7 +21,6 @@ CDR_LE = HEADER[:2]
 
 _PADDING = tuple(bytes(count) for count in range(8))
 _INTEGERS = {8: "B", 16: "H", 32: "I", 64: "Q"}
-
 _OTHERS = {
     b"\x00\x00": "CDR_BE", b"\x00\x02": "PL_CDR_BE", b"\x00\x03": "PL_CDR_LE", b"\x00\x06": "CDR2_BE",
     b"\x00\x07": "CDR2_LE", b"\x00\x08": "D_CDR2_BE", b"\x00\x09": "D_CDR2_LE", b"\x00\x0a": "PL_CDR2_BE",
@@ -44,7 +43,7 @@ def scalar_format(declared: Type) -> str:
             raise AssertionError(f"{declared} is no scalar of a ROS message")
 
 
-# read
+# reading
 
 
 def refuse(representation: bytes) -> None:
@@ -93,7 +92,7 @@ def object_class(declared: MessageType) -> type[tuple[object, ...]]:
     return type(declared.short_name, (tuple,), {"__slots__": (), **fields})
 
 
-# written
+# writing
 
 
 def put_text(data: bytearray, text: str) -> None:

@@ -74,6 +74,7 @@ Step = Union[Put, Blob, Text, Repeat]
 
 
 def steps(plan: Plan) -> Iterable[Step]:  # noqa: C901 - a case a plan
+    """The steps that write a plan, in order."""
     match plan:
         case Record():
             for _, member in plan.members:

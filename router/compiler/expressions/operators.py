@@ -36,6 +36,7 @@ WIDEST = 512
 
 
 def constant(value: object, span: SourceSpan) -> Typed:
+    """A literal. Raises ExpressionError for one that the language does not have, or that is infinite."""
     match value:
         case bool():
             return Typed.at(span, BoolKind(), ast.Constant(value))
@@ -73,6 +74,7 @@ def folded(result: Typed) -> Typed:
 
 
 def list_of(items: Sequence[Typed], span: SourceSpan) -> Typed:
+    """A list literal, whose elements have one kind in common."""
     element: Kind | None = items[0].kind if items else None
     for item in items[1:]:
         element = join(element, item.kind) if element else None
