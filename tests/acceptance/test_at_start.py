@@ -164,6 +164,7 @@ def test_that_nobody_listens_yet_is_no_loss_of_the_first_command(place: Site) ->
         assert total(counts, "messages_dropped") == total(counts, "deadman_datagrams_sent") == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("qos", ["reliable", "best_effort"])
 def test_who_listens_to_a_topic_with_a_deadman_is_stopped_when_it_is_met(place: Site, qos: str) -> None:
     """Until a client has sent something."""

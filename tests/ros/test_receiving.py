@@ -161,6 +161,7 @@ def test_a_start_that_is_slow_loses_nothing_that_waits_for_it(
         wait_until(lambda: receiver.of("greeting") == [HELLO])
 
 
+@pytest.mark.slow
 def test_a_long_queue_keeps_other_topics_waiting_for_one_turn_only(publisher: Publish) -> None:
     with Receiver(string_topic(DEEP, "many"), string_topic(RELIABLE, "few")) as receiver:
         many, few = publisher("many"), publisher("few")

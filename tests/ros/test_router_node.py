@@ -88,6 +88,7 @@ class Apart(dict[tuple[str, str], int]):
         wait_until(lambda: self and +Counter({p: n for (t, p), n in self.items() if t == topic}) == wanted)
 
 
+@pytest.mark.slow
 def test_peers_are_counted_by_policy_until_they_have_gone(subscribe: Callable[..., Subscriber]) -> None:
     apart = Apart()
     with closing(open_ros(string_topic(BEST_EFFORT), incompatible=apart)) as ros:
@@ -105,6 +106,7 @@ def test_peers_are_counted_by_policy_until_they_have_gone(subscribe: Callable[..
         apart.wait_for("reliability")
 
 
+@pytest.mark.slow
 def test_publishers_that_are_not_heard_are_counted_until_they_have_gone() -> None:
     apart = Apart()
     hearing = string_topic(QosPlan("reliable", "transient_local", "keep_last", 5))
@@ -124,6 +126,7 @@ SHORT_LEASE = """\
 """
 
 
+@pytest.mark.slow
 def test_a_peer_that_was_killed_counts_until_its_lease_is_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "short.xml").write_text(SHORT_LEASE)  # 20 s without it
     apart = Apart()
@@ -366,6 +369,7 @@ ros.close()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("transports", "shares"), [("UDPv4", False), ("DEFAULT", True)])
 def test_udp_alone_is_used_where_the_environment_says_so(
     subscribe: Callable[..., Subscriber], transports: str, shares: bool
