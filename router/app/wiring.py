@@ -89,7 +89,7 @@ class Wiring:
     state: State
     deadmen: Mapping[str, Deadman]
     pacers: Mapping[str, Pacer]
-    close: Sequence[Callable[[], None]]
+    engines: Sequence[InboundEngine | OutboundEngine]
 
     def start(self, timers: Timers) -> None:
         """Have deadmen behind gateways publish to each subscriber that is discovered shortly after the start."""
@@ -105,8 +105,8 @@ class Wiring:
 
     def free(self) -> None:
         """Free the functions, which are in reference cycles. None may be called afterwards."""
-        for close in self.close:
-            close()
+        for engine in self.engines:
+            engine.close()
 
     def succeed(self, earlier: Wiring | None, timers: Timers) -> None:
         """Take over from `earlier`, while nothing is received: deadmen with other settings inherit their state.
@@ -172,7 +172,7 @@ def wire(
         state=state,
         deadmen=deadmen,
         pacers=pacers,
-        close=(inbound.close, outbound.close),
+        engines=(inbound, outbound),
     )
 
 
