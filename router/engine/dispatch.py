@@ -213,7 +213,7 @@ class OutboundEngine:
         Its arguments are CDR bytes, and when the middleware got them (wall clock, ns).
         """
         routes = [self._route(handler) for handler in self._program.outbound[topic]]
-        counts, bounds = self._context.counts, HISTOGRAM_BOUNDS_NS
+        counts, bounds, total = self._context.counts, HISTOGRAM_BOUNDS_NS, _SUM
         clock_ns, wall_ns, born = self._context.clock_ns, self._context.wall_ns, self._freshness.born
 
         def take(cdr: bytes, arrived_at: int) -> None:
@@ -227,7 +227,7 @@ class OutboundEngine:
                 counts[route.last_message] = received_at
                 elapsed = clock_ns() - now
                 counts[route.seconds + bisect_left(bounds, elapsed)] += 1
-                counts[route.seconds + _SUM] += elapsed
+                counts[route.seconds + total] += elapsed
 
         return take
 
