@@ -17,7 +17,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
 from mcap.records import (
     ChunkIndex,
     DataEnd,
@@ -27,7 +26,6 @@ from mcap.records import (
     Metadata,
     MetadataIndex,
     Statistics,
-    SummaryOffset,
 )
 from mcap.writer import MCAP0_MAGIC
 
@@ -131,39 +129,31 @@ class RecordingFile:
     def _end(self) -> bytes:
         """Return data end, summary and footer."""
         end = _encoded([DataEnd(0)])
-        start = position = self.size + len(end)
-        groups, offsets = [], []
-        for opcode, records in self._summary().items():
-            group = _encoded(records)
-            if group:
-                offsets.append(SummaryOffset(opcode, position, len(group)))
-            groups.append(group)
-            position += len(group)
-        summary = b"".join((*groups, _encoded(offsets)))
-        footer = _encoded([Footer(start, position, 0)])[:-4]
+        summary = _encoded(self._summary())
+        footer = _encoded([Footer(summary_start=self.size + len(end), summary_offset_start=0, summary_crc=0)])[:-4]
         crc = zlib.crc32(summary + footer)
         return b"".join((end, summary, footer, crc.to_bytes(4, "little"), MCAP0_MAGIC))
 
-    def _summary(self) -> dict[Opcode, list[McapRecord]]:
-        return {
-            Opcode.SCHEMA: [self._channels.schemas[number] for number in sorted(self._written_schemas)],
-            Opcode.CHANNEL: [self._channels.channels[number] for number in sorted(self._messages)],
-            Opcode.STATISTICS: [
-                Statistics(
-                    attachment_count=0,
-                    channel_count=len(self._messages),
-                    channel_message_counts=dict(self._messages),
-                    chunk_count=len(self._indexes),
-                    message_count=self._messages.total(),
-                    message_end_time=max((index.message_end_time for index in self._indexes), default=0),
-                    message_start_time=min((index.message_start_time for index in self._indexes), default=0),
-                    metadata_count=1,
-                    schema_count=len(self._written_schemas),
-                )
-            ],
-            Opcode.CHUNK_INDEX: list(self._indexes),
-            Opcode.METADATA_INDEX: [self._metadata],
-        }
+    def _summary(self) -> list[McapRecord]:
+        indexes = self._indexes
+        statistics = Statistics(
+            attachment_count=0,
+            channel_count=len(self._messages),
+            channel_message_counts=dict(self._messages),
+            chunk_count=len(indexes),
+            message_count=self._messages.total(),
+            message_end_time=max((index.message_end_time for index in indexes), default=0),
+            message_start_time=min((index.message_start_time for index in indexes), default=0),
+            metadata_count=1,
+            schema_count=len(self._written_schemas),
+        )
+        return [
+            *(self._channels.schemas[number] for number in sorted(self._written_schemas)),
+            *(self._channels.channels[number] for number in sorted(self._messages)),
+            statistics,
+            *indexes,
+            self._metadata,
+        ]
 
     def _append(self, data: bytes) -> None:
         try:
