@@ -1,19 +1,18 @@
 """The recorder: mirrored datagrams to disk, and the newest chunks in memory until somebody wants them saved.
 
-The mirror's thread puts batches into a queue. The thread `recorder` encodes each datagram once, into chunks for both;
-so saving copies bytes.
+The mirror's thread encodes each datagram once, into chunks for both; so saving copies bytes. The thread `recorder`
+writes them.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotInTime
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 from router.clock import monotonic_ns, wall_ns
 from router.compiler.program import Program
@@ -30,13 +29,10 @@ PERIOD = 500_000_000
 """ns from chunk to chunk: what a kill costs, with what the mirror still has; more only where the disk is slow."""
 
 MOST_QUEUED = 64 << 20
-"""Bytes that may wait for a disk that is slow."""
+"""Bytes of chunks that may wait for a disk that is slow."""
 
 STOP_SECONDS = 2.5
 """How long a stop waits for the disk. A service manager kills after 10 s, and there is more to close."""
-
-_BESIDE_DATA = 256
-"""Bytes of memory, about, that a queued datagram takes beside its data."""
 
 _PATIENCE = 30.0
 """Seconds in which saving has to be done."""
@@ -44,40 +40,6 @@ _PATIENCE = 30.0
 
 class RecordError(RouterError):
     """The last datagrams could not be saved; the message says why."""
-
-
-class _Batch(NamedTuple):
-    """`wall` and `monotonic` are the two clocks when it was received (ns), `size` its bytes of memory, about."""
-
-    datagrams: Sequence[Mirrored]
-    classifier: Classifier
-    wall: int
-    monotonic: int
-    size: int
-
-
-class DatagramQueue:
-    """At most MOST_QUEUED bytes of batches, from one thread to another. `overflow` counts datagrams without room."""
-
-    def __init__(self) -> None:
-        self.overflow = 0
-        self._batches: deque[_Batch] = deque()
-        self._put = self._taken = 0  # bytes, each written by one thread
-
-    def put(self, datagrams: Sequence[Mirrored], classifier: Classifier) -> None:
-        size = sum([len(data) for _, _, _, data in datagrams]) + _BESIDE_DATA * len(datagrams)
-        if self._put - self._taken + size > MOST_QUEUED:
-            self.overflow += len(datagrams)
-            return
-        self._put += size
-        self._batches.append(_Batch(datagrams, classifier, wall_ns(), monotonic_ns(), size))
-
-    def drain(self) -> Iterator[_Batch]:
-        """Yield what is there now."""
-        for _ in range(len(self._batches)):
-            batch = self._batches.popleft()
-            self._taken += batch.size
-            yield batch
 
 
 class Ring:
@@ -114,6 +76,9 @@ class Recorder:
         self._classifier = Classifier(self._program.envelope, self._program.table)
         self._channels = Channels()
         self._encoder = Encoder(self._channels)
+        self._queue: deque[Chunk] = deque()
+        self._queued = 0  # bytes
+        self._encoding = threading.Lock()  # for the encoder and the queue
         self._directory = RecordingDirectory(settings, self._program.table.path.stem)
         self._continuous = (
             ContinuousWriter(settings, self._directory, self._channels, lambda: self._about("continuous"))
@@ -121,8 +86,7 @@ class Recorder:
             else None
         )
         self._ring = Ring(settings.last, settings.max_size) if settings.last is not None else None
-        self._queue = DatagramQueue()
-        self._lost_by_faults = 0
+        self._overflow = self._lost_by_faults = 0
         self._is_well = True
         self._due = monotonic_ns() + PERIOD
         self._trips: deque[str] = deque()
@@ -163,7 +127,7 @@ class Recorder:
         return {
             "recorded_datagrams": [((), continuous.datagrams if continuous else 0)],
             "recorded_bytes": [((), continuous.bytes if continuous else 0)],
-            "record_dropped": [(("overflow",), self._queue.overflow), (("write_error",), write_errors)],
+            "record_dropped": [(("overflow",), self._overflow), (("write_error",), write_errors)],
         }
 
     def close(self) -> None:
@@ -188,7 +152,32 @@ class Recorder:
         program = self._running_program()
         if program is not self._program:
             self._program, self._classifier = program, Classifier(program.envelope, program.table)
-        self._queue.put(batch, self._classifier)
+        with self._encoding:
+            try:
+                self._encoder.add(batch, self._classifier, wall_ns(), monotonic_ns())
+                if self._encoder.size > LONGEST_CHUNK:
+                    self._finish_chunk()
+            except Exception as error:  # noqa: BLE001 of the router itself, and no reason to stop recording
+                self._encoding_failed(error)
+
+    def _finish_chunk(self) -> None:
+        """To be called with the lock `_encoding`."""
+        chunk = self._encoder.take()
+        if chunk is None:
+            return
+        if self._queued + chunk.size_in_file > MOST_QUEUED:
+            self._overflow += chunk.datagrams
+        else:
+            self._queue.append(chunk)
+            self._queued += chunk.size_in_file
+
+    def _next_chunk(self) -> Chunk | None:
+        with self._encoding:
+            if not self._queue:
+                return None
+            chunk = self._queue.popleft()
+            self._queued -= chunk.size_in_file
+            return chunk
 
     def _run(self) -> None:
         while not self._closing:
@@ -205,41 +194,39 @@ class Recorder:
             self._save_trips()
 
     def _write(self) -> None:
-        """Encode and write all that is queued. What a fault loses is counted, and the rest goes on."""
+        """Finish a chunk, and write all that are queued."""
         self._due = monotonic_ns() + PERIOD
-        faults: list[Exception] = []
-        is_idle = True
-        for batch in self._queue.drain():
-            is_idle = False
+        with self._encoding:
             try:
-                self._encoder.add(batch.datagrams, batch.classifier, batch.wall, batch.monotonic)
-                if self._encoder.size > LONGEST_CHUNK:
-                    self._finish_chunk()
-            except Exception as error:  # noqa: BLE001 of the router itself, and no reason to stop recording
-                faults.append(self._fault(error))
-        try:
-            self._finish_chunk()
-            if self._continuous is not None:
-                self._continuous.close_if_old(monotonic_ns())
-        except Exception as error:  # noqa: BLE001 as above
-            faults.append(self._fault(error))
-        if faults and self._is_well:
-            logger.critical("a fault in the recorder lost datagrams; please report it", exc_info=faults[0])
-        if faults or not is_idle:
-            self._is_well = not faults
+                self._finish_chunk()
+            except Exception as error:  # noqa: BLE001 as in `_take`
+                self._encoding_failed(error)
+        while (chunk := self._next_chunk()) is not None:
+            try:
+                self._store(chunk)
+            except Exception as error:  # noqa: BLE001 as in `_take`
+                self._report(error)
+            else:
+                self._is_well = True
+        if self._continuous is not None:
+            self._continuous.close_if_old(monotonic_ns())
 
-    def _finish_chunk(self) -> None:
-        chunk = self._encoder.take()
-        if chunk is None:
-            return
+    def _store(self, chunk: Chunk) -> None:
         if self._ring is not None:
             self._ring.add(chunk)
         if self._continuous is not None:
             self._continuous.write(chunk, monotonic_ns())
 
-    def _fault(self, error: Exception) -> Exception:
+    def _encoding_failed(self, error: Exception) -> None:
+        """To be called with the lock `_encoding`."""
         self._lost_by_faults += self._encoder.drop()
-        return error
+        self._report(error)
+
+    def _report(self, error: Exception) -> None:
+        """Log a fault, and not those that follow it."""
+        if self._is_well:
+            logger.critical("a fault in the recorder lost datagrams; please report it", exc_info=error)
+        self._is_well = False
 
     def _save_requested(self) -> None:
         while self._requests:
