@@ -114,14 +114,15 @@ class StreamClient:
 
     def _write_now(self) -> None:
         """Write pieces, small ones together, until the kernel takes no more."""
-        while self._pieces and not self._connection.get_write_buffer_size():
+        connection = self._connection
+        while self._pieces and not connection.get_write_buffer_size() and not connection.is_closing():
             batch = [self._pieces.popleft()]
             size = len(batch[0])
             while self._pieces and size + len(self._pieces[0]) <= PIECE:
                 size += len(self._pieces[0])
                 batch.append(self._pieces.popleft())
             self._waiting -= size
-            self._connection.write(batch[0] if len(batch) == 1 else b"".join(batch))
+            connection.write(batch[0] if len(batch) == 1 else b"".join(batch))
 
     async def _write_later(self) -> None:
         try:
