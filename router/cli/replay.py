@@ -105,8 +105,7 @@ def _advise(resent: Resent) -> int:
 
 def _compare(args: argparse.Namespace, recording: Recording) -> int:
     from router.compiler.lookup import Definitions
-    from router.rehearsal.replaying_against import Against
-    from router.rehearsal.replaying_report import Report
+    from router.rehearsal.against import Against, Report
 
     definitions = Definitions()
     old, new = (_checked(path, definitions) for path in (args.table or DEFAULT_TABLE, args.against))

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
+from typing import TextIO
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
-from router.cli.findings import FORMATS, print_findings
-from router.cli.test_report import print_results, summary
+from router.cli.findings import FORMATS, excerpt, github_escaped, is_coloured, plural, print_findings, visible
+from router.cli.findings import as_data as finding_data
 from router.compiler.lookup import Definitions
-from router.errors import Diagnostic, TableError
+from router.errors import Diagnostic, SourceSpan, TableError, shown_path
 from router.rehearsal.coverage import Coverage
-from router.rehearsal.reading import read_test_file
-from router.rehearsal.running import Result
-from router.rehearsal.tests import find_test_files, prove
+from router.rehearsal.reading import find_test_files, read_test_file
+from router.rehearsal.running import Result, run_tests
 from router.table import in_order
 
 FAILED = 1
@@ -44,23 +45,23 @@ def run(args: argparse.Namespace) -> int:
     if not files:
         print(f"router test: no tests (*.test.yaml) in {', '.join(map(str, paths))}", file=sys.stderr)
         return BAD_USAGE
-    coverages: dict[Path, Coverage] | None = {} if args.coverage else None
-    results, findings = _proven(files, args.only or "", coverages)
+    coverages: dict[Path, Coverage] = {}
+    results, findings = _results(files, args.only or "", coverages if args.coverage else None)
     if args.only and not results and not findings:
         print(f"router test: the name of no test contains {args.only!r}", file=sys.stderr)
         return BAD_USAGE
     if findings and args.format != "json":
         print_findings(findings, sys.stderr, args.format)
-    print_results(results, findings, coverages or {}, sys.stdout, args.format)
+    _print_results(results, findings, coverages.values(), sys.stdout, args.format)
     if args.format == "text" and (results or not findings):
-        print(summary(results, len(files)))
+        print(_summary(results, len(files)))
     if findings:
         return BAD_TABLE
-    is_complete = all(coverage.is_complete for coverage in (coverages or {}).values())
+    is_complete = all(coverage.is_complete for coverage in coverages.values())
     return OK if is_complete and all(result.passed for result in results) else FAILED
 
 
-def _proven(
+def _results(
     files: Sequence[Path], only: str, coverages: dict[Path, Coverage] | None
 ) -> tuple[list[Result], list[Diagnostic]]:
     """All results, and what is wrong with the test files and their tables. `coverages`, by table, are filled."""
@@ -73,11 +74,118 @@ def _proven(
         except TableError as error:
             findings.update(dict.fromkeys(error.diagnostics))
             continue
-        coverage = None if coverages is None else Coverage.of(file)
-        results += prove(file, only, coverage)
+        coverage = None if coverages is None else Coverage(file.checked, file.program)
+        results += run_tests(file, only, coverage)
         if coverages is not None and coverage is not None:
             coverages.setdefault(file.checked.path, coverage).add(coverage)
     for coverage, other in itertools.permutations((coverages or {}).values(), 2):
-        coverage.learn(other)
+        coverage.inherit(other)
     findings.update(dict.fromkeys(finding for result in results for finding in result.findings))
     return results, in_order(list(findings))
+
+
+def _print_results(
+    results: Sequence[Result], findings: Sequence[Diagnostic], coverages: Collection[Coverage], out: TextIO, style: str
+) -> None:
+    """Print in one of FORMATS. Only JSON has the `findings`, which are what is wrong with test files and tables."""
+    if style == "json":
+        wrong = {"findings": [finding_data(finding, strict=False) for finding in findings]}
+        json.dump(_as_data(results, coverages) | wrong, out, indent=2)
+        out.write("\n")
+    elif style == "github":
+        out.writelines(line + "\n" for line in _annotations(results, coverages))
+    else:
+        out.writelines(line + "\n" for line in _text(results, coverages, _Paint(is_coloured(out))))
+
+
+def _summary(results: Sequence[Result], files: int) -> str:
+    """`2 of 31 tests failed, in 1 file`."""
+    failed = sum(not result.passed for result in results)
+    tests = plural(len(results), "test")
+    return f"{f'{failed} of {tests} failed' if failed else f'{tests} passed'}, in {plural(files, 'file')}"
+
+
+# for people
+
+_RESET, _BOLD, _RED, _CYAN, _YELLOW = "\x1b[0m", "\x1b[1m", "\x1b[31m", "\x1b[36m", "\x1b[33m"
+
+
+class _Paint:
+    def __init__(self, coloured: bool) -> None:
+        self.coloured = coloured
+
+    def __call__(self, colour: str, text: str) -> str:
+        return f"{colour}{text}{_RESET}" if self.coloured else text
+
+    def excerpt(self, span: SourceSpan, colour: str) -> list[str]:
+        return excerpt(span, colour if self.coloured else "")
+
+
+def _text(results: Sequence[Result], coverages: Collection[Coverage], paint: _Paint) -> Iterator[str]:
+    for result in results:
+        if result.failures:
+            yield f"{paint(_BOLD, str(result.test.span))}: {paint(_RED, 'failed')}: {visible(result.test.name)}"
+        for failure in result.failures:
+            yield f"{failure.span}: {paint(_BOLD, visible(failure.message))}"
+            yield from paint.excerpt(failure.span, _RED)
+            if failure.table is not None:
+                yield f"{failure.table.span}: {paint(_CYAN, failure.table.note)}"
+                yield from paint.excerpt(failure.table.span, _CYAN)
+            yield ""
+    for coverage in coverages:
+        for item in coverage.gaps():
+            yield f"{item.span}: {paint(_YELLOW, 'not covered')}: {item.gap}"
+            yield from paint.excerpt(item.span, _YELLOW)
+        counts = [f"{touched} of {plural(there, kind)}" for kind, (touched, there) in coverage.counts().items()]
+        yield f"{shown_path(coverage.path)}: covered {', '.join(counts)}"
+
+
+# for machines
+
+
+def _as_data(results: Sequence[Result], coverages: Collection[Coverage]) -> dict[str, object]:
+    """Lines and columns count from 1, `end_column` is exclusive."""
+    return {
+        "tests": [_result_data(result) for result in results],
+        "coverage": [
+            {
+                "table": shown_path(coverage.path),
+                **{f"{kind}s": {"touched": one, "all": all_} for kind, (one, all_) in coverage.counts().items()},
+                "gaps": [{"kind": item.kind, "message": item.gap, **_place(item.span)} for item in coverage.gaps()],
+            }
+            for coverage in coverages
+        ],
+    }
+
+
+def _result_data(result: Result) -> dict[str, object]:
+    failures = [
+        {
+            "message": failure.message,
+            **_place(failure.span),
+            "table": {"note": failure.table.note, **_place(failure.table.span)} if failure.table else None,
+        }
+        for failure in result.failures
+    ]
+    return {"name": result.test.name, "passed": result.passed, **_place(result.test.span), "failures": failures}
+
+
+def _place(span: SourceSpan) -> dict[str, str | int]:
+    return {"file": span.file, "line": span.line, "column": span.column, "end_column": span.end_column}
+
+
+def _annotations(results: Sequence[Result], coverages: Collection[Coverage]) -> Iterator[str]:
+    """Workflow commands, which GitHub shows beside the lines of a pull request."""
+    for result in results:
+        for failure in result.failures:
+            table = f" ({failure.table.span}: {failure.table.note})" if failure.table else ""
+            yield _annotation("error", failure.span, result.test.name, failure.message + table)
+    for coverage in coverages:
+        for item in coverage.gaps():
+            yield _annotation("warning", item.span, "not covered by a test", item.gap)
+
+
+def _annotation(level: str, span: SourceSpan, title: str, text: str) -> str:
+    properties = {"file": span.file, "line": span.line, "col": span.column, "endColumn": span.end_column}
+    listed = ",".join(f"{name}={github_escaped(str(value), ':,')}" for name, value in properties.items())
+    return f"::{level} {listed},title={github_escaped(title, ':,')}::{github_escaped(text, '')}"

@@ -1,4 +1,4 @@
-"""Compares what happened in a step with what a test expects: each difference with its place in test and table."""
+"""Compare what happened in a step with what a test expects: each difference with its places in test and table."""
 
 from __future__ import annotations
 
@@ -6,205 +6,318 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from router.compiler import Checked
+from router.compiler.checked import CheckedTarget
+from router.compiler.plan import Each, Items, Leaf, Plan, Record
+from router.compiler.program import Program
 from router.engine.wire import Wire
 from router.errors import DecodeError, Located, SourceSpan
-from router.rehearsal.events import Dropped, Event, Filtered, Published, Received, Rejected, Sent
-from router.rehearsal.matching import Difference
-from router.rehearsal.model import Counted, Expected, Item, Message, Payload, Step, Unchanged
-from router.rehearsal.places import Place, Places
-from router.rehearsal.words import Happened, Words
-from router.table.model import RouteTable
-from tests.oracles import reference_cdr
+from router.rehearsal import cdr
+from router.rehearsal.fields import Difference, Path, offset, path_text, shown
+from router.rehearsal.rehearsal import START, Dropped, Event, Filtered, Published, Received, Rejected, Sent
+from router.rehearsal.steps import Counts, Deliveries, Delivery, Expected, Step
+from router.types.model import MessageType
 
-_SHOWN = 3
-"""So many of what came are told where their number is not what was expected."""
+_LISTED = 3
+"""So many of the deliveries are listed where their number is not what was expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Related:
+    """A stretch of the table, and what it has to do with a failure."""
+
+    span: SourceSpan
+    note: str
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One thing that a table does not do as a test expects. `table` is the place there that has to do with it."""
+    """One thing that a table does not do as a test expects."""
 
     span: SourceSpan
     message: str
-    table: Place | None = None
+    table: Related | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What happened in a step: events `early`, before its time, and in it. `given` are the times and bytes given."""
+
+    step: Step
+    early: Sequence[Event]
+    events: Sequence[Event]
+    given: Sequence[tuple[int, bytes]]
+
+    def given_at(self, at: int) -> int:
+        """When the last message came in that a delivery at this time can be made of, ns."""
+        return max((time for time, _ in self.given if time <= at), default=at)
+
+
+class TableIndex:
+    """Finds the places of a table by route and target, as events name them."""
+
+    def __init__(self, checked: Checked) -> None:
+        self._routes = {route.route.name: route for route in checked.routes}
+        self._targets: dict[tuple[str, str], list[CheckedTarget]] = {}
+        for route in checked.routes:
+            for target in (
+                *route.targets,
+                *(target for subscription in route.subscriptions for target in subscription.targets),
+            ):
+                self._targets.setdefault((route.route.name, target.label), []).append(target)
+
+    def target(self, route: str, target: str, note: str = "the target") -> Related | None:
+        found = self._targets.get((route, target))
+        return Related(found[0].span, note) if found else None
+
+    def type(self, route: str, topic: str) -> MessageType | None:
+        """Of a topic that a route publishes on."""
+        return next((found.type for found in self._targets.get((route, topic), ())), None)
+
+    def of_name(self, target: str, routes: Iterable[str]) -> Related | None:
+        """The target of this name in one of the `routes` that took a message, or else in any."""
+        taken = [name for name in routes if name in self._routes]
+        found = next((found for name in taken if (found := self.target(name, target))), None)
+        if found is None and taken:
+            found = Related(self._routes[taken[0]].route.span, "the route that took it has no such target")
+        return found or next((self.target(*key) for key in self._targets if key[1] == target), None)
+
+    def condition(self, route: str, target: str) -> Related | None:
+        for found in self._targets.get((route, target), ()):
+            if found.when is not None:
+                return Related(found.when.span, "withheld by this condition")
+        return self.target(route, target)
+
+    def deadman(self, route: str) -> Related | None:
+        deadman = self._routes[route].route.deadman if route in self._routes else None
+        return Related(deadman.span, "sent by this deadman") if deadman else None
+
+    def field(self, route: str, target: str, path: Path) -> Related | None:
+        """What fills a field, or else the target that leaves it at its default."""
+        for found in self._targets.get((route, target), ()):
+            if found.plan is None:
+                return Related(found.span, "forwarded here")
+            if (span := _filled(found.plan, path)) is not None:
+                return Related(span, f"what fills {path_text(path)}")
+        return self.target(route, target, "nothing here fills it")
+
+
+def _filled(plan: Plan, path: Path) -> SourceSpan | None:
+    match plan:
+        case Leaf() | Each():
+            return plan.span
+        case Record():
+            inner = next((made for field, made in plan.members if path and field.name == path[0]), None)
+            if inner is None:
+                return plan.span if not path else None
+            return _filled(inner, path[1:])
+        case Items():
+            if path and isinstance(path[0], int) and path[0] < len(plan.items):
+                return _filled(plan.items[path[0]], path[1:])
+            return plan.span
+    return None
 
 
 class Comparison:
-    def __init__(self, wire: Wire, places: Places, table: RouteTable) -> None:
-        self._wire = wire
-        self._places = places
-        self._words = Words(wire, places)
-        self._table = table
+    """Compares the steps of the tests of one table."""
 
-    def failures(self, step: Step, happened: Happened) -> Iterator[Failure]:
+    def __init__(self, checked: Checked, program: Program) -> None:
+        self._wire = Wire(program.envelope)
+        self._index = TableIndex(checked)
+        self._table = program.table
+
+    def failures(self, outcome: Outcome) -> Iterator[Failure]:
         """In the order in which a person would look for them."""
-        expected = step.expected
-        yield from self._early(expected, happened)
+        expected, events = outcome.step.expected, outcome.events
+        yield from self._early(outcome)
         if expected.anything:
             return
-        rejected = [event for event in happened.events if isinstance(event, Rejected)]
-        unexpected = list(self._rejected(expected, rejected))
+        rejected = [event for event in events if isinstance(event, Rejected)]
+        unexpected = list(_rejected(expected, rejected))
         yield from unexpected
-        yield from self._routes(expected, happened.events)
-        is_told = bool(rejected and unexpected)
-        sent = [event for event in happened.events if isinstance(event, Sent)]
-        yield from self._delivered(expected.sent, _by_target(sent), happened, is_told)
-        published = [event for event in happened.events if isinstance(event, Published)]
-        yield from self._delivered(expected.published, _by_target(published), happened, is_told)
-        yield from self._dropped(expected, happened)
-        yield from self._filtered(expected, happened.events)
+        yield from _routes(expected, events)
+        explained = bool(rejected and unexpected)
+        for kind, deliveries in ((Sent, expected.sent), (Published, expected.published)):
+            came: dict[str, list[Sent | Published]] = {}
+            for event in events:
+                if isinstance(event, kind):
+                    came.setdefault(event.target, []).append(event)
+            yield from self._delivered(deliveries, came, outcome, explained=explained)
+        yield from self._dropped(outcome)
+        yield from _filtered(expected, events)
 
-    def _early(self, expected: Expected, happened: Happened) -> Iterator[Failure]:
+    def _early(self, outcome: Outcome) -> Iterator[Failure]:
         """What happened since the step before, at no time that a step has."""
-        by_place: dict[Place | None, list[Event]] = {}
-        for event in happened.early:
+        related: dict[Related | None, list[Event]] = {}
+        for event in outcome.early:
             if isinstance(event, (Sent, Published, Dropped)):
-                by_place.setdefault(self._words.place(event), []).append(event)
-        for place, events in by_place.items():
+                related.setdefault(self._related(event), []).append(event)
+        for place, events in related.items():
             more = f", and so on, {len(events)} in all" if len(events) > 1 else ""
-            message = f"before this step, {self._words.told(events[0], happened)}{more}; no step expects it"
-            yield Failure(expected.span, message, place)
+            message = f"before this step, {self._described(events[0])}{more}; no step expects it"
+            yield Failure(outcome.step.expected.span, message, place)
 
     # what is delivered
 
     def _delivered(
-        self,
-        expected: Mapping[str, tuple[Item, ...]],
-        came: Mapping[str, list[Sent | Published]],
-        happened: Happened,
-        is_told: bool,
+        self, expected: Deliveries, came: Mapping[str, list[Sent | Published]], outcome: Outcome, *, explained: bool
     ) -> Iterator[Failure]:
+        """`explained`: a rejection that was reported is why targets got nothing."""
         for target in dict.fromkeys((*expected, *came)):
-            items, events = expected.get(target, ()), came.get(target, [])
-            if items and not events:
-                if not is_told:  # as the rejection that it comes from
-                    yield self._missing(target, items, happened)
-            elif not items:
-                yield from self._unexpected(events, happened)
-            elif len(items) != len(events):
-                listed = "; ".join(self._words.told(event, happened) for event in events[:_SHOWN])
-                more = f"; and {len(events) - _SHOWN} more" if len(events) > _SHOWN else ""
-                message = f"{len(events)} for {target}, not {len(items)}: {listed}{more}"
-                yield Failure(items[0].span, message, self._words.place(events[-1]))
+            deliveries, events = expected.get(target, ()), came.get(target, [])
+            if deliveries and not events:
+                if not explained:
+                    yield self._missing(target, deliveries[0].span, outcome)
+            elif not deliveries:
+                times = f", {len(events)} times" if len(events) > 1 else ""
+                message = f"{self._described(events[0])}{times}; it is not expected"
+                yield Failure(outcome.step.expected.span, message, self._related(events[0]))
+            elif len(deliveries) != len(events):
+                listed = "; ".join(map(self._described, events[:_LISTED]))
+                more = f"; and {len(events) - _LISTED} more" if len(events) > _LISTED else ""
+                message = f"{len(events)} for {target}, not {len(deliveries)}: {listed}{more}"
+                yield Failure(deliveries[0].span, message, self._related(events[-1]))
             else:
-                for item, event in zip(items, events, strict=True):
-                    yield from self._differences(item, event, happened)
+                for delivery, event in zip(deliveries, events, strict=True):
+                    yield from self._differences(delivery, event, outcome)
 
-    def _missing(self, target: str, items: Sequence[Item], happened: Happened) -> Failure:
-        """With what became of the message instead, where the counters know."""
-        for event in happened.events:
+    def _missing(self, target: str, span: SourceSpan, outcome: Outcome) -> Failure:
+        """With what became of the message instead, where there is an event of it."""
+        for event in outcome.events:
             if isinstance(event, Dropped) and event.target == target:
                 why = f"it was dropped as {event.reason}" + (f" ({event.detail})" if event.detail else "")
-                return Failure(items[0].span, f"nothing for {target}: {why}", self._words.place(event))
+                return Failure(span, f"nothing for {target}: {why}", self._related(event))
             if isinstance(event, Filtered) and event.target == target:
-                place = self._places.condition(event.route, target)
-                return Failure(items[0].span, f"nothing for {target}: it was withheld", place)
-        return Failure(items[0].span, f"nothing for {target}", self._of_name(target, happened))
+                condition = self._index.condition(event.route, target)
+                return Failure(span, f"nothing for {target}: it was withheld", condition)
+        return Failure(span, f"nothing for {target}", self._of_name(target, outcome))
 
-    def _unexpected(self, events: Sequence[Sent | Published], happened: Happened) -> Iterator[Failure]:
-        first, count = events[0], len(events)
-        times = f", {count} times" if count > 1 else ""
-        message = f"{self._words.told(first, happened)}{times}; it is not expected"
-        yield Failure(happened.step.expected.span, message, self._words.place(first))
+    def _differences(self, expected: Delivery, event: Sent | Published, outcome: Outcome) -> Iterator[Failure]:
+        if isinstance(event, Published):
+            if expected.fields is not None:
+                found = cdr.deserialize(expected.fields.type, event.data)
+                now = outcome.given_at(event.at)
+                for difference in expected.fields.differences((), expected.fields.type, found, now):
+                    yield self._different_field(difference, event)
+        elif expected.is_unchanged:
+            trims = self._table.endpoints[event.target].trim_trailing_zeros
+            if event.data not in {data.rstrip(b"\0") if trims else data for _, data in outcome.given}:
+                message = f"{self._described(event)}, not what was given"
+                yield Failure(expected.span, message, self._related(event))
+        elif expected.data is not None:
+            if event.data != expected.data:
+                message = f"{event.target} gets the bytes {event.data.hex(' ')}, not {expected.data.hex(' ')}"
+                yield Failure(expected.span, message, self._related(event))
+        elif expected.case is not None:
+            yield from self._different_payload(expected, expected.case.name, event, outcome)
 
-    def _differences(self, item: Item, event: Sent | Published, happened: Happened) -> Iterator[Failure]:
-        content, moments = item.content, happened.moments(event.at)
-        match content, event:
-            case Unchanged(), Sent():
-                trims = self._table.endpoints[event.endpoint].trim_trailing_zeros
-                if event.data not in {data.rstrip(b"\0") if trims else data for _, data in happened.given}:
-                    yield Failure(
-                        item.span, f"{self._words.told(event, happened)}, not what was given", self._words.place(event)
-                    )
-            case bytes(), Sent():
-                if event.data != content:
-                    message = f"{event.endpoint} gets the bytes {event.data.hex(' ')}, not {content.hex(' ')}"
-                    yield Failure(item.span, message, self._words.place(event))
-            case Payload(), Sent():
-                yield from self._payload(content, item.span, event, happened)
-            case Message(), Published():
-                found = reference_cdr.parse(content.type, event.cdr)
-                for difference in content.fields.differences((), content.type, found, moments):
-                    yield self._failure(difference, event, event.topic, happened)
-
-    def _payload(self, expected: Payload, span: SourceSpan, event: Sent, happened: Happened) -> Iterator[Failure]:
+    def _different_payload(self, expected: Delivery, case: str, event: Sent, outcome: Outcome) -> Iterator[Failure]:
         try:
             decoded = self._wire.decode(event.data)
         except DecodeError as error:
-            yield Failure(span, f"{event.endpoint} gets no envelope: {error}", self._words.place(event))
+            yield Failure(expected.span, f"{event.target} gets no envelope: {error}", self._related(event))
             return
-        if decoded.case.name != expected.case.name:
-            message = f"{self._words.told(event, happened)}, not {expected.case.name}"
-            yield Failure(span, message, self._words.place(event))
+        if decoded.case.name != case:
+            yield Failure(expected.span, f"{self._described(event)}, not {case}", self._related(event))
         elif expected.fields is not None:
-            kind, moments = expected.case.type, happened.moments(event.at)
-            for difference in expected.fields.differences((), kind, decoded.message, moments):
-                yield self._failure(difference, event, event.endpoint, happened)
+            now = outcome.given_at(event.at)
+            for difference in expected.fields.differences((), decoded.case.type, decoded.message, now):
+                yield self._different_field(difference, event)
 
-    def _failure(self, difference: Difference, event: Sent | Published, target: str, happened: Happened) -> Failure:
+    def _different_field(self, difference: Difference, event: Sent | Published) -> Failure:
         is_mapped = not (isinstance(event, Sent) and event.by_deadman)
-        field = self._places.field(event.route, target, difference.path) if is_mapped else None
-        when = happened.time(event)
-        return Failure(difference.span, f"{when}{target}: {difference}", field or self._words.place(event))
+        field = self._index.field(event.route, event.target, difference.path) if is_mapped else None
+        message = f"{_when(event)}{event.target}: {difference}"
+        return Failure(difference.span, message, field or self._related(event))
 
     # what is not delivered
 
-    def _rejected(self, expected: Expected, events: Sequence[Rejected]) -> Iterator[Failure]:
-        came = Counter(event.reason for event in events)
-        wanted = expected.rejected or Located({}, expected.span)
-        if came != Counter(wanted.value):
-            detail = events[0].detail if events else ""
-            message = f"rejected: {_counts(came)}, not {_counts(wanted.value)}" + (f" ({detail})" if detail else "")
-            yield Failure(wanted.span, message)
-
-    def _routes(self, expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
-        taken = {event.route for event in events if isinstance(event, Received)}
-        if expected.route is not None and taken != {expected.route.value}:
-            found = f"the route is {', '.join(sorted(taken))}" if taken else "no route takes it"
-            yield Failure(expected.route.span, f"{found}, not {expected.route.value}")
-
-    def _dropped(self, expected: Expected, happened: Happened) -> Iterator[Failure]:
-        nothing: Located[Counted] = Located({}, expected.span)
+    def _dropped(self, outcome: Outcome) -> Iterator[Failure]:
+        expected = outcome.step.expected
+        nothing: Located[Counts] = Located({}, expected.span)
         came: dict[str, list[Dropped]] = {}
-        for event in happened.events:
+        for event in outcome.events:
             if isinstance(event, Dropped):
                 came.setdefault(event.target, []).append(event)
-        got_something = {_target(event) for event in happened.events if isinstance(event, (Sent, Published))}
-        told = {target for target in (*expected.sent, *expected.published) if target not in got_something}
+        served = {event.target for event in outcome.events if isinstance(event, (Sent, Published))}
+        missing = {target for target in (*expected.sent, *expected.published) if target not in served}
         for target in dict.fromkeys((*expected.dropped, *came)):
             wanted = expected.dropped.get(target, nothing)
-            counts = Counter(event.reason for event in came.get(target, ()))
-            is_told = target not in expected.dropped and target in told  # as the reason why it is missing
-            if counts != Counter(wanted.value) and not is_told:
-                details = {event.detail: None for event in came.get(target, ()) if event.detail}
-                detail = f" ({next(iter(details))})" if details else ""
-                message = f"dropped for {target}: {_counts(counts)}, not {_counts(wanted.value)}{detail}"
-                place = self._words.place(came[target][0]) if target in came else self._of_name(target, happened)
-                yield Failure(wanted.span, message, place)
+            dropped = came.get(target, [])
+            counts = Counter(event.reason for event in dropped)
+            is_reported = target not in expected.dropped and target in missing  # as the reason why it is missing
+            if counts != Counter(wanted.value) and not is_reported:
+                detail = next((f" ({event.detail})" for event in dropped if event.detail), "")
+                message = f"dropped for {target}: {_listed(counts)}, not {_listed(wanted.value)}{detail}"
+                related = self._related(dropped[0]) if dropped else self._of_name(target, outcome)
+                yield Failure(wanted.span, message, related)
 
-    def _of_name(self, target: str, happened: Happened) -> Place | None:
-        """Where the table should have delivered what was given to a target that heard nothing of it."""
-        return self._places.of_name(target, (each.route for each in happened.events if isinstance(each, Received)))
+    # places and words
 
-    def _filtered(self, expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
-        came = Counter(event.target for event in events if isinstance(event, Filtered))
-        if expected.filtered is not None and came != Counter(expected.filtered.value):
-            message = f"withheld from: {_counts(came)}, not {_counts(expected.filtered.value)}"
-            yield Failure(expected.filtered.span, message)
+    def _of_name(self, target: str, outcome: Outcome) -> Related | None:
+        """Where the table should have delivered what was given to a target that got nothing of it."""
+        return self._index.of_name(target, (each.route for each in outcome.events if isinstance(each, Received)))
+
+    def _related(self, event: Event) -> Related | None:
+        match event:
+            case Sent(by_deadman=True):
+                return self._index.deadman(event.route)
+            case Sent() | Published() | Dropped() | Filtered():
+                return self._index.target(event.route, event.target)
+        return None
+
+    def _described(self, event: Event) -> str:
+        """`at 500 ms manual_brake {brake: true} is sent to driving_board`."""
+        when = _when(event)
+        match event:
+            case Sent():
+                by = f" by the deadman of {event.route}" if event.by_deadman else ""
+                return f"{when}{self._datagram(event.data)} is sent to {event.target}{by}"
+            case Published():
+                kind = self._index.type(event.route, event.target)
+                inside = shown(kind, cdr.deserialize(kind, event.data)) if kind else "a message"
+                return f"{when}{inside} is published on {event.target}"
+            case Dropped():
+                return f"{when}{event.target} misses one as {event.reason}"
+        return when
+
+    def _datagram(self, data: bytes) -> str:
+        try:
+            decoded = self._wire.decode(data)
+        except DecodeError:
+            return data.hex(" ")
+        return f"{decoded.case.name} {shown(decoded.case.type, decoded.message)}"
 
 
-def _by_target(events: Iterable[Sent | Published]) -> Mapping[str, list[Sent | Published]]:
-    found: dict[str, list[Sent | Published]] = {}
-    for event in events:
-        found.setdefault(_target(event), []).append(event)
-    return found
+def _rejected(expected: Expected, events: Sequence[Rejected]) -> Iterator[Failure]:
+    came = Counter(event.reason for event in events)
+    wanted = expected.rejected or Located({}, expected.span)
+    if came != Counter(wanted.value):
+        detail = events[0].detail if events else ""
+        message = f"rejected: {_listed(came)}, not {_listed(wanted.value)}" + (f" ({detail})" if detail else "")
+        yield Failure(wanted.span, message)
 
 
-def _target(event: Sent | Published) -> str:
-    return event.endpoint if isinstance(event, Sent) else event.topic
+def _routes(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
+    taken = {event.route for event in events if isinstance(event, Received)}
+    if expected.route is not None and taken != {expected.route.value}:
+        found = f"the route is {', '.join(sorted(taken))}" if taken else "no route takes it"
+        yield Failure(expected.route.span, f"{found}, not {expected.route.value}")
 
 
-def _counts(counts: Counted) -> str:
+def _filtered(expected: Expected, events: Iterable[Event]) -> Iterator[Failure]:
+    came = Counter(event.target for event in events if isinstance(event, Filtered))
+    if expected.filtered is not None and came != Counter(expected.filtered.value):
+        message = f"withheld from: {_listed(came)}, not {_listed(expected.filtered.value)}"
+        yield Failure(expected.filtered.span, message)
+
+
+def _when(event: Event) -> str:
+    """`at 500 ms `, nothing at the beginning of the test."""
+    return f"at {offset(event.at - START)} " if event.at != START else ""
+
+
+def _listed(counts: Counts) -> str:
     """`stale, 3 rate_limited`."""
     listed = (f"{count} {name}" if count > 1 else name for name, count in sorted(counts.items()))
     return ", ".join(listed) or "nothing"

@@ -1,155 +1,159 @@
-"""What of a table its tests have touched: routes, targets, expressions.
+"""What of a table its tests have touched, by what the router counted: routes, targets, and rejections.
 
-Where a table is compiled for this, each of its expressions tells when it gave a value. Something counts as touched
-only in a step that the test looks at, an expression only where the message that it filled was compared.
+Only steps count that expect something (not `any`), and of targets only messages that were compared with something.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from router.compiler.checked import CheckedRoute
+from router.compiler import Checked
+from router.compiler.checked import CheckedRoute, CheckedTarget
+from router.compiler.expressions import Typed
 from router.compiler.program import Program
 from router.errors import SourceSpan
-from router.rehearsal.events import Published, Received, Sent
-from router.rehearsal.model import Item, Payload, TableTestFile, Whatever
-from router.rehearsal.probes import Part, Probes, with_probes
-from router.rehearsal.words import Happened
+from router.rehearsal.comparing import Outcome
+from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Received, Rejected, Sent
+from router.rehearsal.steps import Expected
+from router.table.model import ANY, ROS
 
-Route = str
-Target = str
+KINDS = ("route", "target", "rejection")
+
+Key = tuple[str, ...]
+"""What is touched: `route` or a reason of the metrics, then the names of listener, route, target."""
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
-    """Something that no test has touched; `what` says it in words."""
+class Item:
+    """Something that tests should touch. `gap` says so where none does."""
 
-    span: SourceSpan
     kind: str
-    what: str
+    span: SourceSpan
+    gap: str
 
 
-@dataclass(slots=True)
 class Coverage:
-    """The coverage of one table by a file of tests, and by others that were added. `program` has probes in it."""
+    """The coverage of one table by the tests of a file, and by those of others that are added."""
 
-    program: Program
-    routes: tuple[CheckedRoute, ...]
-    probes: Probes
-    _routes: set[Route] = field(default_factory=set)
-    _targets: set[tuple[Route, Target, bool]] = field(default_factory=set)
-    _outcomes: set[tuple[Part, bool]] = field(default_factory=set)
+    def __init__(self, checked: Checked, program: Program) -> None:
+        self.path: Path = checked.path
+        self._items: dict[Key, Item] = {}
+        self._touched: set[Key] = set()
+        for key, item in _items(checked, program):
+            self._items.setdefault(key, item)
 
-    @classmethod
-    def of(cls, file: TableTestFile) -> Coverage:
-        probes = Probes()
-        routes = tuple(checked for checked in file.checked.routes if not checked.route.ignore)
-        return cls(with_probes(file.checked, probes), routes, probes)
-
-    def saw(self, happened: Happened) -> None:
-        """A step of a test has run."""
-        outcomes = self.probes.taken()
-        if happened.step.expected.anything:
-            return
-        compared = set(_compared(happened))
-        self._targets |= compared
-        self._routes |= {event.route for event in happened.events if isinstance(event, Received)}
-        for part, target, outcome in outcomes:
-            if target is None or part.is_condition or (part.route, target, False) in compared:
-                self._outcomes.add((part, outcome))
+    def record(self, outcome: Outcome) -> None:
+        """Record what a step of a test has touched."""
+        expected = outcome.step.expected
+        if not expected.anything:
+            self._touched.update(key for event in outcome.events for key in _keys(event, expected))
 
     def add(self, other: Coverage) -> None:
-        """What another file of tests has touched of the same table, whatever it fills its variables with."""
-        self.probes.parts |= other.probes.parts
-        self._routes |= other._routes
-        self._targets |= other._targets
-        self._outcomes |= other._outcomes
+        """Add what another file of tests has touched of the same table, whatever its variables are."""
+        self._items = other._items | self._items
+        self._touched |= other._touched
 
-    def learn(self, other: Coverage) -> None:
-        """What the tests of another table have touched counts here too, where it stands at the same place of a file."""
-        routes = {(name, _place(span)) for name, span in other._all_routes() if name in other._routes}
-        self._routes |= {name for name, span in self._all_routes() if (name, _place(span)) in routes}
-        targets = {(key, _place(span)) for key, span in other._all_targets() if key in other._targets}
-        self._targets |= {key for key, span in self._all_targets() if (key, _place(span)) in targets}
-        parts = {replace(part, span=_place(part.span)): part for part in self.probes.parts}
-        placed = [(replace(part, span=_place(part.span)), outcome) for part, outcome in other._outcomes]
-        self._outcomes |= {(parts[part], outcome) for part, outcome in placed if part in parts}
+    def inherit(self, other: Coverage) -> None:
+        """Add what the tests of another table have touched that both tables have from the same place of a file."""
+        places = {key: _real(item.span) for key, item in other._items.items() if key in other._touched}
+        self._touched |= {key for key, item in self._items.items() if places.get(key) == _real(item.span)}
+
+    def gaps(self) -> list[Item]:
+        """What no test has touched."""
+        return [item for key, item in self._items.items() if key not in self._touched]
 
     @property
     def is_complete(self) -> bool:
-        return not list(self.gaps())
+        return not self.gaps()
 
     def counts(self) -> dict[str, tuple[int, int]]:
-        """Of routes, targets and expressions: how many were touched, and how many there are."""
-        there = {
-            "route": len(self.routes),
-            "target": len(list(self._all_targets())),
-            "expression": len(self.probes.parts),
-        }
-        missing = [gap.kind for gap in self.gaps()]
-        return {kind: (count - missing.count(kind), count) for kind, count in there.items()}
-
-    def gaps(self) -> Iterator[Gap]:
-        for name, span in self._all_routes():
-            if name not in self._routes:
-                yield Gap(span, "route", f"no test has a message for the route {name}")
-        for key, span in self._all_targets():
-            if key not in self._targets:
-                route, target, by_deadman = key
-                source = f"the deadman of {route} sends" if by_deadman else f"{route} has"
-                yield Gap(span, "target", f"no test compares what {source} for {target}")
-        for part in self.probes.parts:
-            if why := self._missing(part):
-                yield Gap(part.span, "expression", why)
-
-    def _missing(self, part: Part) -> str:
-        outcomes = {outcome for touched, outcome in self._outcomes if touched == part}
-        where = f"in a compared message of {part.route}"
-        if part.is_condition:
-            words = {True: "held", False: "withheld anything"}
-            never = [word for outcome, word in words.items() if outcome not in outcomes]
-            return f"this condition has never {' nor '.join(never)} in a test" if never else ""
-        if part.is_branch:
-            return "" if outcomes else f"this branch was never taken {where}"
-        if True in outcomes:
-            return ""
-        return f"this gave nothing but zero {where}" if outcomes else f"this was never used {where}"
-
-    def _all_routes(self) -> Iterator[tuple[Route, SourceSpan]]:
-        return ((checked.route.name, checked.route.span) for checked in self.routes)
-
-    def _all_targets(self) -> Iterator[tuple[tuple[Route, Target, bool], SourceSpan]]:
-        """Each once, with whether it is a deadman's."""
-        seen = set()
-        for checked in self.routes:
-            name = checked.route.name
-            served = [*checked.targets, *(target for feed in checked.subscriptions for target in feed.targets)]
-            found = [((name, each.label, False), each.span) for each in served]
-            if checked.deadman and checked.route.deadman:
-                found += [((name, to.value, True), checked.route.deadman.span) for to in checked.route.deadman.to]
-            for key, span in found:
-                if key not in seen:
-                    seen.add(key)
-                    yield key, span
+        """Of each kind, how many were touched, and how many there are."""
+        there = [item.kind for item in self._items.values()]
+        missing = [item.kind for item in self.gaps()]
+        return {kind: (there.count(kind) - missing.count(kind), there.count(kind)) for kind in KINDS}
 
 
-def _place(span: SourceSpan) -> SourceSpan:
+def _real(span: SourceSpan) -> SourceSpan:
     """The same for each path that a table may be extended by."""
     return replace(span, file=os.path.realpath(span.file))
 
 
-def _compared(happened: Happened) -> Iterator[tuple[Route, Target, bool]]:
-    """What got a message in this step that the test says something about."""
-    expected = happened.step.expected
-    for event in happened.events:
-        if isinstance(event, Sent) and any(map(_is_looked_at, expected.sent.get(event.endpoint, ()))):
-            yield event.route, event.endpoint, event.by_deadman
-        elif isinstance(event, Published) and any(map(_is_looked_at, expected.published.get(event.topic, ()))):
-            yield event.route, event.topic, False
+# What there is to touch
 
 
-def _is_looked_at(item: Item) -> bool:
-    content = item.content
-    return not isinstance(content, Whatever) and not (isinstance(content, Payload) and content.fields is None)
+def _items(checked: Checked, program: Program) -> Iterator[tuple[Key, Item]]:
+    routes = [route for route in checked.routes if not route.route.ignore]
+    for route in routes:
+        name = route.route.name
+        yield ("route", name), Item("route", route.route.span, f"no test has a message for the route {name}")
+    for route in routes:
+        yield from _targets(route)
+    if any(source.value not in {ANY, ROS} for route in routes for source in route.route.sources):
+        for listener in program.table.listeners.values():
+            gap = f"no test has a datagram at {listener.name} from a sender that its route does not take it from"
+            yield ("source_mismatch", listener.name), Item("rejection", listener.span, gap)
+    for endpoint in program.table.endpoints.values():
+        if endpoint.budget is not None:
+            gap = f"no test exceeds the budget of {endpoint.name}"
+            yield ("queue_full", endpoint.name), Item("rejection", endpoint.span, gap)
+    for route in routes:
+        yield from _rejections(route)
+
+
+def _targets(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
+    name = route.route.name
+    for target, _ in _with_conditions(route):
+        gap = f"no test compares what {name} has for {target.label}"
+        yield ("target", name, target.label), Item("target", target.span, gap)
+    if deadman := route.route.deadman:
+        for to in deadman.to:
+            gap = f"no test compares what the deadman of {name} sends for {to.value}"
+            yield ("deadman", name, to.value), Item("target", deadman.span, gap)
+
+
+def _rejections(route: CheckedRoute) -> Iterator[tuple[Key, Item]]:
+    """What the table says that keeps messages of a route from its targets."""
+    name = route.route.name
+    if ttl := route.route.ttl:
+        yield ("stale", name), Item("rejection", ttl.span, f"no test has a message of {name} that is older than this")
+    if collect := route.route.collect:
+        gap = f"no test has a frame of {name} that stays incomplete"
+        yield ("incomplete", name), Item("rejection", collect.span, gap)
+    for target, condition in _with_conditions(route):
+        if condition is not None:
+            gap = f"no test has a message of {name} that this withholds from {target.label}"
+            yield ("filtered", name, target.label), Item("rejection", condition.span, gap)
+        if target.declared.max_rate is not None:
+            gap = f"no test has {target.label} get more of {name} than its max_rate"
+            yield ("rate_limited", name, target.label), Item("rejection", target.span, gap)
+
+
+def _with_conditions(route: CheckedRoute) -> Iterator[tuple[CheckedTarget, Typed | None]]:
+    """Every target of a route, with its `when` or that of the topic that topics it."""
+    yield from ((target, target.when) for target in route.targets)
+    for subscription in route.subscriptions:
+        yield from ((target, target.when or subscription.when) for target in subscription.targets)
+
+
+def _keys(event: Event, expected: Expected) -> Iterator[Key]:
+    """What an event touches in a step that expects this."""
+    match event:
+        case Received():
+            yield "route", event.route
+        case Sent() if any(each.is_compared for each in expected.sent.get(event.target, ())):
+            yield "deadman" if event.by_deadman else "target", event.route, event.target
+        case Published() if any(each.is_compared for each in expected.published.get(event.target, ())):
+            yield "target", event.route, event.target
+        case Filtered():
+            yield "filtered", event.route, event.target
+        case Rejected():
+            yield event.reason, event.listener
+        case Dropped(reason="queue_full"):
+            yield event.reason, event.target
+        case Dropped(reason="rate_limited"):
+            yield event.reason, event.route, event.target
+        case Dropped():
+            yield event.reason, event.route

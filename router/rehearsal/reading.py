@@ -1,49 +1,78 @@
-"""Test files to data: each name is looked up in the table under test, so that a test of what is not there is a finding.
-
-Knows the language of tests; what a field's value may be is `table_tests_values`'.
-"""
+"""Test files: found, checked against their schema and read, with the table under test compiled beside them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from router.compiler import check_table
+from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, shown_path
-from router.rehearsal.expected import ExpectedReader
-from router.rehearsal.given import GivenReader
-from router.rehearsal.model import Expected, Step, TableTest, TableTestFile
-from router.rehearsal.names import Names
-from router.rehearsal.shape import read_shape
-from router.rehearsal.shown import offset
-from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.compiler.program import Program
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, shown_path
+from router.rehearsal.fields import offset
+from router.rehearsal.steps import Expected, ExpectedReader, GivenReader, Names, Step
+from router.table.compose import compose
+from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode, is_valid, key_at, node_at
 from router.table.reading import InvalidValueError, parsed
+from router.table.schema import SchemaError, finding, schema_errors, subject
+from router.table.source import read_source
 from router.table.units import parse_duration
 
 R = TypeVar("R")
+
 ENDINGS = (".test.yaml", ".test.yml")
+SCHEMA = "schemas/table-test.schema.json"
 
 
-def read_test_file(path: Path, definitions: Definitions) -> TableTestFile:
-    """Raises TableError: with what is wrong with the file, or with its table."""
-    root = read_shape(path)
+@dataclass(frozen=True, slots=True)
+class TableTest:
+    name: str
+    span: SourceSpan
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TestFile:
+    """The tests of a file, and its table with the program that they run."""
+
+    __test__ = False  # for pytest, which takes the name for a class of tests
+
+    checked: Checked
+    program: Program
+    tests: tuple[TableTest, ...]
+
+
+def find_test_files(paths: Sequence[Path]) -> list[Path]:
+    """The files that the paths stand for, each once: a folder for those in it that are named as tests."""
+    files: dict[Path, None] = {}
+    for path in paths:
+        if os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises where a folder above is not ours to read)
+            found = sorted(file for file in path.iterdir() if file.name.endswith(ENDINGS) and file.name[0] != ".")
+            files.update(dict.fromkeys(found))
+        else:
+            files[path] = None
+    return list(files)
+
+
+def read_test_file(path: Path, definitions: Definitions) -> TestFile:
+    """Raises TableError with every finding in the file, or in its table."""
+    root = _checked_nodes(path)
     checked = check_table(_table_of(root, path), _variables(root), definitions)
     if checked.program is None:
         raise TableError(checked.diagnostics)
     if checked.program.table.routes_span is None:
         message, hint = f"{shown_path(checked.path)} has no routes", "only routes are tested, gateways are not"
         raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message, hint)])
-    findings: list[Diagnostic] = []
-    reader = _Reader(Names(checked), findings)
+    reader = _Reader(Names(checked, checked.program))
     tests = root.get("tests")
     assert isinstance(tests, MappingNode)  # noqa: S101 - the schema saw to it
     found = tuple(reader.test(name, entry.key.span, entry.value) for name, entry in tests.entries.items())
-    if findings:
-        raise TableError(findings)
-    return TableTestFile(path, shown_path(path), checked, found)
+    if reader.findings:
+        raise TableError(reader.findings)
+    return TestFile(checked, checked.program, found)
 
 
 def _table_of(root: MappingNode, path: Path) -> Path:
@@ -70,12 +99,12 @@ def _variables(root: MappingNode) -> Mapping[str, str]:
 
 
 class _Reader:
-    """Reads tests; what is wrong goes to `findings`, and the rest of the file is still read."""
+    """Reads tests. What is wrong is added to `findings`, and the rest of the file is still read."""
 
-    def __init__(self, names: Names, findings: list[Diagnostic]) -> None:
+    def __init__(self, names: Names) -> None:
+        self.findings: list[Diagnostic] = []
         self._given = GivenReader(names)
         self._expected = ExpectedReader(names)
-        self._findings = findings
 
     def test(self, name: str, span: SourceSpan, node: Node) -> TableTest:
         assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
@@ -85,31 +114,29 @@ class _Reader:
         others = [key for key in node.entries if key != "steps"]
         if others:
             message = f"'{others[0]}' stands beside 'steps'"
-            hint = "move it into a step"
-            self._findings.append(Diagnostic(node.entries[others[0]].key.span, Code.UNKNOWN_KEY, message, hint))
+            self._find(node.entries[others[0]].key.span, Code.UNKNOWN_KEY, message, "move it into a step")
         listed = steps.items if isinstance(steps, SequenceNode) else ()
         return TableTest(name, span, tuple(self._steps(span, listed)))
 
-    def _steps(self, span: SourceSpan, nodes: Iterable[Node]) -> Iterable[Step]:
+    def _steps(self, span: SourceSpan, nodes: Iterable[Node]) -> Iterator[Step]:
         latest, is_stopped = 0, False
         for node in nodes:
             step = self._step(span, node)
             if is_stopped:
-                what, hint = "the router is stopped in the step above", "what comes then is another test"
-                self._findings.append(Diagnostic(step.span, Code.BAD_VALUE, what, hint))
-            latest = self._in_time("at", step.at, latest, node)
+                message, hint = "the router is stopped in the step above", "what comes then is another test"
+                self._find(step.span, Code.BAD_VALUE, message, hint)
+            latest = self._in_order("at", step.at, latest, node)
             if step.given is not None:
-                latest += (step.given.repetition.times - 1) * step.given.repetition.every
-            latest = self._in_time("until", step.until, latest, node)
+                latest += (step.given.times - 1) * step.given.every
+            latest = self._in_order("until", step.until, latest, node)
             is_stopped = step.stop
             yield step
 
-    def _in_time(self, key: str, time: int | None, latest: int, node: Node) -> int:
+    def _in_order(self, key: str, time: int | None, latest: int, node: Node) -> int:
         """The time of a key of a step, ns, which is not before the `latest` of what stands above."""
         if time is not None and time < latest and isinstance(node, MappingNode):
-            what = f"this is {offset(time)}, before the {offset(latest)} of what stands above"
-            hint = "steps are in the order of time"
-            self._findings.append(Diagnostic(node.entries[key].value.span, Code.BAD_VALUE, what, hint))
+            message = f"this is {offset(time)}, before the {offset(latest)} of what stands above"
+            self._find(node.entries[key].value.span, Code.BAD_VALUE, message, "steps are in the order of time")
         return max(latest, time or 0)
 
     def _step(self, test: SourceSpan, node: Node) -> Step:
@@ -118,36 +145,84 @@ class _Reader:
         expect = node.entries.get("expect")
         if expect is None:
             message = "this says nothing of what is expected"
-            self._findings.append(Diagnostic(span, Code.MISSING_KEY, message, "say 'expect: nothing', or what"))
+            self._find(span, Code.MISSING_KEY, message, "say 'expect: nothing', or what")
             return Step(span, Expected(span))
         given = node.get("given")
-        expected = self._sound(lambda found: self._expected.expected(expect.key.span, found, given), expect.value)
+        expected = self._read(lambda found: self._expected.expected(expect.key.span, found, given), expect.value)
         return Step(
             span=span,
             expected=expected or Expected(expect.key.span),
-            given=self._sound(self._given.given, given),
-            at=self._sound(_duration, node.get("at")),
-            until=self._sound(_duration, node.get("until")),
+            given=self._read(self._given.given, given),
+            at=self._read(_duration, node.get("at")),
+            until=self._read(_duration, node.get("until")),
             stop=node.get("stop") is not None,
         )
 
-    def _sound(self, read: Callable[[Node], R], node: Node | None) -> R | None:
+    def _read(self, read: Callable[[Node], R], node: Node | None) -> R | None:
         """None for a key that is not there, and for what has a finding."""
         if node is None:
             return None
         try:
             return read(node)
         except InvalidValueError as error:
-            self._findings.append(error.diagnostic)
+            self.findings.append(error.diagnostic)
             return None
+
+    def _find(self, span: SourceSpan, code: Code, message: str, hint: str) -> None:
+        self.findings.append(Diagnostic(span, code, message, hint))
 
 
 def _duration(node: Node) -> int:
+    """Of `at` and `until`, which may be zero as other durations may not."""
     assert isinstance(node, ScalarNode)  # noqa: S101 - the schema saw to it
-    written = Located(node.text, node.span)
-    return 0 if _is_zero(written.value) else parsed(parse_duration, written)
+    is_zero = not node.text.strip("0. nsumih")
+    return 0 if is_zero else parsed(parse_duration, Located(node.text, node.span))
 
 
-def _is_zero(text: str) -> bool:
-    """A time may be zero; elsewhere durations may not."""
-    return not text.strip("0. nsumih")
+# The shape of a file
+
+
+def _checked_nodes(path: Path) -> MappingNode:
+    """The nodes of a test file that fits its schema. Raises TableError with every finding."""
+    findings: list[Diagnostic] = []
+    source = read_source(path)
+    message = "a test file is a mapping with the key 'tests'"
+    if not source.text.strip():
+        raise TableError([Diagnostic(SourceSpan(source.file), Code.WRONG_TYPE, message)])
+    root = compose(source, {}, findings)
+    if not isinstance(root, MappingNode):
+        raise TableError([*findings, Diagnostic(root.span, Code.WRONG_TYPE, message)])
+    if not findings and is_valid(root):
+        findings += _schema_findings(root, SourceSpan(source.file))
+    if findings:
+        raise TableError(sorted(findings, key=lambda found: (found.span, found.message)))
+    return root
+
+
+def _schema_findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
+    errors = schema_errors(root, SCHEMA)
+    misspelt = {error.path for error in errors if error.keyword == "additionalProperties"}
+    for error in errors:
+        if error.keyword == "additionalProperties":
+            yield from _unknown_keys(error, node_at(root, error.path))
+        elif not error.path and error.path not in misspelt:
+            yield Diagnostic(whole, Code.MISSING_KEY, "a test file has its tests under the key 'tests'")
+        elif error.keyword == "required" and error.path in misspelt:
+            continue  # the key that is missing may be the one that is misspelt
+        elif error.keyword == "required":
+            key = key_at(root, error.path)
+            missing = error.message.split("'")[1]
+            message = f"a step says what it expects: '{missing}' is missing"
+            yield Diagnostic(key.span if key else node_at(root, error.path).span, Code.MISSING_KEY, message)
+        else:
+            yield finding(error, root)
+
+
+def _unknown_keys(error: SchemaError, node: Node) -> Iterator[Diagnostic]:
+    assert isinstance(node, MappingNode)  # noqa: S101 - only a mapping has keys
+    known = list(error.schema["properties"])
+    owner = "a test file" if not error.path else subject(error.path)
+    for name, entry in node.entries.items():
+        if name not in known:
+            hint = did_you_mean(name, known)
+            yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)

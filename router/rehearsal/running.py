@@ -1,27 +1,25 @@
-"""Runs a table test on a rehearsal of its table, step by step. What it finds is told by `table_tests_comparing`."""
+"""Run table tests: each on a rehearsal of its table, step by step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from router.compiler.program import Program
-from router.engine.wire import Wire
-from router.errors import Diagnostic
-from router.rehearsal.comparing import Comparison, Failure
-from router.rehearsal.events import Event
-from router.rehearsal.given import datagram, message
-from router.rehearsal.matching import Moments
-from router.rehearsal.model import GivenDatagram, Step, TableTest, TableTestFile
-from router.rehearsal.places import Places
+from router.engine.wire import Wire, framed
+from router.errors import Code, Diagnostic, UsageError
+from router.rehearsal import cdr
+from router.rehearsal.comparing import Comparison, Failure, Outcome
+from router.rehearsal.coverage import Coverage
+from router.rehearsal.fields import protobuf_message, ros_values
+from router.rehearsal.reading import TableTest, TestFile
 from router.rehearsal.rehearsal import START, Rehearsal
-from router.rehearsal.words import Happened
+from router.rehearsal.steps import Given, Step, invalid
 from router.table.reading import InvalidValueError
 
 
 @dataclass(slots=True)
 class Result:
-    """What came of one test. `findings` are what is wrong with the test itself and shows only when it runs."""
+    """What came of one test. `findings` are mistakes in the test that only show when it runs."""
 
     test: TableTest
     failures: list[Failure] = field(default_factory=list)
@@ -32,58 +30,69 @@ class Result:
         return not self.failures and not self.findings
 
 
-class Runner:
-    """For the tests of one file. `program` is the one of its table, or the same with probes for the coverage.
+def run_tests(file: TestFile, only: str = "", coverage: Coverage | None = None) -> list[Result]:
+    """Run the tests of a file whose name contains `only`, and record in `coverage` what of the table they touch."""
+    comparison = Comparison(file.checked, file.program)
+    return [_run(test, file.program, comparison, coverage) for test in file.tests if only in test.name]
 
-    `told` hears after each step that was looked at what happened in it.
-    """
 
-    def __init__(self, file: TableTestFile, program: Program, told: Callable[[Happened], None]) -> None:
-        self._program = program
-        self._told = told
-        self._wire = Wire(program.envelope)
-        self._comparison = Comparison(self._wire, Places(file.checked), program.table)
+def _run(test: TableTest, program: Program, comparison: Comparison, coverage: Coverage | None) -> Result:
+    result, rehearsal = Result(test), Rehearsal(program)
+    for step in test.steps:
+        try:
+            outcome = _run_step(step, rehearsal, program)
+        except InvalidValueError as error:
+            result.findings.append(error.diagnostic)
+            return result
+        if coverage is not None:
+            coverage.record(outcome)
+        result.failures += comparison.failures(outcome)
+    return result
 
-    def run(self, test: TableTest) -> Result:
-        result, rehearsal = Result(test), Rehearsal(self._program)
-        for step in test.steps:
-            try:
-                happened = self._happened(step, rehearsal)
-            except InvalidValueError as error:
-                result.findings.append(error.diagnostic)
-                return result
-            self._told(happened)
-            result.failures += self._comparison.failures(step, happened)
-        return result
 
-    def _happened(self, step: Step, rehearsal: Rehearsal) -> Happened:
-        rehearsal.events.clear()
-        begin = rehearsal.now if step.at is None else START + step.at
-        rehearsal.advance(begin)
-        given = self._give(step, rehearsal)
-        if step.until is not None:
-            rehearsal.advance(START + step.until)
-        if step.stop:
-            rehearsal.close()
-        early: list[Event] = [event for event in rehearsal.events if event.at < begin]
-        events = rehearsal.events[len(early) :]
-        return Happened(step, START, early, events, given)
+def _run_step(step: Step, rehearsal: Rehearsal, program: Program) -> Outcome:
+    rehearsal.events.clear()
+    begin = rehearsal.now if step.at is None else START + step.at
+    rehearsal.advance(begin)
+    given = _give(step.given, rehearsal, Wire(program.envelope)) if step.given else []
+    if step.until is not None:
+        rehearsal.advance(START + step.until)
+    if step.stop:
+        rehearsal.close()
+    early = [event for event in rehearsal.events if event.at < begin]
+    return Outcome(step, early, rehearsal.events[len(early) :], given)
 
-    def _give(self, step: Step, rehearsal: Rehearsal) -> list[tuple[int, bytes]]:
-        """When what was given, as often as the step says."""
-        if step.given is None:
-            return []
-        repetition, begin = step.given.repetition, rehearsal.now
-        given: list[tuple[int, bytes]] = []
-        for number in range(repetition.times):
-            rehearsal.advance(begin + number * repetition.every)
-            now = rehearsal.now
-            moments = Moments(START, now)
-            if isinstance(step.given, GivenDatagram):
-                data = datagram(step.given, self._wire, moments)
-                rehearsal.datagram(step.given.listener, step.given.peer, data, now - repetition.age)
-            else:
-                data = message(step.given, moments)
-                rehearsal.ros(step.given.topic, data, now - repetition.age)
-            given.append((now, data))
-        return given
+
+def _give(given: Given, rehearsal: Rehearsal, wire: Wire) -> list[tuple[int, bytes]]:
+    """The times and bytes of what was given."""
+    found: list[tuple[int, bytes]] = []
+    begin = rehearsal.now
+    for number in range(given.times):
+        rehearsal.advance(begin + number * given.every)
+        now = rehearsal.now
+        if given.topic is not None:
+            data = _message(given, now)
+            rehearsal.ros(given.topic, data, now - given.age)
+        else:
+            data = _datagram(given, wire, now)
+            rehearsal.datagram(given.listener, given.peer, data, now - given.age)
+        found.append((now, data))
+    return found
+
+
+def _datagram(given: Given, wire: Wire, now: int) -> bytes:
+    """The bytes that arrive. Raises InvalidValueError where they are longer than they are to be padded to."""
+    data = given.data or b""
+    if given.case is not None and given.fields is not None:
+        data = wire.encode(given.case, protobuf_message(given.case.message_class, given.fields, now))
+    try:
+        return framed(data, given.trim, given.pad)
+    except UsageError as error:
+        raise invalid(given.span, Code.BAD_VALUE, str(error)) from error
+
+
+def _message(given: Given, now: int) -> bytes:
+    """The CDR bytes that arrive."""
+    if given.fields is None:
+        return given.data or b""
+    return cdr.serialize(given.fields.type, ros_values(given.fields, now))

@@ -14,9 +14,8 @@ from router.assets import asset
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 from router.cli.test import FAILED
 from router.compiler.lookup import Definitions
-from router.rehearsal.reading import read_test_file
-from router.rehearsal.shape import SCHEMA
-from router.rehearsal.tests import prove
+from router.rehearsal.reading import SCHEMA, read_test_file
+from router.rehearsal.running import run_tests
 from router.table.schema import table_schema
 from tests.tables import PROTOS, RIG, ROUTES
 
@@ -49,7 +48,7 @@ def test_the_tests_of_the_rover_pass_and_cover_its_table_completely(
     monkeypatch.chdir(RIG)
     assert main(["test", "routes", "--coverage"]) == OK
     out = capsys.readouterr().out
-    covered = re.search(r"rover\.yaml: covered (\d+) of (\d+) routes, (\d+) of (\d+) targets, (\d+) of (\d+) exp", out)
+    covered = re.search(r"rover\.yaml: covered (\d+) of (\d+) routes, (\d+) of (\d+) targets, (\d+) of (\d+) rej", out)
     assert covered is not None
     assert covered[1] == covered[2]
     assert covered[3] == covered[4]
@@ -92,7 +91,7 @@ def test_the_tests_of_the_rover_pass_and_cover_its_table_completely(
 def test_whatever_is_changed_in_the_table_some_test_notices(rover: Path, old: str, new: str) -> None:
     change(rover, old, new)
     file = read_test_file(rover.with_name("rover.test.yaml"), DEFINITIONS)
-    assert not all(result.passed for result in prove(file))
+    assert not all(result.passed for result in run_tests(file))
 
 
 def test_failure_shows_both_files(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -113,11 +112,11 @@ def test_failure_shows_both_files(rover: Path, capsys: pytest.CaptureFixture[str
 
 def test_what_no_test_touches_is_listed_and_fails(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tests = rover.with_name("rover.test.yaml")
-    change(tests, "fix_quality: PPS_FIX", "fix_quality: GPS_FIX")
+    change(tests, "arm_feedback: {arm_error: 3}", "arm_feedback: any")
     assert main(["test", "--coverage"]) == FAILED
     out = capsys.readouterr().out
-    assert "not covered: this branch was never taken in a compared message of gps_info\n" in out
-    assert "NavSatStatus.STATUS_FIX if fix_quality == GPSFixQuality.PPS_FIX" in out
+    assert "not covered: no test compares what arm_feedback has for arm_feedback\n" in out
+    assert "topic: arm_feedback" in out
 
 
 def test_a_table_that_extends_another_needs_tests_of_what_it_changes_only(
@@ -133,8 +132,8 @@ def test_a_table_that_extends_another_needs_tests_of_what_it_changes_only(
     inherited, changed = json.loads(capsys.readouterr().out)["coverage"]
     assert inherited["gaps"] == []
     lacking = [(gap["kind"], gap["file"]) for gap in changed["gaps"]]
-    assert lacking == [(kind, "lab/scale.yaml") for kind in ("route", "target", "expression")]
-    assert all(changed[kind]["touched"] == changed[kind]["all"] - 1 for kind in ("routes", "targets", "expressions"))
+    assert lacking == [(kind, "lab/scale.yaml") for kind in ("route", "target")]
+    assert all(changed[kind]["touched"] == changed[kind]["all"] - 1 for kind in ("routes", "targets"))
     given = "given: {case: load_cell_info, from: sensor_board, fields: {force_newtons: 2}}"
     tests.write_text(f"tests:\n  a: {{{given}, expect: {{sent: basestation, published: {{scale: {{data: 2}}}}}}}}\n")
     assert main(["test", "--coverage", "routes", "lab"]) == OK
@@ -229,7 +228,7 @@ def test_examples_of_the_documentation_pass(tmp_path: Path, rover: Path) -> None
         table = listed if "max_rate" in example or "incomplete" in example else rover
         path = tmp_path / f"example-{number}.test.yaml"
         path.write_text(f"table: {table}\n{example}")
-        results = prove(read_test_file(path, DEFINITIONS))
+        results = run_tests(read_test_file(path, DEFINITIONS))
         assert [result.failures for result in results if not result.passed] == []
     assert len(examples) == 3
 

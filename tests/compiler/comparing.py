@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import MessageType
 from tests.oracles.reference import Value
-from tests.oracles.reference_cdr import cdr
 
 
 def assert_same_message(ours: bytes, theirs: bytes, declared: MessageType, value: dict[str, Value]) -> None:

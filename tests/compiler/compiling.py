@@ -16,12 +16,12 @@ from router.engine.binding import bind
 from router.engine.delivery import MAPPING_FAILURES, Report
 from router.engine.freshness import Freshness
 from router.errors import Diagnostic, SourceSpan
+from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
 from tests.engine.fakes import plain_outlets
 from tests.oracles.reference import fill
-from tests.oracles.reference_cdr import cdr
 from tests.oracles.reference_expressions import Context, View
 
 SPAN = SourceSpan("table.yaml", 7, 3, 9)

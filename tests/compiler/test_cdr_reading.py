@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import MappingError
+from router.rehearsal.cdr import deserialize as parse
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import outcome
 from tests.compiler.generated_types import values
 from tests.compiler.reading import TIMES, WHOLE, Path, at, field_values, messages, paths, plain, reader, wanted_paths
 from tests.oracles.reference import Value
-from tests.oracles.reference_cdr import cdr, parse
 
 MANY = settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 

@@ -32,6 +32,7 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.source import Source, load
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.comparing import same
 from tests.compiler.compiling import (
@@ -48,7 +49,6 @@ from tests.compiler.compiling import (
 from tests.compiler.generated_types import values
 from tests.compiler.reading import TIMES
 from tests.oracles.reference import Value
-from tests.oracles.reference_cdr import cdr
 from tests.oracles.reference_expressions import evaluate
 
 MODE = Enum("Mode", (("OFF", 0), ("ON", 1), ("LOUD", 300), ("LESS", -7)))

@@ -11,11 +11,11 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import get_types_from_msg
 
 from router.engine.delivery import MAPPING_FAILURES
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import AUTO, context_of, outcome, reference_bytes, scope_of, serializer
 from tests.compiler.generated_types import STATE, pairs, values
 from tests.oracles.reference import Value, fill
-from tests.oracles.reference_cdr import cdr
 
 MANY = settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 

@@ -13,11 +13,11 @@ from router.compiler import Checked
 from router.compiler.checked import CheckedRoute
 from router.compiler.program import Program
 from router.engine.delivery import MAPPING_FAILURES
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from tests.compiler.compiling import Published, context_of
 from tests.compiler.generated_types import EACH_TYPE
 from tests.oracles.reference import fill
-from tests.oracles.reference_cdr import cdr
 
 GOLDEN: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "wire" / "golden_envelopes.json").read_text(encoding="utf-8")

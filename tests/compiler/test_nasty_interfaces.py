@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 
 from router.engine.delivery import MAPPING_FAILURES
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Field, Int, MessageType, String
 from tests.compiler.comparing import assert_same_message, same
 from tests.compiler.compiling import AUTO, context_of, field_map, outcome, scope_of, serializer
@@ -17,7 +18,6 @@ from tests.compiler.generated_types import EACH_TYPE, mirror, values
 from tests.compiler.interface_package import MESSAGES, InterfacePackage, built, declared_type, is_buildable
 from tests.compiler.reading import WHOLE, field_values, reader
 from tests.oracles.reference import fill
-from tests.oracles.reference_cdr import cdr
 
 pytest.importorskip("rclpy")
 pytestmark = [

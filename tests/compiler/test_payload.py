@@ -21,6 +21,7 @@ from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code, MappingError, SourceSpan
+from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
@@ -37,7 +38,6 @@ from tests.compiler.payloads import (
     rover_wire,
 )
 from tests.oracles.reference import fill
-from tests.oracles.reference_cdr import cdr
 
 I32, I64, U8, U64 = Int(32, True), Int(64, True), Int(8, False), Int(64, False)
 F32, F64 = Float(32), Float(64)

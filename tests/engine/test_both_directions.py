@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from router.compiler.program import Program
+from router.rehearsal.cdr import serialize as cdr
 from router.types.ros import ros_interfaces
 from tests.engine.rig import BASESTATION, DRIVING_BOARD, HEAD, SENSOR_BOARD, Rig, program
 from tests.engine.wire import I32, framed, rover_envelope, tag
-from tests.oracles.reference_cdr import cdr
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -13,10 +13,10 @@ import pytest
 
 from router.gateway.json_codec import InvalidMessageError, decoder
 from router.gateway.json_types import Style, example
+from router.rehearsal.cdr import deserialize as parse
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String
 from router.types.ros import ros_interfaces
 from tests.gateway.client_json import tree
-from tests.oracles.reference_cdr import parse
 
 EVERYTHING = MessageType(
     "made/msg/Everything",

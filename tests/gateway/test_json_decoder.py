@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from router.gateway.json_codec import InvalidMessageError, decoder, encoder
 from router.gateway.json_types import PLACEHOLDER, Style, example
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.ros import ros_interfaces
 from tests.compiler.generated_types import defaults
 from tests.compiler.reading import messages
 from tests.gateway.client_json import FORMS, tree, values, written
 from tests.oracles.reference import initial
-from tests.oracles.reference_cdr import cdr
 
 BYTE = Int(8, signed=False)
 

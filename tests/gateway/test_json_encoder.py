@@ -19,11 +19,12 @@ from hypothesis import strategies as st
 from router.errors import MappingError
 from router.gateway.json_codec import UnreadableError, encoder
 from router.gateway.json_types import PLACEHOLDER, Style
+from router.rehearsal.cdr import deserialize as parse
+from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
 from router.types.ros import ros_interfaces
 from tests.compiler.generated_types import values
 from tests.compiler.reading import field_values, messages
-from tests.oracles.reference_cdr import cdr, parse
 from tests.oracles.reference_json import reference_value
 
 MANY = settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])

@@ -1,8 +1,8 @@
-"""The oracle: a plain, slow answer to what a table makes of one message, for tests and for `router test`.
+"""The oracle: a plain, slow answer to what a table makes of one message.
 
 Of the compiler it shares the functions and the type model, and must not know expressions, scalars, conversion,
 mapping, cdr, payload or source: what both agree on is right for two reasons. Expects a table that the compiler
-has accepted. `reference_cdr` and `reference_protobuf` make messages of what comes out here.
+has accepted. `router.rehearsal.cdr` and `reference_protobuf` make messages of what comes out here.
 """
 
 from __future__ import annotations

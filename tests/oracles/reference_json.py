@@ -1,6 +1,6 @@
 """An oracle for the tests: what JSON of a message's value reads back as. Never used to run a gateway.
 
-Takes values as `reference_cdr` does: dictionaries, lists and scalars.
+Takes values as `router.rehearsal.cdr` does: dictionaries, lists and scalars.
 """
 
 from __future__ import annotations

@@ -6,20 +6,22 @@ from pathlib import Path
 
 import pytest
 
-from router.engine.wire import Wire
-from router.rehearsal.events import (
+from router.engine.wire import wire_of_protos
+from router.rehearsal.rehearsal import (
+    START,
     Collected,
     DeadmanChanged,
     Dropped,
     Filtered,
     Published,
     Received,
+    Rehearsal,
     Rejected,
     Sent,
 )
-from router.rehearsal.rehearsal import START, Rehearsal
 from router.values import payload
 from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, STRANGER, program
+from tests.tables import PROTOS
 
 MS = 1_000_000
 BRAKE = b"\xca\x01\x02\x08\x01"
@@ -37,14 +39,16 @@ def rehearsal(folder: Path, routes: str, head: str = HEAD) -> Rehearsal:
     return Rehearsal(program(folder, routes, head))
 
 
-def datagram(made: Rehearsal, case: str, *words: str) -> bytes:
-    wire = Wire(made._program.envelope)
-    return wire.encode(wire.case(case), payload(wire.case(case), words))
+WIRE = wire_of_protos(PROTOS)
+
+
+def datagram(case: str, *words: str) -> bytes:
+    return WIRE.encode(WIRE.case(case), payload(WIRE.case(case), words))
 
 
 def test_event_names_route_and_target(tmp_path: Path) -> None:
     made = rehearsal(tmp_path, "  imu_info: {source: sensor_board, destinations: [basestation, recorder]}\n")
-    data = datagram(made, "imu_info", "accel_x=1.5")
+    data = datagram("imu_info", "accel_x=1.5")
     made.datagram("trimmed", SENSOR_BOARD, data)
     assert made.events == [
         Received(START, "imu_info", "sensor_board"),
@@ -56,21 +60,21 @@ def test_event_names_route_and_target(tmp_path: Path) -> None:
 def test_topic_is_published_though_nobody_subscribes(tmp_path: Path) -> None:
     topic = "{topic: imu, type: comms/msg/ImuSensorInformation, fields: auto}"
     made = rehearsal(tmp_path, f"  imu_info: {{source: sensor_board, topics: [{topic}]}}\n")
-    made.datagram("trimmed", SENSOR_BOARD, datagram(made, "imu_info", "accel_x=1.5"))
+    made.datagram("trimmed", SENSOR_BOARD, datagram("imu_info", "accel_x=1.5"))
     (published,) = [event for event in made.events if isinstance(event, Published)]
-    assert (published.route, published.topic) == ("imu_info", "imu")
-    assert published.cdr[4:8] == b"\0\0\xc0\x3f"
+    assert (published.route, published.target) == ("imu_info", "imu")
+    assert published.data[4:8] == b"\0\0\xc0\x3f"
 
 
 def test_rejected_datagram_tells_its_reason_and_more(tmp_path: Path) -> None:
     made = rehearsal(tmp_path, "  imu_info: {source: sensor_board, destinations: [basestation]}\n")
-    made.datagram("exact", STRANGER, datagram(made, "imu_info"))
+    made.datagram("exact", STRANGER, datagram("imu_info"))
     assert made.events == [Rejected(START, "exact", "source_mismatch", "from 192.168.0.99:1234: imu_info")]
 
 
 def test_deadman_sends_when_it_is_due(tmp_path: Path) -> None:
     made = rehearsal(tmp_path, DRIVE)
-    made.datagram("trimmed", BASESTATION, datagram(made, "manual_drive"))
+    made.datagram("trimmed", BASESTATION, datagram("manual_drive"))
     made.events.clear()
     made.advance(START + 700 * MS)
     sent = [event for event in made.events if isinstance(event, Sent)]
@@ -81,28 +85,28 @@ def test_deadman_sends_when_it_is_due(tmp_path: Path) -> None:
 
 def test_closing_gives_an_armed_deadman_the_last_word(tmp_path: Path) -> None:
     made = rehearsal(tmp_path, DRIVE)
-    made.datagram("trimmed", BASESTATION, datagram(made, "manual_drive"))
+    made.datagram("trimmed", BASESTATION, datagram("manual_drive"))
     made.close()
     assert made.events[-1] == Sent(START, "manual_drive", "driving_board", BRAKE, by_deadman=True)
 
 
 def test_datagram_that_waited_too_long_is_stale(tmp_path: Path) -> None:
     made = rehearsal(tmp_path, DRIVE)
-    made.datagram("trimmed", BASESTATION, datagram(made, "manual_drive"), START - 300 * MS)
+    made.datagram("trimmed", BASESTATION, datagram("manual_drive"), START - 300 * MS)
     assert made.events[-1] == Dropped(START, "manual_drive", "driving_board", "stale")
 
 
 def test_condition_that_withholds_is_told(tmp_path: Path) -> None:
     to = "{endpoint: basestation, when: accel_x > 1}"
     made = rehearsal(tmp_path, f"  imu_info: {{source: sensor_board, destinations: [{to}]}}\n")
-    made.datagram("trimmed", SENSOR_BOARD, datagram(made, "imu_info"))
+    made.datagram("trimmed", SENSOR_BOARD, datagram("imu_info"))
     assert made.events[-1] == Filtered(START, "imu_info", "basestation")
 
 
 def test_what_waits_for_its_rate_is_sent_later(tmp_path: Path) -> None:
     to = "{endpoint: basestation, max_rate: 10 Hz, keep: latest}"
     made = rehearsal(tmp_path, f"  imu_info: {{source: sensor_board, destinations: [{to}]}}\n")
-    first, second, third = (datagram(made, "imu_info", f"accel_x={x}") for x in (1, 2, 3))
+    first, second, third = (datagram("imu_info", f"accel_x={x}") for x in (1, 2, 3))
     for data in (first, second, third):
         made.datagram("trimmed", SENSOR_BOARD, data)
     made.advance(START + 1000 * MS)
@@ -116,7 +120,7 @@ def test_budget_holds_back_and_sends_when_it_is_paid(tmp_path: Path) -> None:
     head = HEAD.replace("kind: basestation}", "kind: basestation, budget: 1kB/s}")
     made = rehearsal(tmp_path, "  imu_info: {source: sensor_board, destinations: [basestation]}\n", head)
     for number in range(1, 21):
-        made.datagram("trimmed", SENSOR_BOARD, datagram(made, "imu_info", f"accel_x={number}"))
+        made.datagram("trimmed", SENSOR_BOARD, datagram("imu_info", f"accel_x={number}"))
     at_once = sum(isinstance(event, Sent) for event in made.events)
     made.advance(START + 1000 * MS)
     assert 0 < at_once < 20
@@ -132,7 +136,7 @@ def test_frame_that_stays_incomplete_is_dropped_when_its_time_is_up(tmp_path: Pa
 """
     made = rehearsal(tmp_path, routes)
     for index in (0, 1):
-        data = datagram(made, "detected_object", "frame_id=7", "total_count=3", f"index={index}")
+        data = datagram("detected_object", "frame_id=7", "total_count=3", f"index={index}")
         made.datagram("trimmed", BASESTATION, data)
     assert Collected(START, "detected_object", "seen") in made.events
     made.advance(START + 2000 * MS)
@@ -159,7 +163,7 @@ def test_same_calls_give_the_same_events(tmp_path: Path) -> None:
     made = [rehearsal(tmp_path, DRIVE) for _ in range(2)]
     for each in made:
         for step in range(20):
-            each.datagram("trimmed", BASESTATION, datagram(each, "manual_drive", f"forward_backward={step}"))
+            each.datagram("trimmed", BASESTATION, datagram("manual_drive", f"forward_backward={step}"))
             each.advance(START + step * 70 * MS)
         each.close()
     assert made[0].events == made[1].events

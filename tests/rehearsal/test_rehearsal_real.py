@@ -1,4 +1,4 @@
-"""A rehearsal beside a router on real sockets, with the same datagrams; and with probes in the code beside without."""
+"""A rehearsal beside a router on real sockets, with the same datagrams."""
 
 from __future__ import annotations
 
@@ -10,17 +10,11 @@ from pathlib import Path
 
 from router.app import Router
 from router.compiler import check_table
-from router.compiler.lookup import Definitions
 from router.engine.wire import Wire
-from router.rehearsal.coverage import Coverage
-from router.rehearsal.events import Filtered, Rejected, Sent
-from router.rehearsal.reading import read_test_file
-from router.rehearsal.rehearsal import Rehearsal
-from router.rehearsal.running import Runner
-from router.rehearsal.words import Happened
+from router.rehearsal.rehearsal import Filtered, Rehearsal, Rejected, Sent
 from router.values import payload
 from tests.ports import free_port
-from tests.tables import PROTOS, ROUTES
+from tests.tables import PROTOS
 
 BOARD = ("127.0.0.30", 0)
 TABLE = """
@@ -80,7 +74,7 @@ def test_rehearsal_sends_and_counts_what_the_router_does(tmp_path: Path) -> None
             for data in given:
                 board.sendto(data, ("127.0.0.1", listen))
             for receiver, name in ((basestation, "basestation"), (recorder, "recorder")):
-                expected = [event.data for event in sent if event.endpoint == name]
+                expected = [event.data for event in sent if event.target == name]
                 assert [receiver.recv(2048) for _ in expected] == expected
         kinds = Counter(type(event) for event in rehearsal.events)
         assert router.total("datagrams_sent") == kinds[Sent]
@@ -88,17 +82,3 @@ def test_rehearsal_sends_and_counts_what_the_router_does(tmp_path: Path) -> None
         assert router.total("datagrams_rejected") == kinds[Rejected]
         assert router.total("messages_dropped") > 0
         assert len(kinds) >= 5
-
-
-def test_code_with_probes_does_what_it_does_without() -> None:
-    file = read_test_file(ROUTES / "rover.test.yaml", Definitions())
-    assert file.checked.program is not None
-    seen: list[list[Happened]] = []
-    for program in (file.checked.program, Coverage.of(file).program):
-        happened: list[Happened] = []
-        runner = Runner(file, program, happened.append)
-        for test in file.tests:
-            runner.run(test)
-        seen.append(happened)
-    assert [each.events for each in seen[0]] == [each.events for each in seen[1]]
-    assert [each.early for each in seen[0]] == [each.early for each in seen[1]]

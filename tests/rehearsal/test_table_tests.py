@@ -11,10 +11,9 @@ from router.compiler.lookup import Definitions
 from router.errors import Code, Diagnostic, TableError
 from router.rehearsal.comparing import Failure
 from router.rehearsal.coverage import Coverage
-from router.rehearsal.model import TableTestFile
-from router.rehearsal.reading import read_test_file
-from router.rehearsal.shown import offset
-from router.rehearsal.tests import find_test_files, prove
+from router.rehearsal.fields import offset
+from router.rehearsal.reading import TestFile, find_test_files, read_test_file
+from router.rehearsal.running import run_tests
 from tests.engine.rig import HEAD, HEAD_OF_LISTENERS
 from tests.tables import PROTOS
 
@@ -48,7 +47,7 @@ detected_object:
 """
 
 
-def written(folder: Path, routes: str, tests: str, head: str = HEAD) -> TableTestFile:
+def written(folder: Path, routes: str, tests: str, head: str = HEAD) -> TestFile:
     """`tests` are those of a test file, beside a table with these routes."""
     table = head.replace("PROTOS", str(PROTOS)) + indent(dedent(routes), "  ")
     (folder / "table.yaml").write_text(table)
@@ -58,7 +57,7 @@ def written(folder: Path, routes: str, tests: str, head: str = HEAD) -> TableTes
 
 
 def failures(folder: Path, routes: str, tests: str, head: str = HEAD) -> list[Failure]:
-    results = prove(written(folder, routes, tests, head))
+    results = run_tests(written(folder, routes, tests, head))
     assert not any(result.findings for result in results)
     return [failure for result in results for failure in result.failures]
 
@@ -534,7 +533,7 @@ def test_what_is_wrong_with_a_test_is_a_finding_with_its_place(
 
 def test_padding_that_is_too_small_is_found_when_the_test_runs(tmp_path: Path) -> None:
     file = written(tmp_path, IMU, f"a: {{given: {given('{accel_x: 1}', ', pad: 2')}, expect: nothing}}\n")
-    (result,) = prove(file)
+    (result,) = run_tests(file)
     assert not result.passed
     assert [finding.code for finding in result.findings] == [Code.BAD_VALUE]
 
@@ -578,11 +577,11 @@ def test_folder_stands_for_its_test_files(tmp_path: Path) -> None:
 # coverage
 
 
-def gaps(folder: Path, routes: str, tests: str) -> list[tuple[str, str]]:
-    """Of what, and the line of the table with it."""
-    file = written(folder, routes, tests)
-    coverage = Coverage.of(file)
-    assert all(result.passed for result in prove(file, coverage=coverage))
+def gaps(folder: Path, routes: str, tests: str, head: str = HEAD) -> list[tuple[str, str]]:
+    """Of what, and the text of the table with it."""
+    file = written(folder, routes, tests, head)
+    coverage = Coverage(file.checked, file.program)
+    assert all(result.passed for result in run_tests(file, coverage=coverage))
     lines = (folder / "table.yaml").read_text().splitlines()
     found = []
     for gap in coverage.gaps():
@@ -591,51 +590,78 @@ def gaps(folder: Path, routes: str, tests: str) -> list[tuple[str, str]]:
     return found
 
 
+STRANGER_REJECTED = """
+strangers:
+  steps:
+    - {given: {hex: 6a 00, from: 192.168.0.99, listener: trimmed}, expect: {rejected: source_mismatch}}
+    - {given: {hex: 6a 00, from: 192.168.0.99, listener: exact}, expect: {rejected: source_mismatch}}
+"""
+
+
 def test_nothing_is_covered_without_a_message(tmp_path: Path) -> None:
     found = gaps(tmp_path, IMU, "a: {expect: nothing}\n")
     assert found.count(("route", "imu_info")) == 1
     assert [kind for kind, _ in found].count("target") == 4
-    expressions = {shown for kind, shown in found if kind == "expression"}
-    assert {"accel_x > 1", "radians(gyro_x)", "1 / accel_y", "received_at"} <= expressions
+    assert {shown for kind, shown in found if kind == "rejection"} == {"trimmed", "exact", "accel_x > 1"}
 
 
 def test_condition_has_to_hold_and_to_withhold(tmp_path: Path) -> None:
-    routes = "imu_info: {source: sensor_board, destinations: [{endpoint: basestation, when: accel_x > 1}]}"
+    routes = "imu_info: {source: any, destinations: [{endpoint: basestation, when: accel_x > 1}]}"
     holds = f"a: {{given: {given('{accel_x: 2}')}, expect: {{sent: basestation}}}}\n"
     withholds = f"b: {{given: {given('{}')}, expect: nothing}}\n"
-    assert gaps(tmp_path, routes, holds) == [("expression", "accel_x > 1")]
+    assert gaps(tmp_path, routes, holds) == [("rejection", "accel_x > 1")]
+    assert gaps(tmp_path, routes, withholds) == [("target", "endpoint")]
     assert gaps(tmp_path, routes, holds + withholds) == []
-
-
-def test_what_gave_nothing_but_zero_is_not_covered(tmp_path: Path) -> None:
-    tests = f"a: {{given: {given('{accel_y: 1}')}, expect: {{sent: basestation, published: PUBLISHED}}}}\n".replace(
-        "PUBLISHED", "{imu_data: unchanged, imu/data_raw: {header: any, angular_velocity: {y: 1}}}"
-    )
-    assert ("expression", "radians(gyro_x)") in gaps(tmp_path, IMU, tests)
-    assert ("expression", "1 / accel_y") not in gaps(tmp_path, IMU, tests)
 
 
 def test_what_nobody_compared_is_not_covered(tmp_path: Path) -> None:
     tests = f"a: {{given: {given('{accel_y: 1, gyro_x: 1}')}, expect: {{sent: basestation, published: {QUIET}}}}}\n"
     found = gaps(tmp_path, IMU, tests)
-    assert ("expression", "radians(gyro_x)") in found
     assert [kind for kind, _ in found].count("target") == 3
 
 
-def test_each_branch_counts(tmp_path: Path) -> None:
-    routes = """
-        imu_info:
-          source: sensor_board
-          topics:
-            - topic: temperature
-              type: sensor_msgs/msg/Temperature
-              fields: {temperature: accel_x if accel_x > 0 else accel_y if accel_y > 0 else 7}
+def test_limits_have_to_be_reached(tmp_path: Path) -> None:
+    routes = "imu_info: {source: any, destinations: [{endpoint: recorder, max_rate: 10 Hz}], ttl: 200ms}"
+    within = f"a: {{given: {given('{}')}, expect: {{sent: recorder}}}}\n"
+    assert [kind for kind, _ in gaps(tmp_path, routes, within)] == ["rejection"] * 2
+    stale = f"b: {{given: {given('{}', ', age: 300ms')}, expect: {{dropped: {{recorder: stale}}}}}}\n"
+    assert len(gaps(tmp_path, routes, within + stale)) == 1
+    often = f"""
+        c:
+          given: {given("{}", ", times: 2")}
+          expect: {{sent: recorder, dropped: {{recorder: rate_limited}}}}
         """
-    expect = "expect: {published: {temperature: {temperature: 2}}}"
-    tests = f"a: {{given: {given('{accel_x: 2}')}, {expect}}}\n"
-    assert gaps(tmp_path, routes, tests) == [("expression", "accel_y"), ("expression", "7")]
-    tests += f"b: {{given: {given('{accel_y: 2}')}, {expect}}}\n"
-    assert gaps(tmp_path, routes, tests) == [("expression", "7")]
+    assert gaps(tmp_path, routes, within + stale + dedent(often)) == []
+
+
+def test_a_budget_has_to_be_exceeded(tmp_path: Path) -> None:
+    head = HEAD.replace("kind: basestation}", "kind: basestation, budget: 1kB/s}")
+    routes = "imu_info: {source: any, destinations: [basestation]}"
+    within = f"a: {{given: {given('{}')}, expect: {{sent: basestation}}}}\n"
+    assert gaps(tmp_path, routes, within, head) == [("rejection", "basestation")]
+    beyond = f"""
+        b:
+          given: {given("{accel_x: 1}", ", times: 10000")}
+          expect: {{sent: {{basestation: {{times: 2}}}}, dropped: {{basestation: {{queue_full: 636}}}}}}
+        """
+    assert gaps(tmp_path, routes, within + dedent(beyond), head) == []
+
+
+def test_a_frame_has_to_stay_incomplete(tmp_path: Path) -> None:
+    routes = FRAMES.replace("source: basestation", "source: any")
+    part = "{case: detected_object, from: basestation, listener: trimmed, fields: {frame_id: 7, total_count: 1}}"
+    whole = f"a: {{given: {part}, expect: {{published: {{seen: {{frame_id: 7, detections: [any]}}}}}}}}\n"
+    assert [kind for kind, _ in gaps(tmp_path, routes, whole)] == ["rejection"]
+    cut = part.replace("count: 1", "count: 2")
+    lost = f"b: {{given: {cut}, until: 1s, expect: {{dropped: {{seen: incomplete}}}}}}\n"
+    assert gaps(tmp_path, routes, whole + lost) == []
+
+
+def test_every_listener_has_to_refuse_a_sender(tmp_path: Path) -> None:
+    routes = "imu_info: {source: sensor_board, destinations: [basestation]}"
+    sent = f"a: {{given: {given('{}')}, expect: {{sent: basestation}}}}\n"
+    assert gaps(tmp_path, routes, sent) == [("rejection", "trimmed"), ("rejection", "exact")]
+    assert gaps(tmp_path, routes, sent + STRANGER_REJECTED) == []
 
 
 def test_deadman_is_a_target(tmp_path: Path) -> None:
@@ -647,19 +673,19 @@ def test_deadman_is_a_target(tmp_path: Path) -> None:
             - {moves.replace("any", "{drive_motor: unchanged}")}
             - {{at: 500ms, expect: {{sent: {{driving_board: {{manual_brake: {{brake: true}}}}}}}}}}
         """
-    assert gaps(tmp_path, DRIVE, tests) == []
+    assert gaps(tmp_path, DRIVE, tests) == [("rejection", "200ms")]
 
 
 def test_files_of_one_table_cover_it_together(tmp_path: Path) -> None:
-    routes = 'imu_info: {source: sensor_board, destinations: [{endpoint: basestation, when: "accel_x > ${LIMIT:-1}"}]}'
+    routes = 'imu_info: {source: any, destinations: [{endpoint: basestation, when: "accel_x > ${LIMIT:-1}"}]}'
     first = written(tmp_path, routes, f"a: {{given: {given('{accel_x: 2}')}, expect: {{sent: basestation}}}}\n")
     path = tmp_path / "more.test.yaml"
     nothing = f"b: {{given: {given('{accel_x: 2}')}, expect: nothing}}"
     path.write_text(f"table: table.yaml\nvariables: {{LIMIT: 3}}\ntests:\n  {nothing}\n")
     second = read_test_file(path, DEFINITIONS)
-    covered = [Coverage.of(file) for file in (first, second)]
+    covered = [Coverage(file.checked, file.program) for file in (first, second)]
     for file, coverage in zip((first, second), covered, strict=True):
-        assert all(result.passed for result in prove(file, coverage=coverage))
+        assert all(result.passed for result in run_tests(file, coverage=coverage))
         assert not coverage.is_complete
     covered[0].add(covered[1])
     assert covered[0].is_complete

@@ -1,30 +1,31 @@
-"""The oracle's second half: a ROS message as CDR bytes and back, one scalar after the other.
+"""ROS messages as CDR bytes and back, one scalar after the other: slow, plain, and apart from the compiler's codec.
 
-Plain CDR, little-endian, as rmw_fastrtps writes it. Knows values and types only; see `reference`.
+Plain CDR, little-endian, as rmw_fastrtps writes it. What the generated code writes is thus checked by other code, in
+table tests and in the tests of the router, where this module is the oracle.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
 from router.errors import MappingError
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
-from tests.oracles.reference import Value
 
 
-def cdr(message: MessageType, value: dict[str, Value], padding: int = 0) -> bytes:
-    """The bytes of a message with their header. Bytes between values mean nothing and are `padding`."""
+def serialize(message: MessageType, values: Mapping[str, Any], padding: int = 0) -> bytes:
+    """The bytes of a message with their header, from all its values by name. Gaps for alignment are `padding`."""
     writer = _Writer(padding)
-    writer.write(message, value)
+    writer.write(message, values)
     return b"\x00\x01\x00\x00" + bytes(writer.data)
 
 
-def parse(message: MessageType, data: bytes) -> SimpleNamespace:
-    """The message in bytes with their header: objects with its fields, as rclpy gives them; bytes are lists.
+def deserialize(message: MessageType, data: bytes) -> SimpleNamespace:
+    """The message in bytes with their header, as objects with its fields; lists of bytes are lists of numbers.
 
-    What comes behind the message is not looked at. Raises MappingError or ValueError when it is no such message.
+    Bytes behind the message are ignored. Raises MappingError or ValueError when it is no such message.
     """
     if data[:2] != b"\x00\x01":
         raise MappingError(f"not plain CDR: {data[:2].hex()}")

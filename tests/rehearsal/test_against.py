@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from router.cli import main
 from router.recording.mirror import MirroredDatagram
 from router.recording.reader import Recording
-from router.rehearsal.replaying_against import Against
+from router.rehearsal.against import Against
 from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, program
 from tests.recording.recorder_rig import MILLISECOND, START, imu, recorded, seen, wire
 from tests.tables import PROTOS

@@ -1,0 +1,303 @@
+"""A recording through two tables on one clock: which deliveries are the same, and a report of those that are not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from typing import NamedTuple, Union
+
+from router.compiler import Checked
+from router.compiler.program import Program
+from router.engine.wire import Wire
+from router.errors import DecodeError, MappingError
+from router.recording.mirror import Classifier, Peer
+from router.recording.reader import Recorded
+from router.rehearsal import cdr
+from router.rehearsal.comparing import TableIndex
+from router.rehearsal.fields import leaves
+from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Rehearsal, Rejected, Sent
+
+Delivery = Union[Sent, Published]
+Loss = tuple[str, str, str, str]
+"""What was done (dropped, withheld, rejected), where (a route or a listener), for which target, and why."""
+
+
+@dataclass(slots=True)
+class Row:
+    """What one target got of one route. `moved` came from both tables with the same bytes at different times.
+
+    `examples`, one of a kind, have the nanoseconds since the beginning, and the delivery of either table, if there is.
+    """
+
+    old: int = 0
+    new: int = 0
+    same: int = 0
+    changed: int = 0
+    moved: int = 0
+    examples: list[tuple[int, Delivery | None, Delivery | None]] = field(default_factory=list)
+
+    @property
+    def lost(self) -> int:
+        return self.old - self.same - self.changed - self.moved
+
+    @property
+    def added(self) -> int:
+        return self.new - self.same - self.changed - self.moved
+
+    @property
+    def differs(self) -> bool:
+        return not self.old == self.new == self.same
+
+
+class Against:
+    """The comparison. `take` the datagrams in order; `rows` are by route and target, `losses` by table.
+
+    `span` is the time from the first datagram to the last, ns. `senders` are what the recording calls them, the
+    listener that they came by, and their addresses.
+    """
+
+    def __init__(self, old: Program, new: Program) -> None:
+        self.rows: dict[tuple[str, str], Row] = {}
+        self.losses: tuple[Counter[Loss], Counter[Loss]] = (Counter(), Counter())
+        self.datagrams = 0
+        self.span = 0
+        self.senders: set[tuple[str, str, Peer]] = set()
+        self._programs = (old, new)
+        self._runs: tuple[Rehearsal, ...] = ()
+        self._first = self._start = 0
+        self._unmatched: tuple[Counter[tuple[str, bytes]], ...] = (Counter(), Counter())
+        """Deliveries that the other table has not made so far, by target and digest."""
+
+    def take(self, found: Recorded) -> None:
+        if not self._runs:
+            self._first, self._start = found.steady, found.at
+            self._runs = tuple(Rehearsal(program, found.at) for program in self._programs)
+        self.datagrams += 1
+        self.span = found.steady - self._first
+        self.senders.add((found.endpoint, found.listener, found.peer))
+        for run, program in zip(self._runs, self._programs, strict=True):
+            run.advance(self._start + self.span)
+            if found.listener in program.table.listeners:
+                run.datagram(found.listener, found.peer, found.data)
+            else:
+                run.events.append(Rejected(run.now, found.listener, "no such listener"))
+        old, new = (self._deliveries(side) for side in (0, 1))
+        for target in dict.fromkeys((*old, *new)):
+            self._compare(old.get(target, []), new.get(target, []))
+
+    @property
+    def differs(self) -> bool:
+        return self.losses[0] != self.losses[1] or any(row.differs for row in self.rows.values())
+
+    @property
+    def is_among_strangers(self) -> bool:
+        """Whether neither table has an endpoint for any sender."""
+        tables = [Classifier(program.envelope, program.table) for program in self._programs]
+        places = {(listener, peer) for _, listener, peer in self.senders}
+        return bool(places) and not any(table.sender(*place) for table in tables for place in places)
+
+    def _deliveries(self, side: int) -> dict[str, list[Delivery]]:
+        """Those since the last call, by target. Losses are counted."""
+        found: dict[str, list[Delivery]] = {}
+        for event in self._runs[side].events:
+            if isinstance(event, (Sent, Published)):
+                found.setdefault(event.target, []).append(event)
+            elif (loss := _loss(event)) is not None:
+                self.losses[side][loss] += 1
+        self._runs[side].events.clear()
+        return found
+
+    def _compare(self, old: Sequence[Delivery], new: Sequence[Delivery]) -> None:
+        """Count what one target got from one datagram and the time before it."""
+        for each in old:
+            self._row(each).old += 1
+        for each in new:
+            self._row(each).new += 1
+        only_old = self._without_same(old, Counter(each.data for each in new), count=True)
+        only_new = self._without_same(new, Counter(each.data for each in old), count=False)
+        only_old = list(self._without_moved(only_old, self._unmatched[1]))
+        only_new = list(self._without_moved(only_new, self._unmatched[0]))
+        both = min(len(only_old), len(only_new))
+        for before, after in zip(only_old[:both], only_new[:both], strict=True):
+            self._row(after).changed += 1
+            self._example(before, after)
+        for each in only_old[both:]:
+            self._unmatched[0][_key(each)] += 1
+            self._example(each, None)
+        for each in only_new[both:]:
+            self._unmatched[1][_key(each)] += 1
+            self._example(None, each)
+
+    def _without_same(self, found: Sequence[Delivery], others: Counter[bytes], *, count: bool) -> list[Delivery]:
+        left = []
+        for each in found:
+            if others[each.data]:
+                others[each.data] -= 1
+                self._row(each).same += count
+            else:
+                left.append(each)
+        return left
+
+    def _without_moved(self, found: Sequence[Delivery], unmatched: Counter[tuple[str, bytes]]) -> Iterator[Delivery]:
+        """Without those that the other table made earlier."""
+        for each in found:
+            if unmatched[key := _key(each)]:
+                unmatched[key] -= 1
+                self._row(each).moved += 1
+            else:
+                yield each
+
+    def _row(self, event: Delivery) -> Row:
+        return self.rows.setdefault((event.route, event.target), Row())
+
+    def _example(self, old: Delivery | None, new: Delivery | None) -> None:
+        event = new or old
+        assert event is not None  # noqa: S101 - there is one of them
+        examples = self._row(event).examples
+        kind = (old is None, new is None)
+        if kind not in ((one is None, other is None) for _, one, other in examples):
+            examples.append((event.at - self._start, old, new))
+
+
+def _key(event: Delivery) -> tuple[str, bytes]:
+    return event.target, blake2b(event.data, digest_size=12).digest()
+
+
+def _loss(event: Event) -> Loss | None:
+    match event:
+        case Dropped():
+            return "dropped", event.route, event.target, event.reason
+        case Filtered():
+            return "withheld", event.route, event.target, "when"
+        case Rejected():
+            return "rejected", event.listener, "", event.reason
+    return None
+
+
+# The report
+
+
+_MOST_FIELDS = 12
+_MOST_SENDERS = 5
+_COLUMNS = ("old", "new", "same", "changed", "moved", "lost", "added")
+
+
+class _Content(NamedTuple):
+    """What a delivery is, and its fields by path."""
+
+    name: str
+    fields: dict[str, str]
+
+
+class Report:
+    """A comparison as plain lines: counts by route and target, then fields that differ."""
+
+    def __init__(self, old: Checked, new: Checked) -> None:
+        self._tables = (old, new)
+        self._indexes = (TableIndex(old), TableIndex(new))
+        self._wires = tuple(Wire(checked.envelope) for checked in (old, new) if checked.envelope)
+
+    def lines(self, found: Against) -> Iterator[str]:
+        """All of it. Little where both tables deliver the same."""
+        old, new = (checked.path for checked in self._tables)
+        yield f"{found.datagrams} datagrams of {found.span / 1e9:.1f} s, through {old} and {new}"
+        if not found.differs:
+            yield f"both deliver the same, {sum(row.old for row in found.rows.values())} datagrams and messages"
+            yield from _same_losses(found)
+            yield from _strangers(found)
+            return
+        yield from _counts(found)
+        yield from _losses(found)
+        for (route, target), row in sorted(found.rows.items()):
+            for at, before, after in row.examples:
+                if _is_reported(row, before, after):
+                    yield ""
+                    yield f"{route} to {target}, {at / 1e9:.3f} s after the beginning:"
+                    yield from self._example(before, after)
+        yield from _strangers(found)
+
+    def _example(self, before: Delivery | None, after: Delivery | None) -> Iterator[str]:
+        if before is None or after is None:
+            which, content = ("old", self._content(0, before)) if before else ("new", self._content(1, after))
+            listed = " ".join([f"{name}={value}" for name, value in content.fields.items()][:_MOST_FIELDS])
+            yield f"  with the {which} table only: {content.name} {listed}"
+            return
+        old, new = self._content(0, before), self._content(1, after)
+        if old.name != new.name:
+            yield f"  {old.name} became {new.name}"
+        differing = [name for name in {**old.fields, **new.fields} if old.fields.get(name) != new.fields.get(name)]
+        for name in differing[:_MOST_FIELDS]:
+            yield f"  {name}: {old.fields.get(name, 'nothing')} became {new.fields.get(name, 'nothing')}"
+        if len(differing) > _MOST_FIELDS:
+            yield f"  and {len(differing) - _MOST_FIELDS} more fields"
+        if not differing and old.name == new.name:
+            yield "  the same fields, in other bytes"
+
+    def _content(self, side: int, event: Delivery | None) -> _Content:
+        assert event is not None  # noqa: S101 - an example has one of the two
+        unread = _Content("a message" if isinstance(event, Published) else "a datagram", {"bytes": event.data.hex()})
+        if isinstance(event, Sent):
+            try:
+                decoded = self._wires[side].decode(event.data)
+            except DecodeError:
+                return unread
+            return _Content(decoded.case.name, dict(leaves(decoded.case.type, decoded.message)))
+        kind = self._indexes[side].type(event.route, event.target)
+        if kind is None:
+            return unread
+        try:
+            return _Content(kind.name, dict(leaves(kind, cdr.deserialize(kind, event.data))))
+        except (MappingError, ValueError):
+            return unread._replace(name=kind.name)
+
+
+def _counts(found: Against) -> Iterator[str]:
+    rows = {key: row for key, row in sorted(found.rows.items()) if row.differs}
+    if not rows:
+        return
+    width = [max(map(len, column)) for column in zip(("route", "target"), *rows, strict=True)]
+    yield ""
+    yield f"{'route':{width[0]}}  {'target':{width[1]}}" + "".join(f"{name:>9}" for name in _COLUMNS)
+    for (route, target), row in rows.items():
+        counts = [getattr(row, name) for name in _COLUMNS]
+        yield f"{route:{width[0]}}  {target:{width[1]}}" + "".join(f"{count:9}" for count in counts)
+
+
+def _losses(found: Against) -> Iterator[str]:
+    old, new = found.losses
+    changed = sorted(loss for loss in {*old, *new} if old[loss] != new[loss])
+    if changed:
+        yield ""
+    for loss in changed:
+        done, place, target, reason = loss
+        to = f" to {target}" if target else ""
+        yield f"{done} ({reason}): {place}{to}: {old[loss]} with the old table, {new[loss]} with the new one"
+
+
+def _same_losses(found: Against) -> Iterator[str]:
+    """What both tables lost: of a recording from another network, that is everything."""
+    counts: Counter[str] = Counter()
+    for (done, _, _, reason), count in found.losses[0].items():
+        counts[f"{done} ({reason})"] += count
+    for what, count in sorted(counts.items()):
+        yield f"{what}: {count} with both"
+
+
+def _strangers(found: Against) -> Iterator[str]:
+    """Why next to nothing was delivered, where the tables are for another network than the recording."""
+    if not found.is_among_strangers:
+        return
+    named = sorted({f"{name or 'a stranger'} at {peer[0]}" for name, _, peer in found.senders})
+    more = f" and {len(named) - _MOST_SENDERS} more" if len(named) > _MOST_SENDERS else ""
+    yield ""
+    yield f"neither table has an endpoint where the datagrams came from: {', '.join(named[:_MOST_SENDERS])}{more};"
+    yield "compare tables with the addresses of the recording"
+
+
+def _is_reported(row: Row, before: Delivery | None, after: Delivery | None) -> bool:
+    """Whether an example is one: what only came at another time is none of what did not come."""
+    if before is None:
+        return row.added > 0
+    return after is not None or row.lost > 0

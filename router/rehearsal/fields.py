@@ -1,0 +1,265 @@
+"""What a table test says of a message field by field, given or expected, and where a message differs from it.
+
+A message here is anything with its fields as attributes: a protobuf message, or what `cdr.deserialize` returns.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Union
+
+from google.protobuf.message import Message
+
+from router.compiler.expressions.functions import NS_PER_SECOND
+from router.compiler.namespace import entries
+from router.errors import SourceSpan
+from router.rehearsal.rehearsal import START
+from router.table.units import duration
+from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
+from router.values import scalar_text
+
+TIMES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
+
+Path = tuple[Union[str, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One field that is not what was expected; `span` is the place that expects it."""
+
+    path: Path
+    expected: str
+    actual: str
+    span: SourceSpan
+
+    def __str__(self) -> str:
+        return f"{path_text(self.path)} is {self.actual}, not {self.expected}"
+
+
+# What a test says. `differences` compares it with an actual value; `now` is when the step's message came in, ns.
+
+
+@dataclass(frozen=True, slots=True)
+class AnyValue:
+    span: SourceSpan
+
+    def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
+        """None."""
+        yield from ()
+
+
+@dataclass(frozen=True, slots=True)
+class Scalar:
+    """A scalar, of a float32 the nearest one; or a number that may be `tolerance` off, written as `text`."""
+
+    value: Any
+    span: SourceSpan
+    tolerance: float | None = None
+    text: str = ""
+
+    def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
+        if self.tolerance is None:
+            if not _same(kind, self.value, actual):
+                yield Difference(path, shown(kind, self.value), shown(kind, actual), self.span)
+            return
+        slack = 4 * math.ulp(self.value)  # the ends of the interval are written in decimal
+        if not abs(actual - self.value) <= self.tolerance + slack:
+            yield Difference(path, self.text, shown(kind, actual), self.span)
+
+
+@dataclass(frozen=True, slots=True)
+class Time:
+    """A time, a message of one of TIMES: `offset` ns after the test's start, or None for when the message came in."""
+
+    type: MessageType
+    offset: int | None
+    span: SourceSpan
+
+    def at(self, now: int) -> int:
+        return now if self.offset is None else START + self.offset
+
+    def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
+        expected, found = self.at(now), _time_of(self.type, actual)
+        if found != expected:
+            yield Difference(path, offset(expected - START), offset(found - START), self.span)
+
+
+@dataclass(frozen=True, slots=True)
+class Fields:
+    """A message of this type whose other fields are all at their default."""
+
+    type: MessageType
+    members: Mapping[str, FieldValue]
+    span: SourceSpan
+
+    def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
+        for field in self.type.fields:
+            member = self.members.get(field.name)
+            value = getattr(actual, field.name)
+            here = (*path, field.name)
+            if member is not None:
+                yield from member.differences(here, field.type, value, now)
+            elif not _is_unset(actual, field, value):
+                yield Difference(here, "at its default", shown(field.type, value), self.span)
+
+
+@dataclass(frozen=True, slots=True)
+class Elements:
+    """The elements of a list, or the entries of a protobuf map in the order of their keys."""
+
+    items: tuple[FieldValue, ...]
+    span: SourceSpan
+
+    def differences(self, path: Path, kind: Type, actual: Any, now: int) -> Iterator[Difference]:
+        assert isinstance(kind, List)  # noqa: S101 - it was read as one
+        if len(actual) != len(self.items):
+            found = f"{len(actual)} elements {shown(kind, actual)}" if len(actual) else "empty"
+            yield Difference(path, f"{len(self.items)} elements", found, self.span)
+            return
+        for index, (item, value) in enumerate(zip(self.items, _elements(kind, actual), strict=True)):
+            yield from item.differences((*path, index), kind.element, value, now)
+
+
+FieldValue = Union[AnyValue, Scalar, Time, Fields, Elements]
+
+
+# Messages made of what a test gives
+
+
+def protobuf_message(message_class: type[Message], given: Fields, now: int) -> Message:
+    """A protobuf message with these fields set; `now` is when it comes in, ns."""
+    return message_class(**_plain(given, now, complete=False))
+
+
+def ros_values(given: Fields, now: int) -> Mapping[str, Any]:
+    """All values of a ROS message by name, those that were not given at their default."""
+    values: Mapping[str, Any] = _plain(given, now, complete=True)
+    return values
+
+
+def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
+    """A given value as the constructors of protobuf take it, with messages and maps as dicts.
+
+    `complete`: with the defaults of what is not given.
+    """
+    match value:
+        case Fields():
+            given = {name: _plain(member, now, complete=complete) for name, member in value.members.items()}
+            return {**default_of(value.type), **given} if complete else given
+        case Elements(items=(Fields(type=MessageType(is_map_entry=True, fields=(key, member))), *_)):
+            absent = {} if isinstance(member.type, MessageType) else default_of(member.type)
+            empty = {"key": default_of(key.type), "value": absent}
+            entries_given = (empty | _plain(entry, now, complete=False) for entry in value.items)
+            return {entry["key"]: entry["value"] for entry in entries_given}
+        case Elements():
+            return [_plain(item, now, complete=complete) for item in value.items]
+        case Time():
+            seconds, nanoseconds = value.type.fields
+            return dict(zip((seconds.name, nanoseconds.name), divmod(value.at(now), NS_PER_SECOND), strict=True))
+        case Scalar():
+            return value.value
+    raise AssertionError(f"{value} cannot be given")
+
+
+def default_of(kind: Type, default: object = None) -> Any:
+    """The value of a field that nothing fills; of a message its values by name. `default` is the declared one."""
+    if default is not None:
+        return default
+    match kind:
+        case MessageType():
+            return {field.name: default_of(field.type, field.default) for field in kind.fields}
+        case List():
+            return [default_of(kind.element) for _ in range(kind.length or 0)]
+        case String():
+            return ""
+        case Bytes():
+            return b""
+        case Float():
+            return 0.0
+        case Bool():
+            return False
+        case _:
+            return 0
+
+
+def _is_unset(holder: Any, field: Field, value: Any) -> bool:
+    if isinstance(holder, Message) and (field.has_presence or isinstance(field.type, MessageType)):
+        return not holder.HasField(field.name)
+    return _is_default(field.type, value, default_of(field.type, field.default))
+
+
+def _is_default(kind: Type, value: Any, default: Any) -> bool:
+    if isinstance(kind, MessageType):
+        return all(_is_default(field.type, getattr(value, field.name), default[field.name]) for field in kind.fields)
+    if isinstance(kind, List):
+        same = zip(_elements(kind, value), default, strict=False)
+        return len(value) == len(default) and all(_is_default(kind.element, one, other) for one, other in same)
+    return _same(kind, default, value)
+
+
+def _same(kind: Type, expected: Any, actual: Any) -> bool:
+    if isinstance(kind, Float):
+        if math.isnan(expected) or math.isnan(actual):
+            return math.isnan(expected) and math.isnan(actual)
+        letter = "<f" if kind.bits == 32 else "<d"
+        return bool(struct.unpack(letter, struct.pack(letter, expected))[0] == actual)
+    if isinstance(kind, Int):
+        return int(expected) == int(actual)
+    return bool(expected == actual)
+
+
+def _elements(kind: List, value: Any) -> Sequence[Any]:
+    """Of a list; of a protobuf map its entries, by key."""
+    element = kind.element
+    return entries(value) if isinstance(element, MessageType) and element.is_map_entry else value
+
+
+def _time_of(kind: MessageType, value: Any) -> int:
+    """A message of TIMES in ns of the wall clock."""
+    seconds, nanoseconds = (getattr(value, field.name) for field in kind.fields)
+    return int(seconds * NS_PER_SECOND + nanoseconds)
+
+
+# Text
+
+
+def shown(kind: Type, value: Any) -> str:
+    """A value as a test would write it, on one line; of messages the fields that are not at their default."""
+    match kind:
+        case MessageType() if kind.name in TIMES:
+            return offset(_time_of(kind, value) - START)
+        case MessageType():
+            members = ((field, getattr(value, field.name)) for field in kind.fields)
+            inner = (f"{f.name}: {shown(f.type, member)}" for f, member in members if not _is_unset(value, f, member))
+            return f"{{{', '.join(inner)}}}"
+        case List():
+            return f"[{', '.join(shown(kind.element, item) for item in _elements(kind, value))}]"
+        case String():
+            return repr(value)
+        case _:
+            return scalar_text(value, kind) or "empty"
+
+
+def leaves(kind: Type, value: Any, path: Path = ()) -> Iterator[tuple[str, str]]:
+    """Every scalar of a message by its path, `header.stamp.sec` or `points[1].x`, as text."""
+    if isinstance(kind, MessageType):
+        for field in kind.fields:
+            yield from leaves(field.type, getattr(value, field.name), (*path, field.name))
+    elif isinstance(kind, List):
+        for index, element in enumerate(_elements(kind, value)):
+            yield from leaves(kind.element, element, (*path, index))
+    else:
+        yield path_text(path), shown(kind, value)
+
+
+def path_text(path: Path) -> str:
+    """`linear_acceleration.x`, `points[1].x`."""
+    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path).removeprefix(".")
+
+
+def offset(ns: int) -> str:
+    """A time after the beginning of the test, as a test would write it; negative before."""
+    return f"{'-' if ns < 0 else ''}{duration(abs(ns)) if ns else '0 ms'}"

@@ -1,0 +1,594 @@
+"""The steps of a table test: what is given and what is expected, as data with its places, and how that is read.
+
+Every name has to be one of the table under test. What is not raises InvalidValueError, with the nearest name there is.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from router.compiler import Checked
+from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
+from router.compiler.program import Program
+from router.engine.dispatch import Peer
+from router.errors import Code, Diagnostic, Located, SourceSpan, UsageError, did_you_mean
+from router.rehearsal.fields import TIMES, AnyValue, Elements, Fields, FieldValue, Scalar, Time
+from router.table.addresses import BadAddressError, parse_address
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
+from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
+from router.table.units import parse_duration
+from router.types.model import Bytes, Enum, Float, Int, List, MessageType, Type
+from router.types.protobuf import PayloadCase
+from router.values import parse
+
+ANY = "any"
+UNCHANGED = "unchanged"
+RECEIVED_AT = "received_at"
+
+Counts = Mapping[str, int]
+"""How many of each reason, or of each target."""
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """A message that comes in, `times` often, `every` ns, each sent `age` ns ago.
+
+    With a `topic` a ROS message, else a datagram from `peer` at `listener`. Its content is `fields`, of a datagram
+    those of the payload `case`, or the bytes `data`. `pad` in bytes, 0 for none.
+    """
+
+    span: SourceSpan
+    topic: str | None = None
+    peer: Peer = ("", 0)
+    listener: str = ""
+    case: PayloadCase | None = None
+    fields: Fields | None = None
+    data: bytes | None = None
+    trim: bool = False
+    pad: int = 0
+    times: int = 1
+    every: int = 0
+    age: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """One delivery that is expected: the datagram as it was given, these bytes, or a message with these fields.
+
+    `case` is the payload of a datagram. Where nothing of all that is said, any content will do.
+    """
+
+    span: SourceSpan
+    is_unchanged: bool = False
+    data: bytes | None = None
+    case: PayloadCase | None = None
+    fields: Fields | None = None
+
+    @property
+    def is_compared(self) -> bool:
+        """Whether the test looks at the content, and not only at which payload it is."""
+        return self.is_unchanged or self.data is not None or self.fields is not None
+
+
+Deliveries = Mapping[str, tuple[Delivery, ...]]
+"""By endpoint or topic, in order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """All that happens in a step; with `anything`, nothing is compared.
+
+    `filtered` and `route` are None where the test does not say.
+    """
+
+    span: SourceSpan
+    anything: bool = False
+    sent: Deliveries = field(default_factory=dict)
+    published: Deliveries = field(default_factory=dict)
+    dropped: Mapping[str, Located[Counts]] = field(default_factory=dict)
+    rejected: Located[Counts] | None = None
+    filtered: Located[Counts] | None = None
+    route: Located[str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """`at` and `until` in ns after the beginning of the test, None where the step before ends."""
+
+    span: SourceSpan
+    expected: Expected
+    given: Given | None = None
+    at: int | None = None
+    until: int | None = None
+    stop: bool = False
+
+
+def invalid(span: SourceSpan, code: Code, message: str, hint: str = "") -> InvalidValueError:
+    return InvalidValueError(Diagnostic(span, code, message, hint))
+
+
+# Names
+
+
+_PORT = 40_000
+"""A sender's port where the test says none."""
+
+
+class Names:
+    """The names of a table. A method takes a name and its place, and raises InvalidValueError if there is none such."""
+
+    def __init__(self, checked: Checked, program: Program) -> None:
+        self._checked = checked
+        self._program = program
+        self._table = program.table
+
+    @cached_property
+    def constants(self) -> Mapping[str, set[int]]:
+        """The numbers of enum values by name, plain and with the name of their enum."""
+        numbers: dict[str, set[int]] = {}
+        enums: Iterable[Enum] = self._checked.schema.enums.values() if self._checked.schema else ()
+        for enum in enums:
+            for name, number in enum.values:
+                for known in (name, f"{enum.name.rpartition('.')[2]}.{name}"):
+                    numbers.setdefault(known, set()).add(number)
+        return numbers
+
+    def case(self, name: str, span: SourceSpan) -> PayloadCase:
+        envelope = self._program.envelope
+        if name not in envelope.cases:
+            message = f"{envelope.name} has no payload case '{name}'"
+            raise invalid(span, Code.UNKNOWN_PAYLOAD_CASE, message, did_you_mean(name, envelope.cases))
+        return envelope.cases[name]
+
+    def peer(self, name: str, span: SourceSpan) -> Peer:
+        """The address that an endpoint sends from, or any other that is written HOST:PORT."""
+        if endpoint := self._table.endpoints.get(name):
+            address = endpoint.address.value
+            return address.host, endpoint.source_port.value if endpoint.source_port else address.port
+        host, colon, port = name.partition(":")
+        try:
+            return parse_address(f"{'127.0.0.1' if host == 'localhost' else host}:{port if colon else _PORT}")
+        except BadAddressError as error:
+            message = f"'{name}' is neither HOST[:PORT] nor a name of the route table"
+            raise invalid(span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(name, self._table.endpoints)) from error
+
+    def listener(self, named: Located[str] | None, sender: str, span: SourceSpan) -> str:
+        """The one that is named, else the one by which the sender is believed, else the only one."""
+        listeners = self._table.listeners
+        if named is not None:
+            return self._known(named.value, listeners, named.span, "listener")
+        endpoint = self._table.endpoints.get(sender)
+        if endpoint is not None and endpoint.listener is not None:
+            return endpoint.listener.value
+        if len(listeners) > 1:
+            raise invalid(span, Code.MISSING_KEY, f"say which listener: {', '.join(listeners)}")
+        return next(iter(listeners))
+
+    def endpoint(self, name: str, span: SourceSpan) -> str:
+        """One that something is sent to."""
+        self._known(name, self._table.endpoints, span, "endpoint", Code.UNKNOWN_ENDPOINT)
+        return self._known(name, self._destinations, span, "route to the endpoint", Code.UNKNOWN_ENDPOINT)
+
+    def route(self, name: str, span: SourceSpan) -> str:
+        return self._known(name, [route.name for route in self._table.routes if not route.ignore], span, "route")
+
+    def published(self, name: str, span: SourceSpan) -> MessageType:
+        return self._published[self._known(name, self._published, span, "route that publishes on")]
+
+    def subscribed(self, name: str, span: SourceSpan) -> MessageType:
+        topics = {
+            subscription.topic.topic.value: subscription.type
+            for route in self._checked.routes
+            for subscription in route.subscriptions
+        }
+        return topics[self._known(name, topics, span, "route from the topic")]
+
+    def target(self, name: str, span: SourceSpan) -> str:
+        """An endpoint or a topic that a route delivers to."""
+        return self._known(name, [*self._destinations, *self._published], span, "route to")
+
+    @cached_property
+    def _destinations(self) -> Sequence[str]:
+        return [endpoint.name for endpoint in self._program.senders]
+
+    @cached_property
+    def _published(self) -> Mapping[str, MessageType]:
+        targets = [target for route in self._checked.routes for target in route.targets]
+        return {target.topic.topic.value: target.type for target in targets if target.topic and target.type}
+
+    def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:
+        known = list(names)
+        if name not in known:
+            raise invalid(span, code, f"{self._table.path.name} has no {what} '{name}'", did_you_mean(name, known))
+        return name
+
+
+# Fields of messages
+
+
+_ROUGHLY = re.compile(r"~ ?([-+]?[0-9]+(?:\.([0-9]*))?(?:[eE]([-+]?[0-9]+))?)")
+_WITHIN = re.compile(r"(\S+) *(?:\+-|\+/-|±) *(\S+)")
+
+
+class FieldReader:
+    """Reads the fields of messages. With `exact`, as for what is given, there is no `any` and no tolerance.
+
+    `any` is that word without quotes; with them it is text.
+    """
+
+    def __init__(self, names: Names, *, exact: bool) -> None:
+        self._names = names
+        self._exact = exact
+
+    def message(self, kind: MessageType, node: Node) -> Fields:
+        if not isinstance(node, MappingNode):
+            raise invalid(node.span, Code.WRONG_TYPE, f"{kind} is a message: write its fields, {{name: value}}")
+        members: dict[str, FieldValue] = {}
+        for path, entry in node.entries.items():
+            self._put(members, kind, path, entry)
+        return Fields(kind, members, node.span)
+
+    def _put(self, members: dict[str, FieldValue], kind: MessageType, path: str, entry: Entry) -> None:
+        """Add the value of a path such as `header.stamp` to the members of a message."""
+        span = entry.key.span
+        name, dot, rest = path.partition(".")
+        field = kind.field(name)
+        if field is None:
+            hint = did_you_mean(name, [member.name for member in kind.fields])
+            raise invalid(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
+        if dot and not isinstance(field.type, MessageType):
+            raise invalid(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields")
+        inner = members.get(name)
+        if inner is not None and not (dot and isinstance(inner, Fields)):
+            raise invalid(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
+        if dot and isinstance(field.type, MessageType):
+            below = dict(inner.members) if isinstance(inner, Fields) else {}
+            self._put(below, field.type, rest, entry)
+            members[name] = Fields(field.type, below, span)
+        else:
+            members[name] = self._value(field.type, entry.value, kind)
+
+    def _value(self, kind: Type, node: Node, holder: MessageType) -> FieldValue:
+        if not self._exact and isinstance(node, ScalarNode) and node.text == ANY and node.place.is_whole_line:
+            return AnyValue(node.span)
+        match kind, node:
+            case MessageType(), ScalarNode() if kind.name in TIMES:
+                return Time(kind, _offset(node), node.span)
+            case MessageType(fields=(only,)), ScalarNode():  # as a table fills it
+                return Fields(kind, {only.name: self._value(only.type, node, kind)}, node.span)
+            case MessageType(), _:
+                return self.message(kind, node)
+            case List(), SequenceNode():
+                if kind.length is not None and len(node.items) != kind.length:
+                    message = f"{kind} has {kind.length} elements, not {len(node.items)}"
+                    raise invalid(node.span, Code.TYPE_MISMATCH, message)
+                return Elements(tuple(self._value(kind.element, item, holder) for item in node.items), node.span)
+            case List(), _:
+                raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
+            case _, ScalarNode():
+                return self._scalar(kind, node, holder)
+        raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} takes one value")
+
+    def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Scalar:
+        text = node.text
+        if isinstance(kind, (Int, Float)) and not self._exact and (near := _near(text, node.span)):
+            return near
+        if isinstance(kind, Int) and (number := self._constant(text, holder, node.span)) is not None:
+            text = str(number)
+        if isinstance(kind, Bytes):
+            text = text.replace(" ", "")
+        try:
+            return Scalar(parse(kind, text, ""), node.span)
+        except UsageError as error:
+            raise invalid(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
+
+    def _constant(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
+        """The value of a ROS constant of the message, or of a protobuf enum: `STATUS_FIX`, `GPSFixQuality.RTK_FIX`."""
+        found = holder.constants.get(text.removeprefix(f"{holder.short_name}."))
+        if isinstance(found, int):
+            return found
+        numbers = self._names.constants.get(text, set())
+        if len(numbers) > 1:
+            message = f"several enums have a value '{text}', with different numbers"
+            raise invalid(span, Code.BAD_VALUE, message, f"say of which enum, as in State.{text}")
+        return next(iter(numbers), None)
+
+
+def _near(text: str, span: SourceSpan) -> Scalar | None:
+    """`~1.571` is what rounds to that, `1.57 +- 0.01` what is that near."""
+    if found := _ROUGHLY.fullmatch(text):
+        value = _finite(found[1], "number to be near", span)
+        digits = len(found[2] or "") - int(found[3] or 0)
+        return Scalar(value, span, float(f"0.5e{-digits}"), text)
+    if found := _WITHIN.fullmatch(text):
+        value = _finite(found[1], "number to be near", span)
+        tolerance = _finite(found[2], "tolerance", span)
+        if tolerance < 0:
+            raise invalid(span, Code.BAD_VALUE, f"'{found[2]}' is no tolerance, which is not negative")
+        return Scalar(value, span, tolerance, text)
+    return None
+
+
+def _finite(text: str, what: str, span: SourceSpan) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise invalid(span, Code.BAD_VALUE, f"'{text}' is no {what}", "write a number, as in 1.57 +- 0.01")
+    return value
+
+
+def _offset(node: ScalarNode) -> int | None:
+    if node.text == RECEIVED_AT:
+        return None
+    if node.value == 0:
+        return 0
+    try:
+        return parse_duration(node.text)
+    except ValueError as error:
+        hint = f"a time is '{RECEIVED_AT}', or so long after the beginning of the test, such as 300ms"
+        raise invalid(node.span, Code.BAD_VALUE, str(error), hint) from error
+
+
+# given
+
+
+_KEYS_OF_DATAGRAMS = ("case", "fields", "from", "listener", "trim", "pad")
+_KEYS_OF_MESSAGES = ("topic", "message")
+
+
+class GivenReader:
+    def __init__(self, names: Names) -> None:
+        self._names = names
+        self._fields = FieldReader(names, exact=True)
+
+    def given(self, node: Node) -> Given:
+        """Raises InvalidValueError."""
+        assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
+        span = next(iter(node.entries.values())).key.span if node.entries else node.span
+        topic = optional_text(node, "topic")
+        return self._datagram(span, node) if topic is None else self._message(span, node, topic)
+
+    def _datagram(self, span: SourceSpan, node: MappingNode) -> Given:
+        _refuse(node, ("message",), "a datagram", _KEYS_OF_DATAGRAMS)
+        sender = optional_text(node, "from")
+        if sender is None:
+            raise invalid(span, Code.MISSING_KEY, "it is not said who sends this", "add 'from: ENDPOINT'")
+        named, data = optional_text(node, "case"), _hex(node)
+        if (named is None) == (data is None):
+            message = "a datagram is given as 'case' with 'fields', or as 'hex'; a ROS message has a 'topic'"
+            raise invalid(span, Code.BAD_VALUE, message)
+        if named is None and (fields := node.entries.get("fields")):
+            raise invalid(fields.key.span, Code.UNKNOWN_KEY, "'fields' belongs to 'case'")
+        case = self._names.case(named.value, named.span) if named else None
+        pad = integer(node, "pad")
+        times, every, age = _repetition(node)
+        return Given(
+            span=span,
+            peer=self._names.peer(sender.value, sender.span),
+            listener=self._names.listener(optional_text(node, "listener"), sender.value, span),
+            case=case,
+            fields=self._content(case.type, node.get("fields"), span) if case else None,
+            data=data,
+            trim=boolean(node, "trim"),
+            pad=pad.value if pad else 0,
+            times=times,
+            every=every,
+            age=age,
+        )
+
+    def _message(self, span: SourceSpan, node: MappingNode, topic: Located[str]) -> Given:
+        _refuse(node, _KEYS_OF_DATAGRAMS, "a ROS message", _KEYS_OF_MESSAGES)
+        kind = self._names.subscribed(topic.value, topic.span)
+        data, message = _hex(node), node.get("message")
+        if data is not None and message is not None:
+            raise invalid(span, Code.BAD_VALUE, "a ROS message is given as 'message' or as 'hex', not both")
+        fields = self._content(kind, message, topic.span) if data is None else None
+        times, every, age = _repetition(node)
+        return Given(span, topic.value, fields=fields, data=data, times=times, every=every, age=age)
+
+    def _content(self, kind: MessageType, node: Node | None, span: SourceSpan) -> Fields:
+        return self._fields.message(kind, node) if node else Fields(kind, {}, span)
+
+
+def _refuse(node: MappingNode, names: tuple[str, ...], what: str, known: tuple[str, ...]) -> None:
+    for name in names:
+        if entry := node.entries.get(name):
+            hint = f"it has {', '.join((*known, 'hex'))}"
+            raise invalid(entry.key.span, Code.UNKNOWN_KEY, f"{what} has no key '{name}'", hint)
+
+
+def _repetition(node: MappingNode) -> tuple[int, int, int]:
+    """`times`, `every` and `age`, the latter two in ns."""
+    times, every, age = integer(node, "times"), optional_text(node, "every"), optional_text(node, "age")
+    if every is not None and times is None:
+        raise invalid(every.span, Code.MISSING_KEY, "'every' without 'times'", "say how often it is given")
+    return (
+        times.value if times else 1,
+        parsed(parse_duration, every) if every else 0,
+        parsed(parse_duration, age) if age else 0,
+    )
+
+
+def _hex(node: MappingNode) -> bytes | None:
+    text = optional_text(node, "hex")
+    return bytes.fromhex(text.value) if text else None
+
+
+# expect
+
+
+_MOST = 100_000
+
+
+class ExpectedReader:
+    def __init__(self, names: Names) -> None:
+        self._names = names
+        self._fields = FieldReader(names, exact=False)
+        self._given = FieldReader(names, exact=True)
+
+    def expected(self, span: SourceSpan, node: Node, given: Node | None) -> Expected:
+        """`given` is what the step is given, which 'unchanged' refers to. Raises InvalidValueError."""
+        if isinstance(node, ScalarNode):
+            return Expected(span, anything=node.text == ANY)
+        assert isinstance(node, MappingNode)  # noqa: S101 - the schema saw to it
+        route, rejected, filtered = (node.entries.get(key) for key in ("route", "rejected", "filtered"))
+        return Expected(
+            span=span,
+            sent=self._sent(node.get("sent"), given),
+            published=self._published(node.get("published"), given),
+            dropped=self._dropped(node.get("dropped")),
+            rejected=Located(_reasons(rejected.value, REJECT_REASONS), rejected.key.span) if rejected else None,
+            filtered=Located(self._filtered(filtered.value), filtered.key.span) if filtered else None,
+            route=Located(self._names.route(*_name(route.value)), route.value.span) if route else None,
+        )
+
+    def _sent(self, node: Node | None, given: Node | None) -> Deliveries:
+        if not isinstance(node, MappingNode):
+            named = [_name(item) for item in _listed(node)]
+            _refuse_repeated(named)
+            return {self._names.endpoint(name, span): (_unchanged(span, given),) for name, span in named}
+        return {
+            self._names.endpoint(name, entry.key.span): tuple(
+                delivery for one in _listed(entry.value) for delivery in self._datagrams(one, given)
+            )
+            for name, entry in node.entries.items()
+        }
+
+    def _datagrams(self, node: Node, given: Node | None) -> Sequence[Delivery]:
+        if isinstance(node, ScalarNode):
+            return [_of_word(node, given)]
+        if not isinstance(node, MappingNode):
+            raise invalid(node.span, Code.WRONG_TYPE, "a list within a list is no datagram")
+        times = _times(node)
+        content = [(name, entry) for name, entry in node.entries.items() if name != "times"]
+        if not content:
+            return [_unchanged(node.span, given)] * times
+        if len(content) > 1:
+            _, second = content[1]
+            message, hint = "a datagram has one payload", "write a list of several datagrams"
+            raise invalid(second.key.span, Code.BAD_VALUE, message, hint)
+        ((name, entry),) = content
+        if name == "hex":
+            return [Delivery(entry.key.span, data=_bytes(entry.value))] * times
+        case = self._names.case(name, entry.key.span)
+        fields = None if _is(entry.value, ANY) else self._content(case.type, entry.value, given)
+        return [Delivery(entry.key.span, case=case, fields=fields)] * times
+
+    def _published(self, node: Node | None, given: Node | None) -> Deliveries:
+        found: dict[str, tuple[Delivery, ...]] = {}
+        for name, entry in node.entries.items() if isinstance(node, MappingNode) else ():
+            kind, span = self._names.published(name, entry.key.span), entry.key.span
+            listed = _listed(entry.value)
+            found[name] = tuple(each for one in listed for each in self._messages(kind, span, one, given))
+        return found
+
+    def _messages(self, kind: MessageType, span: SourceSpan, node: Node, given: Node | None) -> Sequence[Delivery]:
+        times = 1
+        if isinstance(node, MappingNode) and set(node.entries) == {"message", "times"}:
+            times = _times(node)
+            node = node.entries["message"].value
+        fields = None if _is(node, ANY) else self._content(kind, node, given)
+        return [Delivery(span, fields=fields)] * times
+
+    def _content(self, kind: MessageType, node: Node, given: Node | None) -> Fields:
+        """Fields as they are written here, or as they were given."""
+        if not _is(node, UNCHANGED):
+            return self._fields.message(kind, node)
+        if not isinstance(given, MappingNode) or "hex" in given.entries:
+            raise invalid(node.span, Code.BAD_VALUE, "no fields were given in this step that could be unchanged")
+        fields = given.get("fields") or given.get("message")
+        return self._given.message(kind, fields) if fields else Fields(kind, {}, node.span)
+
+    def _dropped(self, node: Node | None) -> Mapping[str, Located[Counts]]:
+        entries = node.entries.items() if isinstance(node, MappingNode) else ()
+        return {
+            self._names.target(name, entry.key.span): Located(_reasons(entry.value, DROP_REASONS), entry.key.span)
+            for name, entry in entries
+        }
+
+    def _filtered(self, node: Node) -> Counts:
+        if isinstance(node, MappingNode):
+            counts = {name: _count(entry.value) for name, entry in node.entries.items()}
+            return {self._names.target(name, node.entries[name].key.span): count for name, count in counts.items()}
+        return Counter(self._names.target(*_name(item)) for item in _listed(node))
+
+
+def _reasons(node: Node, known: Iterable[str]) -> Counts:
+    """A reason, a list of them, or how many of each."""
+    if isinstance(node, MappingNode):
+        named = [(name, entry.key.span) for name, entry in node.entries.items()]
+    else:
+        named = [_name(item) for item in _listed(node)]
+    for name, span in named:
+        if name not in known:
+            raise invalid(span, Code.BAD_VALUE, f"there is no reason '{name}'", did_you_mean(name, known))
+    if isinstance(node, MappingNode):
+        return {name: _count(entry.value) for name, entry in node.entries.items()}
+    return Counter(name for name, _ in named)
+
+
+def _of_word(node: ScalarNode, given: Node | None) -> Delivery:
+    if node.text == UNCHANGED:
+        return _unchanged(node.span, given)
+    if node.text == ANY:
+        return Delivery(node.span)
+    hint = f"write {UNCHANGED}, {ANY}, or {{CASE: {{FIELD: value}}}}"
+    raise invalid(node.span, Code.BAD_VALUE, f"'{node.text}' is no datagram", hint)
+
+
+def _unchanged(span: SourceSpan, given: Node | None) -> Delivery:
+    if not isinstance(given, MappingNode) or "topic" in given.entries:
+        message = "no datagram was given in this step that could be unchanged"
+        raise invalid(span, Code.BAD_VALUE, message, "write {ENDPOINT: {CASE: {FIELD: value}}}")
+    return Delivery(span, is_unchanged=True)
+
+
+def _bytes(node: Node) -> bytes:
+    try:
+        return bytes.fromhex(_name(node)[0])
+    except ValueError:
+        raise invalid(node.span, Code.BAD_VALUE, "'hex' takes bytes in quotes, such as '0a 05'") from None
+
+
+def _times(node: MappingNode) -> int:
+    times = node.get("times")
+    return _count(times) if times else 1
+
+
+def _count(node: Node) -> int:
+    value = node.value if isinstance(node, ScalarNode) else None
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= _MOST:
+        raise invalid(node.span, Code.BAD_VALUE, f"how often is a whole number from 1 to {_MOST}")
+    return value
+
+
+def _refuse_repeated(named: Sequence[tuple[str, SourceSpan]]) -> None:
+    names = [name for name, _ in named]
+    for index, (name, span) in enumerate(named):
+        if name in names[:index]:
+            hint = f"where it gets the datagram twice, write {{{name}: {{times: 2}}}}"
+            raise invalid(span, Code.BAD_VALUE, f"'{name}' is named twice", hint)
+
+
+def _name(node: Node) -> tuple[str, SourceSpan]:
+    if not isinstance(node, ScalarNode):
+        raise invalid(node.span, Code.WRONG_TYPE, "this must be a name")
+    return node.text, node.span
+
+
+def _listed(node: Node | None) -> Sequence[Node]:
+    """One, or a list of them; of nothing, none."""
+    if node is None:
+        return ()
+    return node.items if isinstance(node, SequenceNode) else (node,)
+
+
+def _is(node: Node, word: str) -> bool:
+    return isinstance(node, ScalarNode) and node.text == word
