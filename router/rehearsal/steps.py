@@ -181,12 +181,7 @@ class Names:
         return self._published[self._known(name, self._published, span, "route that publishes on")]
 
     def subscribed(self, name: str, span: SourceSpan) -> MessageType:
-        topics = {
-            subscription.topic.topic.value: subscription.type
-            for route in self._checked.routes
-            for subscription in route.subscriptions
-        }
-        return topics[self._known(name, topics, span, "route from the topic")]
+        return self._subscribed[self._known(name, self._subscribed, span, "route from the topic")]
 
     def target(self, name: str, span: SourceSpan) -> str:
         """An endpoint or a topic that a route delivers to."""
