@@ -196,6 +196,11 @@ class Names:
         targets = [target for route in self._checked.routes for target in route.targets]
         return {target.topic.topic.value: target.type for target in targets if target.topic and target.type}
 
+    @cached_property
+    def _subscribed(self) -> Mapping[str, MessageType]:
+        subscriptions = [each for route in self._checked.routes for each in route.subscriptions]
+        return {each.topic.topic.value: each.type for each in subscriptions}
+
     def _known(self, name: str, names: Iterable[str], span: SourceSpan, what: str, code: Code = Code.BAD_VALUE) -> str:
         known = list(names)
         if name not in known:
