@@ -81,6 +81,16 @@ def test_packages_import_what_the_table_allows() -> None:
     assert wrong == []
 
 
+def test_no_module_imports_the_tests() -> None:
+    wrong = [
+        where(path, line)
+        for path, tree in MODULES.items()
+        for module, _, line in imports(tree)
+        if module.partition(".")[0] == "tests"
+    ]
+    assert wrong == []
+
+
 def test_pure_packages_touch_no_socket_thread_loop_or_ros() -> None:
     wrong = [
         f"{where(path, line)}: imports {module}"

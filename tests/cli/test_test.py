@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -13,27 +14,39 @@ import pytest
 from router.assets import asset
 from router.cli import BAD_TABLE, BAD_USAGE, OK, main
 from router.cli.test import FAILED
+from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.rehearsal.reading import SCHEMA, read_test_file
+from router.rehearsal.reading import SCHEMA, TestFile, read_test_file
 from router.rehearsal.running import run_tests
 from router.table.schema import table_schema
 from tests.tables import PROTOS, RIG, ROUTES
 
 REPOSITORY = Path(__file__).parents[2]
-TESTS = ROUTES / "rover.test.yaml"
 DEFINITIONS = Definitions()
 
 
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the rover's protos, which are compiled once for all tables in it."""
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "protos").symlink_to(PROTOS)
+    shutil.copytree(ROUTES, folder / "routes")
+    return folder
+
+
 @pytest.fixture
-def rover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def rover(site: Path, unchanged: TestFile, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the rover's table with its tests, to be changed."""
-    folder = tmp_path / "routes"
-    folder.mkdir()
     for name in ("rover.yaml", "rover.test.yaml"):
-        shutil.copy(ROUTES / name, folder)
-    (tmp_path / "protos").symlink_to(PROTOS)
-    monkeypatch.chdir(tmp_path)
-    return folder / "rover.yaml"
+        shutil.copy(ROUTES / name, site / "routes")
+    monkeypatch.chdir(site)
+    monkeypatch.setattr("router.cli.test.Definitions", lambda: DEFINITIONS)
+    return site / "routes" / "rover.yaml"
+
+
+@pytest.fixture(scope="module")
+def unchanged(site: Path) -> TestFile:
+    return read_test_file(site / "routes" / "rover.test.yaml", DEFINITIONS)
 
 
 def change(table: Path, old: str, new: str) -> None:
@@ -88,9 +101,13 @@ def test_the_tests_of_the_rover_pass_and_cover_its_table_completely(
         ("destinations: [basestation]", "destinations: [{endpoint: basestation, max_rate: 10}]"),
     ],
 )
-def test_whatever_is_changed_in_the_table_some_test_notices(rover: Path, old: str, new: str) -> None:
+def test_whatever_is_changed_in_the_table_some_test_notices(
+    rover: Path, unchanged: TestFile, old: str, new: str
+) -> None:
     change(rover, old, new)
-    file = read_test_file(rover.with_name("rover.test.yaml"), DEFINITIONS)
+    checked = check_table(rover, {}, DEFINITIONS)
+    assert checked.program is not None
+    file = replace(unchanged, checked=checked, program=checked.program)
     assert not all(result.passed for result in run_tests(file))
 
 

@@ -66,6 +66,14 @@ def messages(folder: Path, routes: str, tests: str, head: str = HEAD) -> list[st
     return [failure.message for failure in failures(folder, routes, tests, head)]
 
 
+def messages_of(folder: Path, routes: str, tests: dict[str, str]) -> dict[str, list[str]]:
+    """What is said of each test of one file, by its name."""
+    file = written(folder, routes, "".join(f'"{name}": {test}\n' for name, test in tests.items()))
+    results = run_tests(file)
+    assert not any(result.findings for result in results)
+    return {result.test.name: [failure.message for failure in result.failures] for result in results}
+
+
 def findings(folder: Path, routes: str, tests: str) -> list[Diagnostic]:
     with pytest.raises(TableError) as caught:
         written(folder, routes, tests)
@@ -105,44 +113,37 @@ def test_everything_that_happens_is_expected(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("written", ["~1.571", "~1.6", "1.57 +- 0.01", "1.5 ± 0.1", "~157.1e-2", "1.5707963267948966"])
-def test_numbers_may_be_rounded_or_have_a_tolerance(tmp_path: Path, written: str) -> None:
-    raw = f"{{header: any, angular_velocity: {{x: {written}, y: 1}}}}"
-    tests = f"""
-        a:
-          given: {given("{accel_y: 1, gyro_x: 90}")}
-          expect: {{sent: basestation, published: {{imu_data: any, imu/data_raw: {raw}}}}}
-        """
-    assert not failures(tmp_path, IMU, tests)
+def test_numbers_may_be_rounded_or_have_a_tolerance(tmp_path: Path) -> None:
+    within = ["~1.571", "~1.6", "1.57 +- 0.01", "1.5 ± 0.1", "~157.1e-2", "1.5707963267948966"]
+    outside = ["~1.572", "~1.5", "1.58 +- 0.001", "1.57", "nan"]
+    took = given("{accel_y: 1, gyro_x: 90}")
+    tests = {}
+    for number in (*within, *outside):
+        raw = f"{{header: any, angular_velocity: {{x: {number}, y: 1}}}}"
+        published = f"{{imu_data: any, imu/data_raw: {raw}}}"
+        tests[number] = f"{{given: {took}, expect: {{sent: basestation, published: {published}}}}}"
+    said = messages_of(tmp_path, IMU, tests)
+    assert said == {number: [] for number in within} | {
+        number: [f"imu/data_raw: angular_velocity.x is 1.5707963267948966, not {number}"] for number in outside
+    }
 
 
-@pytest.mark.parametrize("written", ["~1.572", "~1.5", "1.58 +- 0.001", "1.57", "nan"])
-def test_a_number_outside_its_tolerance_fails(tmp_path: Path, written: str) -> None:
-    raw = f"{{header: any, angular_velocity: {{x: {written}, y: 1}}}}"
-    tests = f"""
-        a:
-          given: {given("{accel_y: 1, gyro_x: 90}")}
-          expect: {{sent: basestation, published: {{imu_data: any, imu/data_raw: {raw}}}}}
-        """
-    assert messages(tmp_path, IMU, tests) == [
-        f"imu/data_raw: angular_velocity.x is 1.5707963267948966, not {written}",
-    ]
-
-
-@pytest.mark.parametrize(("expected", "differs"), [("nan", False), ("1.5", True), ("inf", True)])
-def test_nan_is_expected_as_what_it_is(tmp_path: Path, expected: str, differs: bool) -> None:
+def test_nan_is_expected_as_what_it_is(tmp_path: Path) -> None:
     routes = """
 imu_info:
   source: sensor_board
   topics: [{topic: field, type: sensor_msgs/msg/FluidPressure, fields: {fluid_pressure: accel_x, variance: nan}}]
 """
-    tests = f"""
-        a:
-          given: {given("{accel_x: nan}")}
-          expect: {{published: {{field: {{fluid_pressure: nan, variance: {expected}}}}}}}
-        """
-    wrong = [f"field: variance is nan, not {expected}"]
-    assert messages(tmp_path, routes, tests) == (wrong if differs else [])
+    took = given("{accel_x: nan}")
+    tests = {
+        variance: f"{{given: {took}, expect: {{published: {{field: {{fluid_pressure: nan, variance: {variance}}}}}}}}}"
+        for variance in ("nan", "1.5", "inf")
+    }
+    assert messages_of(tmp_path, routes, tests) == {
+        "nan": [],
+        "1.5": ["field: variance is nan, not 1.5"],
+        "inf": ["field: variance is nan, not inf"],
+    }
 
 
 def test_float32_is_the_nearest_to_what_is_written(tmp_path: Path) -> None:
@@ -376,33 +377,34 @@ def test_failure_has_its_place_in_test_and_table(tmp_path: Path) -> None:
     assert failure.table.note == "what fills angular_velocity.x"
 
 
-@pytest.mark.parametrize(
-    ("expect", "said"),
-    [
-        (f"{{published: {QUIET}}}", "imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation; it is not expected"),
-        (f"{{sent: [basestation, recorder], published: {QUIET}}}", "nothing for recorder: it was withheld"),
-        (f"{{sent: basestation, filtered: [basestation], published: {QUIET}}}",
-         "withheld from: recorder, not basestation"),
-        (f"{{sent: {{basestation: {{ph_info: {{}}}}}}, published: {QUIET}}}",
-         "imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation, not ph_info"),
-        (f"{{sent: {{basestation: {{times: 2}}}}, published: {QUIET}}}",
-         "1 for basestation, not 2: imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation"),
-        (f"{{sent: {{basestation: {{hex: '00'}}}}, published: {QUIET}}}",
-         "basestation gets the bytes 6a 0a 0d 00 00 00 3f 15 00 00 80 3f, not 00"),
-        (f"{{rejected: malformed, sent: basestation, published: {QUIET}}}", "rejected: nothing, not malformed"),
-        (f"{{dropped: {{imu_data: stale}}, sent: basestation, published: {QUIET}}}",
-         "dropped for imu_data: nothing, not stale"),
-        ("{sent: basestation, published: {imu_data: {accel_x: 0.5}, imu/data_raw: any}}",
-         "imu_data: accel_y is 1, not at its default"),
-        ("{sent: basestation, published: {imu_data: unchanged}}",
-         f"{RAW} is published on imu/data_raw; it is not expected"),
-        (f"{{sent: basestation, published: {{imu_data: unchanged, imu/data_raw: {RAW.replace('0 ms', '5ms')}}}}}",
-         "imu/data_raw: header.stamp is 0 ms, not 5 ms"),
-    ],
-)  # fmt: skip
-def test_what_differs_is_said(tmp_path: Path, expect: str, said: str) -> None:
-    tests = f"a:\n  given: {given('{accel_x: 0.5, accel_y: 1}')}\n  expect: {expect}\n"
-    assert messages(tmp_path, IMU, tests) == [said]
+DIFFERENCES = [
+    (f"{{published: {QUIET}}}", "imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation; it is not expected"),
+    (f"{{sent: [basestation, recorder], published: {QUIET}}}", "nothing for recorder: it was withheld"),
+    (f"{{sent: basestation, filtered: [basestation], published: {QUIET}}}",
+     "withheld from: recorder, not basestation"),
+    (f"{{sent: {{basestation: {{ph_info: {{}}}}}}, published: {QUIET}}}",
+     "imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation, not ph_info"),
+    (f"{{sent: {{basestation: {{times: 2}}}}, published: {QUIET}}}",
+     "1 for basestation, not 2: imu_info {accel_x: 0.5, accel_y: 1} is sent to basestation"),
+    (f"{{sent: {{basestation: {{hex: '00'}}}}, published: {QUIET}}}",
+     "basestation gets the bytes 6a 0a 0d 00 00 00 3f 15 00 00 80 3f, not 00"),
+    (f"{{rejected: malformed, sent: basestation, published: {QUIET}}}", "rejected: nothing, not malformed"),
+    (f"{{dropped: {{imu_data: stale}}, sent: basestation, published: {QUIET}}}",
+     "dropped for imu_data: nothing, not stale"),
+    ("{sent: basestation, published: {imu_data: {accel_x: 0.5}, imu/data_raw: any}}",
+     "imu_data: accel_y is 1, not at its default"),
+    ("{sent: basestation, published: {imu_data: unchanged}}",
+     f"{RAW} is published on imu/data_raw; it is not expected"),
+    (f"{{sent: basestation, published: {{imu_data: unchanged, imu/data_raw: {RAW.replace('0 ms', '5ms')}}}}}",
+     "imu/data_raw: header.stamp is 0 ms, not 5 ms"),
+]  # fmt: skip
+
+
+def test_what_differs_is_said(tmp_path: Path) -> None:
+    took = given("{accel_x: 0.5, accel_y: 1}")
+    tests = {str(number): f"{{given: {took}, expect: {expect}}}" for number, (expect, _) in enumerate(DIFFERENCES)}
+    said = messages_of(tmp_path, IMU, tests)
+    assert said == {str(number): [message] for number, (_, message) in enumerate(DIFFERENCES)}
 
 
 def test_what_is_missing_is_explained_by_its_drop(tmp_path: Path) -> None:
@@ -453,82 +455,85 @@ def test_a_drop_that_is_not_listed_fails_though_the_target_got_others(tmp_path: 
     assert messages(tmp_path, routes, tests) == ["dropped for basestation: rate_limited, not nothing"]
 
 
-@pytest.mark.parametrize("expect", ["nothing", "any"])
-def test_what_happens_between_two_steps_fails(tmp_path: Path, expect: str) -> None:
-    tests = f"""
-        a:
-          steps:
-            - given: {{topic: drive_motor}}
-              expect: any
-            - at: 650ms
-              expect: {expect}
+def test_what_happens_between_two_steps_fails(tmp_path: Path) -> None:
+    tests = """
+        nothing: {steps: [{given: {topic: drive_motor}, expect: any}, {at: 650ms, expect: nothing}]}
+        any: {steps: [{given: {topic: drive_motor}, expect: any}, {at: 650ms, expect: any}]}
         """
-    (failure,) = failures(tmp_path, DRIVE, tests)
-    assert failure.message == (
-        "before this step, at 500 ms manual_brake {brake: true} is sent to driving_board by the deadman of "
-        "drive_motor, and so on, 2 in all; no step expects it"
-    )
-    assert failure.table is not None
-    assert failure.table.note == "sent by this deadman"
+    found = failures(tmp_path, DRIVE, tests)
+    assert len(found) == 2
+    for failure in found:
+        assert failure.message == (
+            "before this step, at 500 ms manual_brake {brake: true} is sent to driving_board by the deadman of "
+            "drive_motor, and so on, 2 in all; no step expects it"
+        )
+        assert failure.table is not None
+        assert failure.table.note == "sent by this deadman"
 
 
 # what is no test
 
 
-@pytest.mark.parametrize(
-    ("test", "code", "said"),
-    [
-        (
-            "{given: {case: imu, from: sensor_board, listener: exact}, expect: nothing}",
-            Code.UNKNOWN_PAYLOAD_CASE,
-            "payload case 'imu'",
-        ),
-        ("{given: {case: imu_info, from: sensor}, expect: nothing}", Code.UNKNOWN_ENDPOINT, "'sensor'"),
-        ("{given: {case: imu_info, from: sensor_board}, expect: nothing}", Code.MISSING_KEY, "say which listener"),
-        ("{given: {case: imu_info, from: sensor_board, listener: x}, expect: nothing}", Code.BAD_VALUE, "listener 'x'"),
-        ("{given: {topic: imu_data}, expect: nothing}", Code.BAD_VALUE, "no route from the topic 'imu_data'"),
-        (f"{{given: {given('{accel: 1}')}, expect: nothing}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
-        (f"{{given: {given('{accel_x: 1e39}')}, expect: nothing}}", Code.BAD_VALUE, "does not fit float32"),
-        (f"{{given: {given('{accel_x: any}')}, expect: nothing}}", Code.BAD_VALUE, "'any' is not a number"),
-        ("{expect: {sent: nobody}}", Code.UNKNOWN_ENDPOINT, "no endpoint 'nobody'"),
-        ("{expect: {sent: driving_board}}", Code.UNKNOWN_ENDPOINT, "no route to the endpoint 'driving_board'"),
-        ("{expect: {sent: basestation}}", Code.BAD_VALUE, "no datagram was given in this step"),
-        ("{expect: {published: {imu: {}}}}", Code.BAD_VALUE, "no route that publishes on 'imu'"),
-        ("{expect: {published: {imu_data: {accel: 1}}}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
-        ("{expect: {published: {imu_data: unchanged}}}", Code.BAD_VALUE, "no fields were given"),
-        ("{expect: {dropped: {basestation: lost}}}", Code.BAD_VALUE, "no reason 'lost'"),
-        ("{expect: {dropped: {nobody: stale}}}", Code.BAD_VALUE, "no route to 'nobody'"),
-        ("{expect: {route: imu}}", Code.BAD_VALUE, "no route 'imu'"),
-        ("{expect: {rejected: no}}", Code.AMBIGUOUS_SCALAR, "truth value"),
-        ("{expect: {rejected: lost}}", Code.BAD_VALUE, "'rejected' must be one of truncated, empty"),
-        ("{expect: {filtered: nobody}}", Code.BAD_VALUE, "no route to 'nobody'"),
-        ("{expects: nothing}", Code.UNKNOWN_KEY, "no key 'expects'"),
-        ("{given: {hex: '00', from: sensor_board, listener: exact}}", Code.MISSING_KEY, "nothing of what is expected"),
-        ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1 s, before the 2 s"),
-        ("{steps: [{expect: nothing}], expect: nothing}", Code.UNKNOWN_KEY, "'expect' stands beside 'steps'"),
-        (
-            f"{{steps: [{{given: {given('{}', ', times: 3, every: 1s')}, until: 1999 ms, expect: any}}]}}",
-            Code.BAD_VALUE,
-            "1.999 s, before the 2 s",
-        ),
-        ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, before the 1 s"),
-        ("{steps: [{stop: true, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "router is stopped"),
-        (f"{{given: {given('{}')}, expect: {{sent: [basestation, basestation]}}}}", Code.BAD_VALUE, "named twice"),
-        ("{expect: {published: {imu_data: {accel_x: 1 +- inf}}}}", Code.BAD_VALUE, "'inf' is no tolerance"),
-        ("{expect: {published: {imu_data: {accel_x: 1 +- -1}}}}", Code.BAD_VALUE, "'-1' is no tolerance"),
-        ("{expect: {published: {imu_data: {accel_x: nan +- 1}}}}", Code.BAD_VALUE, "'nan' is no number to be near"),
-        ("{expect: {published: {imu_data: {accel_x: ~1e400}}}}", Code.BAD_VALUE, "'1e400' is no number to be near"),
-        ("{expect: sent}", Code.BAD_VALUE, "'expect' must be 'nothing', 'any', or a mapping"),
-    ],
-)
-def test_what_is_wrong_with_a_test_is_a_finding_with_its_place(
-    tmp_path: Path, test: str, code: Code, said: str
-) -> None:
-    (found,) = findings(tmp_path, IMU, f"a: {test}\n")
-    assert found.code is code
-    assert said in found.message
-    assert found.span.file.endswith("table.test.yaml")
-    assert found.span.line == 2
+IN_YAML = [
+    ("{expect: {rejected: no}}", Code.AMBIGUOUS_SCALAR, "truth value"),
+]
+IN_SHAPE = [
+    ("{expect: {rejected: lost}}", Code.BAD_VALUE, "'rejected' must be one of truncated, empty"),
+    ("{expects: nothing}", Code.UNKNOWN_KEY, "no key 'expects'"),
+    ("{expect: sent}", Code.BAD_VALUE, "'expect' must be 'nothing', 'any', or a mapping"),
+]
+IN_MEANING = [
+    (
+        "{given: {case: imu, from: sensor_board, listener: exact}, expect: nothing}",
+        Code.UNKNOWN_PAYLOAD_CASE,
+        "payload case 'imu'",
+    ),
+    ("{given: {case: imu_info, from: sensor}, expect: nothing}", Code.UNKNOWN_ENDPOINT, "'sensor'"),
+    ("{given: {case: imu_info, from: sensor_board}, expect: nothing}", Code.MISSING_KEY, "say which listener"),
+    ("{given: {case: imu_info, from: sensor_board, listener: x}, expect: nothing}", Code.BAD_VALUE, "listener 'x'"),
+    ("{given: {topic: imu_data}, expect: nothing}", Code.BAD_VALUE, "no route from the topic 'imu_data'"),
+    (f"{{given: {given('{accel: 1}')}, expect: nothing}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
+    (f"{{given: {given('{accel_x: 1e39}')}, expect: nothing}}", Code.BAD_VALUE, "does not fit float32"),
+    (f"{{given: {given('{accel_x: any}')}, expect: nothing}}", Code.BAD_VALUE, "'any' is not a number"),
+    ("{expect: {sent: nobody}}", Code.UNKNOWN_ENDPOINT, "no endpoint 'nobody'"),
+    ("{expect: {sent: driving_board}}", Code.UNKNOWN_ENDPOINT, "no route to the endpoint 'driving_board'"),
+    ("{expect: {sent: basestation}}", Code.BAD_VALUE, "no datagram was given in this step"),
+    ("{expect: {published: {imu: {}}}}", Code.BAD_VALUE, "no route that publishes on 'imu'"),
+    ("{expect: {published: {imu_data: {accel: 1}}}}", Code.UNKNOWN_FIELD, "has no field 'accel'"),
+    ("{expect: {published: {imu_data: unchanged}}}", Code.BAD_VALUE, "no fields were given"),
+    ("{expect: {dropped: {basestation: lost}}}", Code.BAD_VALUE, "no reason 'lost'"),
+    ("{expect: {dropped: {nobody: stale}}}", Code.BAD_VALUE, "no route to 'nobody'"),
+    ("{expect: {route: imu}}", Code.BAD_VALUE, "no route 'imu'"),
+    ("{expect: {filtered: nobody}}", Code.BAD_VALUE, "no route to 'nobody'"),
+    ("{given: {hex: '00', from: sensor_board, listener: exact}}", Code.MISSING_KEY, "nothing of what is expected"),
+    ("{steps: [{at: 2s, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "1 s, before the 2 s"),
+    ("{steps: [{expect: nothing}], expect: nothing}", Code.UNKNOWN_KEY, "'expect' stands beside 'steps'"),
+    (
+        f"{{steps: [{{given: {given('{}', ', times: 3, every: 1s')}, until: 1999 ms, expect: any}}]}}",
+        Code.BAD_VALUE,
+        "1.999 s, before the 2 s",
+    ),
+    ("{steps: [{until: 1s, expect: any}, {at: 999 ms, expect: any}]}", Code.BAD_VALUE, "999 ms, before the 1 s"),
+    ("{steps: [{stop: true, expect: nothing}, {at: 1s, expect: nothing}]}", Code.BAD_VALUE, "router is stopped"),
+    (f"{{given: {given('{}')}, expect: {{sent: [basestation, basestation]}}}}", Code.BAD_VALUE, "named twice"),
+    ("{expect: {published: {imu_data: {accel_x: 1 +- inf}}}}", Code.BAD_VALUE, "'inf' is no tolerance"),
+    ("{expect: {published: {imu_data: {accel_x: 1 +- -1}}}}", Code.BAD_VALUE, "'-1' is no tolerance"),
+    ("{expect: {published: {imu_data: {accel_x: nan +- 1}}}}", Code.BAD_VALUE, "'nan' is no number to be near"),
+    ("{expect: {published: {imu_data: {accel_x: ~1e400}}}}", Code.BAD_VALUE, "'1e400' is no number to be near"),
+]
+
+
+def test_what_is_wrong_with_a_test_is_a_finding_with_its_place(tmp_path: Path) -> None:
+    for mistakes in (IN_YAML, IN_SHAPE, IN_MEANING):  # where a file has some of one kind, the next is not looked at
+        tests = "".join(f"t{number}: {test}\n" for number, (test, _, _) in enumerate(mistakes))
+        found = findings(tmp_path, IMU, tests)
+        assert len(found) == len(mistakes)
+        for finding in found:
+            _, code, said = mistakes[finding.span.line - 2]
+            assert finding.code is code
+            assert said in finding.message
+            assert finding.span.file.endswith("table.test.yaml")
+        assert {finding.span.line for finding in found} == set(range(2, len(mistakes) + 2))
 
 
 def test_padding_that_is_too_small_is_found_when_the_test_runs(tmp_path: Path) -> None:
@@ -691,8 +696,6 @@ def test_files_of_one_table_cover_it_together(tmp_path: Path) -> None:
     assert covered[0].is_complete
 
 
-@pytest.mark.parametrize(
-    ("ns", "text"), [(0, "0 ms"), (300_000_000, "300 ms"), (1_999_000_000, "1.999 s"), (-250_000_000, "-250 ms")]
-)
-def test_times_are_told_as_a_test_writes_them(ns: int, text: str) -> None:
-    assert offset(ns) == text
+def test_times_are_shown_as_a_test_writes_them() -> None:
+    shown = {0: "0 ms", 300_000_000: "300 ms", 1_999_000_000: "1.999 s", -250_000_000: "-250 ms"}
+    assert {ns: offset(ns) for ns in shown} == shown
