@@ -13,7 +13,7 @@ from rich.text import Text
 from demo.expected import active_routes
 from demo.verdict import Said, arrival_count, topic_count
 from router.table.model import RouteTable
-from router.tools.top import RouteRow, View
+from router.tools.top import Order, RouteRow, View
 from router.tools.top_view import route_table, summary_line
 
 LINE_INTERVAL = 3.0
@@ -90,7 +90,7 @@ class _Terminal:
         legend = Text(style="dim").append("destinations", style="cyan").append(", ").append("ROS topics", style="green")
         legend.append("; on ROS, on UDP: what has really arrived there")
         room = self._console.height - 3 - len(changes)
-        table = route_table(view, room, {"on ROS": on_ros, "on UDP": on_udp})
+        table = route_table(view, Order.DROPS, room, {"on ROS": on_ros, "on UDP": on_udp})
         self._live.update(Group(title, table, *changes, legend), refresh=True)
 
 

@@ -14,10 +14,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from router.errors import RouterError, TableError
+from router.errors import RouterError, TableError, TransportError, UsageError
 from router.ros.environment import ADDRESS_SPACE, address_space
 
 OK = 0
+NETWORK_FAULT = 1
 BAD_USAGE = 2
 BAD_TABLE = 78
 """EX_CONFIG: systemd is told not to restart into it."""
@@ -58,7 +59,7 @@ class _Version(argparse.Action):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; the exit code: 0, 78 for a bad table, 2 for wrong usage."""
+    """Run one verb; the exit code: 0, 78 for a bad table, 2 for wrong usage, 1 for the network."""
     arguments = sys.argv[1:] if argv is None else list(argv)
     _open_what_is_closed()
     for stream in (sys.stdout, sys.stderr):
@@ -131,5 +132,7 @@ def _run(arguments: Sequence[str]) -> int:
         return BAD_TABLE
     except RouterError as error:
         print(f"router {chosen}: {error}", file=sys.stderr)
-        return BAD_TABLE
+        if isinstance(error, UsageError):
+            return BAD_USAGE
+        return NETWORK_FAULT if isinstance(error, TransportError) else BAD_TABLE
     return code

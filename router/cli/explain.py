@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import positive
 from router.compiler import Checked, check_table
@@ -14,7 +14,7 @@ from router.compiler.checked import CheckedRoute
 from router.compiler.link import compile_handlers
 from router.compiler.lookup import Definitions
 from router.compiler.metrics import Counters
-from router.errors import did_you_mean
+from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
 
 _DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides,
@@ -53,9 +53,7 @@ def run(args: argparse.Namespace) -> int:
     known = [*routes, *gateways, *ignored]
     for name in args.names:
         if name not in known:
-            hint = did_you_mean(name, known)
-            print(f"router explain: {args.table} has no route or gateway '{name}'; {hint}", file=sys.stderr)
-            return BAD_USAGE
+            raise UsageError(f"{args.table} has no route or gateway '{name}'; {did_you_mean(name, known)}")
     topics = known_topics(checked.table) if args.live is None else seen_topics(checked.table, args.live)
     for name in args.names or known:
         for route in routes.get(name, ()):

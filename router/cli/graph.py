@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import print_findings
+from router.errors import UsageError
 
 if TYPE_CHECKING:
     from router.table.model import RouteTable
@@ -45,8 +46,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         args.output.write_text(_drawn(checked.table, args.output.suffix), encoding="utf-8")
     except OSError as error:
-        print(f"router graph: {args.output} cannot be written: {error.strerror}", file=sys.stderr)
-        return BAD_USAGE
+        raise UsageError(f"{args.output} cannot be written: {error.strerror}") from error
     return OK
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from router.assets import asset
 from router.cli import OK, VERBS
-from router.cli.tool_options import explained
 from router.errors import UsageError, shown_path
 
 _PARTS = {
@@ -28,7 +27,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("folder", metavar="DIR", nargs="?", type=Path, default=Path(), help="default: where you are")
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     targets = {part: args.folder / part for part in _PARTS}
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import VERBS
-from router.cli.tool_options import explained, whole
+from router.cli.tool_options import say, whole
 from router.errors import TransportError, UsageError
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ def _seconds(text: str) -> float:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     from router.table.model import GatewayFormat
     from router.tools.gateway_client import GatewayClient, topic_filter
@@ -62,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
     form = GatewayFormat(args.format) if args.format else None
     gateway = remote(args.ask) if args.ask else None
     show = _printer(args.json)
-    with _recorder(args.record) as record, closing(open_source(args.place, form, gateway, _say)) as source:
-        _say(f"listening: {source.place}; Ctrl-C ends it")
+    with _recorder(args.record) as record, closing(open_source(args.place, form, gateway, say)) as source:
+        say(f"listening: {source.place}; Ctrl-C ends it")
         rest = args.count
         try:
             for heard in client.hear(source, args.seconds or math.inf):
@@ -76,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             pass
         finally:
-            _say(str(client.tally(source)))
+            say(str(client.tally(source)))
     return 0
 
 
@@ -123,7 +122,3 @@ def _printer(as_json: bool) -> Callable[[Heard], None]:
         console.print(line, no_wrap=True, overflow="ellipsis", crop=True)
 
     return show
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import print_findings
-from router.cli.tool_options import explained
 
 if TYPE_CHECKING:
     from router.compiler import Checked
@@ -38,7 +37,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     from router.assets import asset, is_installed
     from router.errors import UsageError

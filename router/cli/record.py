@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import OK, VERBS
-from router.cli.tool_options import add_router_options, explained, progress, running_url
+from router.cli.tool_options import add_router_options, progress, running_url
 from router.errors import UsageError
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--last", action="store_true", help="have the router save what it has kept in memory instead")
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     if args.last and args.output:
         raise UsageError("--last writes to the directory of the table's 'record', on the router's computer; leave -o")

@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
-from router.cli.tool_options import add_router_options, explained, running_url
+from router.cli.tool_options import add_router_options, running_url
 
 PATIENCE = 60.0
 """Seconds; a large table takes one to compile where there is much traffic."""
@@ -25,7 +25,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_router_options(parser)
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     from router.tools.running_router import post
 

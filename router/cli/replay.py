@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import DEFAULT_TABLE, OK, VERBS
-from router.cli.tool_options import explained, progress
+from router.cli.tool_options import progress
 from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
@@ -53,7 +53,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--against", type=Path, metavar="NEW", help="compare TABLE with this table instead")
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     from router.recording.reader import Recording
 

@@ -20,7 +20,7 @@ from router.app.process import supervised
 from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import is_coloured, print_findings
 from router.compiler import check_table
-from router.errors import StartError
+from router.errors import StartError, UsageError
 from router.log import LEVELS as LOG_LEVELS
 from router.log import configure_log
 
@@ -60,8 +60,7 @@ def run(args: argparse.Namespace) -> int:
     parameters = ros_parameters(args.ros_args)
     named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE
     if args.table and named and args.table.resolve() != Path(named).resolve():
-        print(f"router run: TABLE is {args.table}, {_ROUTES_PATH} is {named}; name one table", file=sys.stderr)
-        return BAD_USAGE
+        raise UsageError(f"TABLE is {args.table}, {_ROUTES_PATH} is {named}; name one table")
     table = args.table or Path(named or DEFAULT_TABLE)
     environ = {**os.environ, **table_variables(parameters)}
     checked = check_table(table, environ)

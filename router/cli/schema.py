@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from router.assets import asset, is_installed
 from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
 from router.cli.findings import plural, print_findings
-from router.cli.tool_options import explained
 from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, shown_path
 from router.table import load_table
 from router.table.model import EnvelopeSettings
@@ -44,7 +43,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     lock.add_argument("--accept", action="append", default=[], metavar="NAME", help=_ACCEPT)
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     """Raises TableError for broken `.proto` files and a broken lock file."""
     from router.types.lock import LockComparison

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from router.cli import VERBS
-from router.cli.tool_options import add_wire_options, explained, load_wire, positive, whole
+from router.cli.tool_options import add_wire_options, load_wire, positive, whole
 
 if TYPE_CHECKING:
     from router.table.addresses import Address
@@ -42,7 +42,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_wire_options(parser)
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     from router.engine.wire import framed
     from router.tools import udp

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import VERBS
-from router.cli.tool_options import explained, positive
+from router.cli.tool_options import positive
 from router.errors import TableError
 
 if TYPE_CHECKING:
@@ -53,7 +53,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--json", action="store_true", help="statistics as JSON lines, the last one final")
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     from router.compiler import check_table
     from router.engine.wire import Wire

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from router.cli import VERBS
-from router.cli.tool_options import add_url_option, add_wire_options, explained, load_wire, running_url, whole
+from router.cli.tool_options import add_url_option, add_wire_options, load_wire, running_url, say, whole
 from router.errors import StartError, UsageError, nearest
 from router.ros.environment import check_environment, ros_remedy
 
@@ -70,7 +69,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_wire_options(parser)
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     if args.type and not args.topic:
         raise UsageError("--type belongs to --topic")
@@ -128,14 +126,14 @@ def _running(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> 
     wanted = args.words or (sorted(condition.cases) if condition else [])
     # The router goes before whatever runs on its computer to watch it.
     with background_threads(), tap(url, wanted, args.sources) as batches:
-        _say(f"tapping the router at {url}; Ctrl-C ends it")
+        say(f"tapping the router at {url}; Ctrl-C ends it")
         try:
             _print(taken.take(batches), args)
         finally:
             if taken.missed:
-                _say(f"{taken.missed} datagrams were too many for this terminal; the router routed them all the same")
+                say(f"{taken.missed} datagrams were too many for this terminal; the router routed them all the same")
             if condition is not None and condition.failure:
-                _say(f"where --where fails nothing is shown: {condition.failure}")
+                say(f"where --where fails nothing is shown: {condition.failure}")
 
 
 @contextmanager
@@ -146,7 +144,7 @@ def _port(args: argparse.Namespace, wire: Wire, table: RouteTable | None) -> Ite
     place = args.words[0]
     with udp.open_udp(udp.listening(place, table), place) as receiver:
         host, port = receiver.getsockname()
-        _say(f"listening on {host}:{port}; Ctrl-C ends it")
+        say(f"listening on {host}:{port}; Ctrl-C ends it")
         yield listen(receiver, wire, udp.peer_names(table))
 
 
@@ -162,15 +160,11 @@ def _topic(args: argparse.Namespace) -> Iterator[Iterator[TappedMessage]]:
     from router.tools.tap import listen_to_topic
 
     if args.type is None:
-        _say(f"waiting for a publisher of {args.topic}; Ctrl-C ends it")
+        say(f"waiting for a publisher of {args.topic}; Ctrl-C ends it")
     try:
         listener = TopicListener(args.topic, args.type)
     except StartError as error:
         raise UsageError(str(error)) from error
     with closing(listener):
-        _say(f"listening to {args.topic} of {listener.type_name}; Ctrl-C ends it")
+        say(f"listening to {args.topic} of {listener.type_name}; Ctrl-C ends it")
         yield listen_to_topic(listener)
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

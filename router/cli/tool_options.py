@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -11,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
-from router.cli import BAD_USAGE, DEFAULT_TABLE
-from router.errors import TransportError, UsageError
+from router.cli import DEFAULT_TABLE
+from router.errors import UsageError
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
@@ -62,18 +61,9 @@ def running_url(args: argparse.Namespace) -> str:
     return url_of(table)
 
 
-def explained(run: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
-    """Decorate a verb to print errors as one line: exit code 2 for usage, 1 for the network."""
-
-    @functools.wraps(run)
-    def explained_run(args: argparse.Namespace) -> int:
-        try:
-            return run(args)
-        except (UsageError, TransportError) as error:
-            print(f"router {args.verb}: {error}", file=sys.stderr)
-            return BAD_USAGE if isinstance(error, UsageError) else 1
-
-    return explained_run
+def say(line: str) -> None:
+    """Print a line for whoever started the verb; stdout is for what it shows."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def positive(text: str) -> float:

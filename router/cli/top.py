@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 from router.cli import OK, VERBS
-from router.cli.tool_options import add_router_options, explained, positive, running_url
+from router.cli.tool_options import add_router_options, positive, running_url
 from router.errors import TransportError
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--once", action="store_true", help="show it once and end, as where there is no terminal")
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     from router.tools.top import Order
 
@@ -80,12 +79,12 @@ def _show(url: str, order: Order, interval: float) -> None:
     from rich.live import Live
 
     from router.tools.top import Order, Window, view
-    from router.tools.top_view import Keys, screen
+    from router.tools.top_view import keys, screen
 
     console, orders = Console(), {each.key: each for each in Order}
     window, note = Window(), ""
     window.add(_snapshot(url))
-    with Live(console=console, screen=True, auto_refresh=False) as live, Keys() as keys:
+    with Live(console=console, screen=True, auto_refresh=False) as live, keys() as wait_for_key:
         key, due = "", 0.0
         while key != "q":
             if time.monotonic() >= due:
@@ -102,7 +101,7 @@ def _show(url: str, order: Order, interval: float) -> None:
             shown = view(*window.ends, time.time())
             live.update(screen(shown, f"router top {url}", order, console.height, note), refresh=True)
             try:
-                key = keys.wait(max(due - time.monotonic(), 0.0))
+                key = wait_for_key(max(due - time.monotonic(), 0.0))
             except KeyboardInterrupt:
                 return
             order = orders.get(key, order)

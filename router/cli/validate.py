@@ -10,7 +10,6 @@ from pathlib import Path
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
 from router.cli.findings import FORMATS, count_line, print_findings, severity
-from router.cli.tool_options import explained
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, Severity, UsageError, shown_path
@@ -29,7 +28,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--strict", action="store_true", help="take warnings for errors")
 
 
-@explained
 def run(args: argparse.Namespace) -> int:
     tables = find_tables(args.paths or [DEFAULT])
     findings: dict[Diagnostic, None] = {}  # tables that extend the same one share its findings

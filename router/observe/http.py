@@ -27,9 +27,10 @@ from email.message import Message
 from enum import IntEnum
 from functools import partial
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from io import BytesIO
 from pathlib import Path
+from socketserver import ThreadingTCPServer
 from time import monotonic, sleep
 from typing import Any
 from urllib.parse import parse_qs
@@ -95,7 +96,7 @@ class HttpServer:
             ) from error
         self._thread = threading.Thread(target=self._server.serve_forever, name="http", daemon=True)
         self._thread.start()
-        self.address = Address(address.host, self._server.server_port)
+        self.address = Address(*self._server.socket.getsockname())
 
     def close(self) -> None:
         # The server looks every half second whether it is to stop, and whenever its socket stirs.
@@ -107,9 +108,10 @@ class HttpServer:
         self._status.close()
 
 
-class _Server(ThreadingHTTPServer):
+class _Server(ThreadingTCPServer):
     """A thread for each connection that is admitted; others are closed at once."""
 
+    allow_reuse_address = True
     daemon_threads = True
     block_on_close = False
     request_queue_size = 256
@@ -117,13 +119,6 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, address: Address, responder: Responder) -> None:
         self.connections = Connections()
         super().__init__(address, partial(_Handler, responder, self.connections))
-
-    def server_bind(self) -> None:
-        """As HTTPServer does, but without asking the network for this computer's name."""
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self.socket.bind(self.server_address)
-        self.server_address = self.socket.getsockname()
-        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         is_own = is_own_computer(client_address[0], request.getsockname()[0])

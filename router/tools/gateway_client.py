@@ -20,10 +20,6 @@ ASK_AGAIN = 1.0
 """Seconds after which schemas are asked for again."""
 
 
-_MOST_SHAPES = 10_000
-"""Schemas that are remembered; senders may be forged."""
-
-
 @dataclass(slots=True)
 class Tally:
     """Counts. `early` messages came before their schema, `unwanted` ones are of other topics."""
@@ -69,7 +65,7 @@ class GatewayClient:
                 yield from self.take(arrival)
 
     def take(self, arrival: Arrival) -> Iterator[Heard]:
-        """Decode one arrival; `now` in monotonic ns."""
+        """Decode one arrival."""
         try:
             packets = unbatched(arrival.data)
         except PacketError as error:
@@ -101,9 +97,6 @@ class GatewayClient:
 
     def _schema(self, schema: Schema, sender: Hashable) -> Iterator[Schema]:
         self._tally.schemas += 1
-        if len(self._shapes) >= _MOST_SHAPES:
-            self._shapes.clear()
-            self._held.clear()
         self._shapes[sender, schema.type_name] = schema.shape
         if self._wants(schema.topic):
             yield schema

@@ -167,12 +167,7 @@ RATES: Mapping[str, float] = {
 """Usual rate of a payload case on the rover, Hz."""
 
 USUAL_RATE = 2.0
-
-
-def usual_rate(case: str) -> float:
-    """Hz, also of a payload case that RATES lacks."""
-    return RATES.get(case, USUAL_RATE)
-
+"""Of a payload case that RATES lacks."""
 
 NESTING = 3
 """Depth to which recursive messages are filled."""

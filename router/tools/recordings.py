@@ -144,11 +144,7 @@ class Replayer:
             self._sockets[key] = self._open(found)
         sender = self._sockets[key]
         try:
-            try:
-                sender.send(found.data)
-            except ConnectionRefusedError:  # the answer to an earlier datagram; this one was not sent
-                self.resent.refused += 1
-                sender.send(found.data)
+            self.resent.refused += udp.send_once(sender, found.data)
         except OSError as error:
             raise TransportError(f"cannot send to {Address(*sender.getpeername())}: {error.strerror}") from error
         self.resent.datagrams += 1

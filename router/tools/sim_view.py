@@ -63,7 +63,7 @@ class SimView:
     def headline(self) -> str:
         """What went out and what was received, in one line."""
         statistics = self._statistics
-        sent = sum(statistics.sent.values())
+        sent = sum(cases.total() for cases in statistics.sent.values())
         received = sum(arrivals.count for _, arrivals in self._arrivals())
         line = f"{self._seconds:.0f} s: sent {sent}, received {received}"
         if not received and self._seconds > PATIENCE:
@@ -141,7 +141,7 @@ class SimView:
         return {
             "seconds": round(seconds, 3),
             "final": final,
-            "sent": _nested(self._statistics.sent),
+            "sent": self._statistics.sent,
             "unsent": self._statistics.unsent,
             "received": received,
             "undecodable": {name: inbox.undecodable for name, inbox in inboxes.items() if inbox.undecodable},
@@ -159,10 +159,3 @@ class SimView:
                 for change in self._statistics.changes
             ],
         }
-
-
-def _nested(counts: dict[Key, int]) -> dict[str, dict[str, int]]:
-    nested: dict[str, dict[str, int]] = defaultdict(dict)
-    for (first, second), count in counts.items():
-        nested[first][second] = count
-    return nested

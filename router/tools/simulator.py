@@ -11,7 +11,7 @@ import re
 import selectors
 import socket
 import time
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -22,7 +22,7 @@ from router.table.addresses import Address
 from router.table.model import ANY, Endpoint, RouteTable
 from router.table.units import LARGEST_DATAGRAM
 from router.tools.board import Change, Inbox, boards
-from router.tools.payloads import PayloadModel, pose, usual_rate
+from router.tools.payloads import RATES, USUAL_RATE, PayloadModel, pose
 from router.tools.udp import LOOPBACK, listener_address, open_udp
 from router.types.protobuf import PayloadCase
 
@@ -77,7 +77,7 @@ def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iter
         if route.is_outbound:
             continue
         case = wire.case(route.case.value)
-        rate = usual_rate(case.name) * rate_scale
+        rate = RATES.get(case.name, USUAL_RATE) * rate_scale
         for source in route.sources:
             sender = STRANGER if source.value == ANY else source.value
             if sender != STRANGER and sender not in table.endpoints:
@@ -102,12 +102,12 @@ MOST_CHANGES = 100
 
 @dataclass(slots=True)
 class Statistics:
-    """Counts since the start. `sent` is by endpoint and payload case, `inboxes` by endpoint.
+    """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
 
     `unsent` are datagrams that the kernel refused to take. `changes` are those of the boards, the newest last.
     """
 
-    sent: dict[tuple[str, str], int] = field(default_factory=lambda: defaultdict(int))
+    sent: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     unsent: int = 0
     inboxes: dict[str, Inbox] = field(default_factory=dict)
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=MOST_CHANGES))
@@ -233,7 +233,7 @@ class Simulator:
         except OSError:
             self.statistics.unsent += 1
         else:
-            self.statistics.sent[stream.endpoint, stream.case.name] += 1
+            self.statistics.sent[stream.endpoint][stream.case.name] += 1
 
     def _receive(self, receiver: socket.socket, inbox: Inbox, now: float) -> None:
         for _ in range(DRAIN):

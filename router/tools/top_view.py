@@ -10,9 +10,8 @@ import termios
 import time
 import tty
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from types import TracebackType
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -30,46 +29,47 @@ _HEAD = 4
 """Lines above the routes and the one below them."""
 
 
-class Keys:
-    """Until the context ends, keys come without Enter and are not echoed. Without a terminal there are none."""
+@contextmanager
+def keys() -> Iterator[Callable[[float], str]]:
+    """Yield a function that waits for a key, at most so many seconds, and returns it or "".
 
-    def __init__(self) -> None:
-        self._terminal = sys.stdin.fileno() if sys.stdin.isatty() else None
-        self._before = termios.tcgetattr(self._terminal) if self._terminal is not None else None
+    Until the context ends, keys come without Enter and are not echoed. Without a terminal there are none.
+    """
+    if not sys.stdin.isatty():
+        yield _sleep
+        return
+    terminal = sys.stdin.fileno()
 
-    def __enter__(self) -> Keys:
-        if self._terminal is not None:
-            tty.setcbreak(self._terminal)
-        return self
+    def wait(seconds: float) -> str:
+        ready, _, _ = select.select([terminal], [], [], seconds)
+        return os.read(terminal, 1).decode(errors="replace") if ready else ""
 
-    def wait(self, seconds: float) -> str:
-        """Return the next key, or nothing when none came in that time."""
-        if self._terminal is None:
-            time.sleep(seconds)
-            return ""
-        ready, _, _ = select.select([self._terminal], [], [], seconds)
-        return os.read(self._terminal, 1).decode(errors="replace") if ready else ""
+    before = termios.tcgetattr(terminal)
+    tty.setcbreak(terminal)
+    try:
+        yield wait
+    finally:
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._terminal is not None and self._before is not None:
-            termios.tcsetattr(self._terminal, termios.TCSADRAIN, self._before)
+
+def _sleep(seconds: float) -> str:
+    time.sleep(seconds)
+    return ""
 
 
 def screen(view: View, title: str, order: Order, height: int, note: str = "") -> RenderableType:
     """At most `height` lines. `note` says what went wrong when the router was last asked."""
-    keys = ", ".join(f"{each.key} {each.value}" for each in Order)
-    foot = Text(f"sorted by {order.value}; keys: {keys}, q quit", style="dim", no_wrap=True, overflow="ellipsis")
+    hints = ", ".join(f"{each.key} {each.value}" for each in Order)
+    foot = Text(f"sorted by {order.value}; keys: {hints}, q quit", style="dim", no_wrap=True, overflow="ellipsis")
     head = Text(title, style="bold", no_wrap=True, overflow="ellipsis")
     if note:
         head.append(f"  {note}", style="bold red")
-    return Group(head, *_summary(view), _routes(view, order, height - _HEAD), foot)
+    return Group(head, *_summary(view), route_table(view, order, height - _HEAD, _TIMES), foot)
 
 
 def page(view: View, order: Order) -> RenderableType:
     """All of it, to be printed once."""
-    return Group(*_summary(view), _routes(view, order, len(view.routes) + 1))
+    return Group(*_summary(view), route_table(view, order, len(view.routes) + 1, _TIMES))
 
 
 def _summary(view: View) -> list[Text]:
@@ -84,20 +84,8 @@ def _summary(view: View) -> list[Text]:
     return [Text(summary_line(view), no_wrap=True, overflow="ellipsis"), about]
 
 
-def _routes(view: View, order: Order, height: int) -> RenderableType:
-    """The first rows in this order. What does not fit is counted in the last line."""
-    room = height - 1
-    rows = ordered(view.routes, order)
-    shown = rows if len(rows) <= room else rows[: max(room - 1, 0)]
-    table = route_table(replace(view, routes=shown), len(shown) + 1, _TIMES)
-    if len(shown) < len(rows):
-        table.add_row(Text(f"and {len(rows) - len(shown)} more", style="dim"))
-    return table
-
-
-def route_table(view: View, height: int, columns: Mapping[str, Column] | None = None) -> Table:
-    """At most `height` lines, those with losses first where not all fit; the last line counts the others."""
-    columns = columns or {}
+def route_table(view: View, order: Order, height: int, columns: Mapping[str, Column]) -> Table:
+    """At most `height` lines with the first routes in this order; the last line counts the others."""
     table = Table(box=None, pad_edge=False, expand=True, header_style="bold")
     table.add_column("route", no_wrap=True)
     table.add_column("in/s", justify="right", no_wrap=True)
@@ -105,16 +93,14 @@ def route_table(view: View, height: int, columns: Mapping[str, Column] | None = 
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("drops", no_wrap=True, overflow="ellipsis")
-    room = height - 1
-    shown = list(view.routes)
-    if len(shown) > room:
-        shown = sorted(shown, key=lambda row: (not row.lost, -row.rate))[: max(room - 1, 0)]
+    rows, room = ordered(view.routes, order), height - 1
+    shown = rows if len(rows) <= room else rows[: max(room - 1, 0)]
     for row in shown:
         rate = Text(rate_text(row.rate), style="" if row.rate else "dim")
         drops = Text(reasons_text(row.dropped) or "-", style="red" if row.lost else "dim")
         table.add_row(row.route, rate, _targets_cell(row), *(column(row) for column in columns.values()), drops)
-    if len(shown) < len(view.routes):
-        table.add_row(Text(f"and {len(view.routes) - len(shown)} more", style="dim"))
+    if len(shown) < len(rows):
+        table.add_row(Text(f"and {len(rows) - len(shown)} more", style="dim"))
     return table
 
 

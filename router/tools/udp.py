@@ -175,7 +175,7 @@ def send(sender: socket.socket, to: Address, data: bytes, count: int | None, rat
         sender.setblocking(True)
         sender.connect(to)
         for elapsed in paced(count, rate):
-            _send_one(sender, data, sent)
+            sent.refused += send_once(sender, data)
             sent.count += 1
             sent.seconds = elapsed
     except OSError as error:
@@ -184,10 +184,11 @@ def send(sender: socket.socket, to: Address, data: bytes, count: int | None, rat
         sent.refused += 1
 
 
-def _send_one(sender: socket.socket, data: bytes, sent: Sent) -> None:
-    """A connected socket reports the refusal of an earlier datagram in place of sending this one."""
+def send_once(sender: socket.socket, data: bytes) -> int:
+    """Send on a connected socket. Return 1 if an earlier datagram was refused, which it reports instead of sending."""
     try:
         sender.send(data)
     except ConnectionRefusedError:
-        sent.refused += 1
         sender.send(data)
+        return 1
+    return 0

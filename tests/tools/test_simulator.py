@@ -103,7 +103,7 @@ def test_an_endpoint_with_a_source_port_sends_from_it(wire: Wire, table_path: Ca
     assert station.source_port is not None
     router = open_udp(reachable(table.listeners["rover"].address.value), "router")
     with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
-        simulate(simulator, lambda: simulator.statistics.sent["station", "plain"] > 0)
+        simulate(simulator, lambda: simulator.statistics.sent["station"]["plain"] > 0)
         peers = set()
         while ("127.0.6.10", station.source_port.value) not in peers:
             peers.add(router.recvfrom(2000)[1])
@@ -127,8 +127,8 @@ def test_rates_and_offsets_follow_from_seed_and_scale(wire: Wire, table: RouteTa
 def test_a_silent_endpoint_sends_nothing_and_others_go_on(wire: Wire, table: RouteTable) -> None:
     silences = [Silence("station", 0.0, math.inf)]
     with closing(Simulator(wire, table, seed=1, rate_scale=FAST, silences=silences)) as simulator:
-        simulate(simulator, lambda: simulator.statistics.sent["board", "every_kind"] > 5)
-        assert simulator.statistics.sent["station", "plain"] == 0
+        simulate(simulator, lambda: simulator.statistics.sent["board"]["every_kind"] > 5)
+        assert simulator.statistics.sent["station"]["plain"] == 0
 
 
 def test_a_silence_of_nobody_is_named(wire: Wire, table: RouteTable) -> None:
@@ -202,7 +202,7 @@ def some_statistics(wire: Wire) -> Statistics:
     statistics = Statistics()
     board = Board("board", {"plain"}, [], statistics.changes.append)
     statistics.inboxes = {"station": Inbox(wire, None), "board": Inbox(wire, board)}
-    statistics.sent["board", "every_kind"] = 7
+    statistics.sent["board"]["every_kind"] = 7
     message = wire.case("every_kind").message_class(i32=5)
     statistics.inboxes["station"].arrivals["every_kind"] = Arrivals(message, at=1.5, count=4)
     statistics.inboxes["board"].arrivals["plain"] = Arrivals(wire.case("plain").message_class(value=1.5), 2.0, 2)
