@@ -6,6 +6,7 @@ A message here is anything with its fields as attributes: a protobuf message, or
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +16,16 @@ from google.protobuf.message import Message
 
 from router.compiler.expressions.functions import NS_PER_SECOND
 from router.compiler.namespace import entries
-from router.errors import SourceSpan
+from router.errors import Code, Diagnostic, SourceSpan, UsageError, did_you_mean
 from router.rehearsal.rehearsal import START
-from router.table.units import duration
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
+from router.table.reading import InvalidValueError
+from router.table.units import duration, parse_duration
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
-from router.values import scalar_text
+from router.values import parse, scalar_text
 
+ANY = "any"
+RECEIVED_AT = "received_at"
 TIMES = frozenset({"builtin_interfaces/msg/Time", "google.protobuf.Timestamp"})
 
 Path = tuple[Union[str, int], ...]
@@ -126,6 +131,139 @@ class Elements:
 FieldValue = Union[AnyValue, Scalar, Time, Fields, Elements]
 
 
+def invalid(span: SourceSpan, code: Code, message: str, hint: str = "") -> InvalidValueError:
+    return InvalidValueError(Diagnostic(span, code, message, hint))
+
+
+# Reading them
+
+
+_ROUGHLY = re.compile(r"~ ?([-+]?[0-9]+(?:\.([0-9]*))?(?:[eE]([-+]?[0-9]+))?)")
+_WITHIN = re.compile(r"(\S+) *(?:\+-|\+/-|±) *(\S+)")
+
+
+class FieldReader:
+    """Reads the fields of messages. With `exact`, as for what is given, there is no `any` and no tolerance.
+
+    `constants` are the numbers of enum values by name; several where enums share a name. `any` is that word without
+    quotes; with them it is text. What does not fit a type raises InvalidValueError at its place.
+    """
+
+    def __init__(self, constants: Mapping[str, set[int]], *, exact: bool) -> None:
+        self._constants = constants
+        self._exact = exact
+
+    def message(self, kind: MessageType, node: Node) -> Fields:
+        if not isinstance(node, MappingNode):
+            raise invalid(node.span, Code.WRONG_TYPE, f"{kind} is a message: write its fields, {{name: value}}")
+        members: dict[str, FieldValue] = {}
+        for path, entry in node.entries.items():
+            self._put(members, kind, path, entry)
+        return Fields(kind, members, node.span)
+
+    def _put(self, members: dict[str, FieldValue], kind: MessageType, path: str, entry: Entry) -> None:
+        """Add the value of a path such as `header.stamp` to the members of a message."""
+        span = entry.key.span
+        name, dot, rest = path.partition(".")
+        field = kind.field(name)
+        if field is None:
+            hint = did_you_mean(name, [member.name for member in kind.fields])
+            raise invalid(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
+        if dot and not isinstance(field.type, MessageType):
+            raise invalid(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields")
+        inner = members.get(name)
+        if inner is not None and not (dot and isinstance(inner, Fields)):
+            raise invalid(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
+        if dot and isinstance(field.type, MessageType):
+            below = dict(inner.members) if isinstance(inner, Fields) else {}
+            self._put(below, field.type, rest, entry)
+            members[name] = Fields(field.type, below, span)
+        else:
+            members[name] = self._value(field.type, entry.value, kind)
+
+    def _value(self, kind: Type, node: Node, holder: MessageType) -> FieldValue:
+        if not self._exact and isinstance(node, ScalarNode) and node.text == ANY and node.place.is_whole_line:
+            return AnyValue(node.span)
+        match kind, node:
+            case MessageType(), ScalarNode() if kind.name in TIMES:
+                return Time(kind, _offset(node), node.span)
+            case MessageType(fields=(only,)), ScalarNode():  # as a table fills it
+                return Fields(kind, {only.name: self._value(only.type, node, kind)}, node.span)
+            case MessageType(), _:
+                return self.message(kind, node)
+            case List(), SequenceNode():
+                if kind.length is not None and len(node.items) != kind.length:
+                    message = f"{kind} has {kind.length} elements, not {len(node.items)}"
+                    raise invalid(node.span, Code.TYPE_MISMATCH, message)
+                return Elements(tuple(self._value(kind.element, item, holder) for item in node.items), node.span)
+            case List(), _:
+                raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
+            case _, ScalarNode():
+                return self._scalar(kind, node, holder)
+        raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} takes one value")
+
+    def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Scalar:
+        text = node.text
+        if isinstance(kind, (Int, Float)) and not self._exact and (near := _near(text, node.span)):
+            return near
+        if isinstance(kind, Int) and (number := self._constant(text, holder, node.span)) is not None:
+            text = str(number)
+        if isinstance(kind, Bytes):
+            text = text.replace(" ", "")
+        try:
+            return Scalar(parse(kind, text, ""), node.span)
+        except UsageError as error:
+            raise invalid(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
+
+    def _constant(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
+        """The value of a ROS constant of the message, or of a protobuf enum: `STATUS_FIX`, `GPSFixQuality.RTK_FIX`."""
+        found = holder.constants.get(text.removeprefix(f"{holder.short_name}."))
+        if isinstance(found, int):
+            return found
+        numbers = self._constants.get(text, set())
+        if len(numbers) > 1:
+            message = f"several enums have a value '{text}', with different numbers"
+            raise invalid(span, Code.BAD_VALUE, message, f"say of which enum, as in State.{text}")
+        return next(iter(numbers), None)
+
+
+def _near(text: str, span: SourceSpan) -> Scalar | None:
+    """`~1.571` is what rounds to that, `1.57 +- 0.01` what is that near."""
+    if found := _ROUGHLY.fullmatch(text):
+        value = _finite(found[1], "number to be near", span)
+        digits = len(found[2] or "") - int(found[3] or 0)
+        return Scalar(value, span, float(f"0.5e{-digits}"), text)
+    if found := _WITHIN.fullmatch(text):
+        value = _finite(found[1], "number to be near", span)
+        tolerance = _finite(found[2], "tolerance", span)
+        if tolerance < 0:
+            raise invalid(span, Code.BAD_VALUE, f"'{found[2]}' is no tolerance, which is not negative")
+        return Scalar(value, span, tolerance, text)
+    return None
+
+
+def _finite(text: str, what: str, span: SourceSpan) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise invalid(span, Code.BAD_VALUE, f"'{text}' is no {what}", "write a number, as in 1.57 +- 0.01")
+    return value
+
+
+def _offset(node: ScalarNode) -> int | None:
+    if node.text == RECEIVED_AT:
+        return None
+    if node.value == 0:
+        return 0
+    try:
+        return parse_duration(node.text)
+    except ValueError as error:
+        hint = f"a time is '{RECEIVED_AT}', or so long after the beginning of the test, such as 300ms"
+        raise invalid(node.span, Code.BAD_VALUE, str(error), hint) from error
+
+
 # Messages made of what a test gives
 
 
@@ -148,10 +286,10 @@ def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
     match value:
         case Fields():
             given = {name: _plain(member, now, complete=complete) for name, member in value.members.items()}
-            return {**default_of(value.type), **given} if complete else given
+            return {**_default_of(value.type), **given} if complete else given
         case Elements(items=(Fields(type=MessageType(is_map_entry=True, fields=(key, member))), *_)):
-            absent = {} if isinstance(member.type, MessageType) else default_of(member.type)
-            empty = {"key": default_of(key.type), "value": absent}
+            absent = {} if isinstance(member.type, MessageType) else _default_of(member.type)
+            empty = {"key": _default_of(key.type), "value": absent}
             entries_given = (empty | _plain(entry, now, complete=False) for entry in value.items)
             return {entry["key"]: entry["value"] for entry in entries_given}
         case Elements():
@@ -164,15 +302,15 @@ def _plain(value: FieldValue, now: int, *, complete: bool) -> Any:
     raise AssertionError(f"{value} cannot be given")
 
 
-def default_of(kind: Type, default: object = None) -> Any:
+def _default_of(kind: Type, default: object = None) -> Any:
     """The value of a field that nothing fills; of a message its values by name. `default` is the declared one."""
     if default is not None:
         return default
     match kind:
         case MessageType():
-            return {field.name: default_of(field.type, field.default) for field in kind.fields}
+            return {field.name: _default_of(field.type, field.default) for field in kind.fields}
         case List():
-            return [default_of(kind.element) for _ in range(kind.length or 0)]
+            return [_default_of(kind.element) for _ in range(kind.length or 0)]
         case String():
             return ""
         case Bytes():
@@ -188,7 +326,7 @@ def default_of(kind: Type, default: object = None) -> Any:
 def _is_unset(holder: Any, field: Field, value: Any) -> bool:
     if isinstance(holder, Message) and (field.has_presence or isinstance(field.type, MessageType)):
         return not holder.HasField(field.name)
-    return _is_default(field.type, value, default_of(field.type, field.default))
+    return _is_default(field.type, value, _default_of(field.type, field.default))
 
 
 def _is_default(kind: Type, value: Any, default: Any) -> bool:

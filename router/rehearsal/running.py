@@ -10,10 +10,10 @@ from router.errors import Code, Diagnostic, UsageError
 from router.rehearsal import cdr
 from router.rehearsal.comparing import Comparison, Failure, Outcome
 from router.rehearsal.coverage import Coverage
-from router.rehearsal.fields import protobuf_message, ros_values
+from router.rehearsal.fields import invalid, protobuf_message, ros_values
 from router.rehearsal.reading import TableTest, TestFile
 from router.rehearsal.rehearsal import START, Rehearsal
-from router.rehearsal.steps import Given, Step, invalid
+from router.rehearsal.steps import Given, Step
 from router.table.reading import InvalidValueError
 
 

@@ -5,8 +5,6 @@ Every name has to be one of the table under test. What is not raises InvalidValu
 
 from __future__ import annotations
 
-import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,19 +14,16 @@ from router.compiler import Checked
 from router.compiler.metrics import DROP_REASONS, REJECT_REASONS
 from router.compiler.program import Program
 from router.engine.dispatch import Peer
-from router.errors import Code, Diagnostic, Located, SourceSpan, UsageError, did_you_mean
-from router.rehearsal.fields import TIMES, AnyValue, Elements, Fields, FieldValue, Scalar, Time
+from router.errors import Code, Located, SourceSpan, did_you_mean
+from router.rehearsal.fields import ANY, FieldReader, Fields, invalid
 from router.table.addresses import BadAddressError, parse_address
-from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
-from router.table.reading import InvalidValueError, boolean, integer, optional_text, parsed
+from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.table.reading import boolean, integer, optional_text, parsed
 from router.table.units import parse_duration
-from router.types.model import Bytes, Enum, Float, Int, List, MessageType, Type
+from router.types.model import Enum, MessageType
 from router.types.protobuf import PayloadCase
-from router.values import parse
 
-ANY = "any"
 UNCHANGED = "unchanged"
-RECEIVED_AT = "received_at"
 
 Counts = Mapping[str, int]
 """How many of each reason, or of each target."""
@@ -106,10 +101,6 @@ class Step:
     at: int | None = None
     until: int | None = None
     stop: bool = False
-
-
-def invalid(span: SourceSpan, code: Code, message: str, hint: str = "") -> InvalidValueError:
-    return InvalidValueError(Diagnostic(span, code, message, hint))
 
 
 # Names
@@ -208,134 +199,6 @@ class Names:
         return name
 
 
-# Fields of messages
-
-
-_ROUGHLY = re.compile(r"~ ?([-+]?[0-9]+(?:\.([0-9]*))?(?:[eE]([-+]?[0-9]+))?)")
-_WITHIN = re.compile(r"(\S+) *(?:\+-|\+/-|±) *(\S+)")
-
-
-class FieldReader:
-    """Reads the fields of messages. With `exact`, as for what is given, there is no `any` and no tolerance.
-
-    `any` is that word without quotes; with them it is text.
-    """
-
-    def __init__(self, names: Names, *, exact: bool) -> None:
-        self._names = names
-        self._exact = exact
-
-    def message(self, kind: MessageType, node: Node) -> Fields:
-        if not isinstance(node, MappingNode):
-            raise invalid(node.span, Code.WRONG_TYPE, f"{kind} is a message: write its fields, {{name: value}}")
-        members: dict[str, FieldValue] = {}
-        for path, entry in node.entries.items():
-            self._put(members, kind, path, entry)
-        return Fields(kind, members, node.span)
-
-    def _put(self, members: dict[str, FieldValue], kind: MessageType, path: str, entry: Entry) -> None:
-        """Add the value of a path such as `header.stamp` to the members of a message."""
-        span = entry.key.span
-        name, dot, rest = path.partition(".")
-        field = kind.field(name)
-        if field is None:
-            hint = did_you_mean(name, [member.name for member in kind.fields])
-            raise invalid(span, Code.UNKNOWN_FIELD, f"{kind} has no field '{name}'", hint)
-        if dot and not isinstance(field.type, MessageType):
-            raise invalid(span, Code.UNKNOWN_FIELD, f"'{name}' is {field.type} and has no fields")
-        inner = members.get(name)
-        if inner is not None and not (dot and isinstance(inner, Fields)):
-            raise invalid(span, Code.DUPLICATE_FIELD, f"'{name}' is given twice")
-        if dot and isinstance(field.type, MessageType):
-            below = dict(inner.members) if isinstance(inner, Fields) else {}
-            self._put(below, field.type, rest, entry)
-            members[name] = Fields(field.type, below, span)
-        else:
-            members[name] = self._value(field.type, entry.value, kind)
-
-    def _value(self, kind: Type, node: Node, holder: MessageType) -> FieldValue:
-        if not self._exact and isinstance(node, ScalarNode) and node.text == ANY and node.place.is_whole_line:
-            return AnyValue(node.span)
-        match kind, node:
-            case MessageType(), ScalarNode() if kind.name in TIMES:
-                return Time(kind, _offset(node), node.span)
-            case MessageType(fields=(only,)), ScalarNode():  # as a table fills it
-                return Fields(kind, {only.name: self._value(only.type, node, kind)}, node.span)
-            case MessageType(), _:
-                return self.message(kind, node)
-            case List(), SequenceNode():
-                if kind.length is not None and len(node.items) != kind.length:
-                    message = f"{kind} has {kind.length} elements, not {len(node.items)}"
-                    raise invalid(node.span, Code.TYPE_MISMATCH, message)
-                return Elements(tuple(self._value(kind.element, item, holder) for item in node.items), node.span)
-            case List(), _:
-                raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
-            case _, ScalarNode():
-                return self._scalar(kind, node, holder)
-        raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} takes one value")
-
-    def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Scalar:
-        text = node.text
-        if isinstance(kind, (Int, Float)) and not self._exact and (near := _near(text, node.span)):
-            return near
-        if isinstance(kind, Int) and (number := self._constant(text, holder, node.span)) is not None:
-            text = str(number)
-        if isinstance(kind, Bytes):
-            text = text.replace(" ", "")
-        try:
-            return Scalar(parse(kind, text, ""), node.span)
-        except UsageError as error:
-            raise invalid(node.span, Code.BAD_VALUE, str(error).removeprefix(": ")) from error
-
-    def _constant(self, text: str, holder: MessageType, span: SourceSpan) -> int | None:
-        """The value of a ROS constant of the message, or of a protobuf enum: `STATUS_FIX`, `GPSFixQuality.RTK_FIX`."""
-        found = holder.constants.get(text.removeprefix(f"{holder.short_name}."))
-        if isinstance(found, int):
-            return found
-        numbers = self._names.constants.get(text, set())
-        if len(numbers) > 1:
-            message = f"several enums have a value '{text}', with different numbers"
-            raise invalid(span, Code.BAD_VALUE, message, f"say of which enum, as in State.{text}")
-        return next(iter(numbers), None)
-
-
-def _near(text: str, span: SourceSpan) -> Scalar | None:
-    """`~1.571` is what rounds to that, `1.57 +- 0.01` what is that near."""
-    if found := _ROUGHLY.fullmatch(text):
-        value = _finite(found[1], "number to be near", span)
-        digits = len(found[2] or "") - int(found[3] or 0)
-        return Scalar(value, span, float(f"0.5e{-digits}"), text)
-    if found := _WITHIN.fullmatch(text):
-        value = _finite(found[1], "number to be near", span)
-        tolerance = _finite(found[2], "tolerance", span)
-        if tolerance < 0:
-            raise invalid(span, Code.BAD_VALUE, f"'{found[2]}' is no tolerance, which is not negative")
-        return Scalar(value, span, tolerance, text)
-    return None
-
-
-def _finite(text: str, what: str, span: SourceSpan) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise invalid(span, Code.BAD_VALUE, f"'{text}' is no {what}", "write a number, as in 1.57 +- 0.01")
-    return value
-
-
-def _offset(node: ScalarNode) -> int | None:
-    if node.text == RECEIVED_AT:
-        return None
-    if node.value == 0:
-        return 0
-    try:
-        return parse_duration(node.text)
-    except ValueError as error:
-        hint = f"a time is '{RECEIVED_AT}', or so long after the beginning of the test, such as 300ms"
-        raise invalid(node.span, Code.BAD_VALUE, str(error), hint) from error
-
-
 # given
 
 
@@ -346,7 +209,7 @@ _KEYS_OF_MESSAGES = ("topic", "message")
 class GivenReader:
     def __init__(self, names: Names) -> None:
         self._names = names
-        self._fields = FieldReader(names, exact=True)
+        self._fields = FieldReader(names.constants, exact=True)
 
     def given(self, node: Node) -> Given:
         """Raises InvalidValueError."""
@@ -430,8 +293,8 @@ _MOST = 100_000
 class ExpectedReader:
     def __init__(self, names: Names) -> None:
         self._names = names
-        self._fields = FieldReader(names, exact=False)
-        self._given = FieldReader(names, exact=True)
+        self._fields = FieldReader(names.constants, exact=False)
+        self._given = FieldReader(names.constants, exact=True)
 
     def expected(self, span: SourceSpan, node: Node, given: Node | None) -> Expected:
         """`given` is what the step is given, which 'unchanged' refers to. Raises InvalidValueError."""

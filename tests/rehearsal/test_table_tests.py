@@ -8,10 +8,11 @@ from textwrap import dedent, indent
 import pytest
 
 from router.compiler.lookup import Definitions
+from router.engine.wire import wire_of_protos
 from router.errors import Code, Diagnostic, TableError
 from router.rehearsal.comparing import Failure
 from router.rehearsal.coverage import Coverage
-from router.rehearsal.fields import offset
+from router.rehearsal.fields import leaves, offset
 from router.rehearsal.reading import TestFile, find_test_files, read_test_file
 from router.rehearsal.running import run_tests
 from tests.engine.rig import HEAD, HEAD_OF_LISTENERS
@@ -357,6 +358,24 @@ def test_every_kind_of_field_is_told_where_it_is_not_expected(tmp_path: Path) ->
         "right is ''",
         "time is 250 ms",
     ]
+
+
+def test_every_scalar_of_a_message_is_listed_by_its_path(tmp_path: Path) -> None:
+    (tmp_path / "kinds.proto").write_text(PROTO)
+    case = wire_of_protos(tmp_path).case("every_kind")
+    message = case.message_class(point={"x": 1}, points=[{"y": 3}], places={5: {"x": 6}}, maybe=7)
+    found = {
+        path: text for path, text in leaves(case.type, message) if text not in {"0", "0.0", "false", "empty", "''"}
+    }
+    assert found == {
+        "mode": "MODE_OFF",
+        "state": "IDLE",
+        "point.x": "1",
+        "points[0].y": "3",
+        "maybe": "7",
+        "places[0].key": "5",
+        "places[0].value.x": "6",
+    }
 
 
 # what fails
