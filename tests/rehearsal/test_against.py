@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from router.cli import main
@@ -159,7 +159,6 @@ def test_comparing_and_sending_exclude_each_other(tmp_path: Path, capsys: pytest
     assert "--against sends nothing" in capsys.readouterr().err
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 60)), min_size=1, max_size=20), st.data())
 def test_rows_add_up_whatever_comes(steps: list[tuple[int, int]], data: st.DataObject) -> None:
     """Old and new are what was the same, changed, moved, and only there; and nothing is below zero."""
