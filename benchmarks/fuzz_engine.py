@@ -22,8 +22,7 @@ from pathlib import Path
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM, InboundEngine, Report
-from tests.engine.fakes import plain_outlets
-from tests.engine.ledger import Ledger
+from tests.engine.rig import Ledger, Rig
 from tests.tables import ROUTES
 
 ROOT = Path(__file__).parent.parent
@@ -173,15 +172,17 @@ def _receiver(program: Program, counts: list[int], noise: random.Random) -> Call
         if noise.random() < 0.01:
             raise PublishError
 
-    outlets = plain_outlets(
-        program.counters,
-        {plan.name: send for plan in program.senders},
-        {plan.label: publish for plan in program.publishers},
-        _forget,
+    context = Rig(program).context
+    timed = replace(
+        context,
         counts=counts,
+        send=dict.fromkeys(context.send, send),
+        publish=dict.fromkeys(context.publish, publish),
+        report=_forget,
         publish_errors=(PublishError,),
+        clock_ns=time.monotonic_ns,
+        wall_ns=time.time_ns,
     )
-    timed = replace(outlets, clock_ns=time.monotonic_ns, wall_ns=time.time_ns)
     listener = program.listeners[0].name
     return InboundEngine(program, timed, {listener: time.time_ns}).receiver(listener)
 

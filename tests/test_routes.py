@@ -15,7 +15,7 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.engine import InboundEngine
 from router.table.model import Route, RouteTable, Transport
-from tests.engine.fakes import plain_outlets
+from tests.engine.rig import Rig
 from tests.tables import ROUTES
 
 Publish = Callable[..., dict[str, bytes]]
@@ -163,21 +163,12 @@ def published(rover: Program) -> Publish:
     """A function that routes one payload and gives what was published, CDR bytes by topic."""
 
     def route(case: str, **values: object) -> dict[str, bytes]:
-        sent: dict[str, bytes] = {}
-        reports: list[object] = []
-        topics = [plan.label for plan in rover.publishers]
-        outlets = plain_outlets(
-            rover.counters,
-            send={sender.name: len for sender in rover.senders},
-            publish={topic: partial(sent.__setitem__, topic) for topic in topics},
-            report=reports.append,
-            wall_ns=WALL_NS,
-        )
-        engine = InboundEngine(rover, outlets, {"rover": lambda: WALL_NS})
+        rig = Rig(rover)
+        rig.now = WALL_NS - Rig.WALL
         envelope = rover.envelope.message_class(**{case: values})
-        engine.receiver("rover")(envelope.SerializeToString(), ("192.168.0.30", 8))
-        assert reports == []
-        return sent
+        rig.receive(envelope.SerializeToString(), listener="rover")
+        assert rig.reports == []
+        return dict(rig.published)
 
     return route
 

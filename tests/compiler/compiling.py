@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
 from typing import Any
 
 from router.compiler.cdr import write_message
@@ -13,14 +12,14 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.program import Handler, Program
 from router.compiler.source import Source
 from router.engine.binding import bind
-from router.engine.delivery import MAPPING_FAILURES, Report
+from router.engine.delivery import MAPPING_FAILURES
 from router.engine.freshness import Freshness
 from router.errors import Diagnostic, SourceSpan
 from router.rehearsal.cdr import serialize as cdr
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
-from tests.engine.fakes import plain_outlets
+from tests.engine.rig import Rig
 from tests.oracles.reference import fill
 from tests.oracles.reference_expressions import Context, View
 
@@ -99,51 +98,19 @@ def outcome(make: Callable[[], Any]) -> Any:
         return MAPPING_FAILURES
 
 
-@dataclass
 class Published:
-    """A handler bound to lists: what it publishes by topic, what it sends, what it reports."""
+    """A handler of a program, whose targets are those of a rig: `reports` has its losses, `sent` what it sends."""
 
-    program: Program
-    handler: Handler
-    topics: dict[str, list[bytes]] = field(default_factory=dict)
-    sent: dict[str, list[bytes]] = field(default_factory=dict)
-    reports: list[Report] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        topics = [target.label for target in self.handler.targets if target.is_topic]
-        endpoints = [target.label for target in self.handler.targets if not target.is_topic]
-        self.topics = {topic: [] for topic in topics}
-        self.sent = {endpoint: [] for endpoint in endpoints}
-        self._handle = bind(
-            self.handler,
-            self.program.counters,
-            plain_outlets(
-                self.program.counters,
-                send={name: self._sender(name) for name in endpoints},
-                publish={topic: self._publisher(topic) for topic in topics},
-                report=self.reports.append,
-            ),
-            Freshness(),
-        )
-
-    def _sender(self, endpoint: str) -> Callable[[bytes], int]:
-        def send(datagram: bytes) -> int:
-            self.sent[endpoint].append(datagram)
-            return len(datagram)
-
-        return send
-
-    def _publisher(self, topic: str) -> Callable[[bytes], None]:
-        def publish(data: bytes) -> None:
-            self.topics[topic].append(bytes(data))
-
-        return publish
+    def __init__(self, program: Program, handler: Handler) -> None:
+        rig = Rig(program)
+        self.topics = {target.label for target in handler.targets if target.is_topic}
+        self.reports, self.sent, self._published = rig.reports, rig.sent, rig.published
+        self._is_aged = handler.ttl is not None
+        self._handle = bind(handler, program.counters, rig.context, Freshness())
 
     def __call__(self, message: Any) -> dict[str, bytes]:
-        """Serves one message. Topics whose mapping failed are left out; `reports` has why."""
-        self.reports.clear()
-        for published in self.topics.values():
-            published.clear()
-        born = (1,) if self.handler.ttl is not None else ()
-        self._handle(message, b"datagram", RECEIVED_AT, 1, SOURCE, *born)
-        return {topic: published[0] for topic, published in self.topics.items() if published}
+        """Serve one message, and return what is published by topic. Topics whose mapping failed are left out."""
+        for made in (self.reports, self.sent, self._published):
+            made.clear()
+        self._handle(message, b"datagram", RECEIVED_AT, 1, SOURCE, *((1,) if self._is_aged else ()))
+        return dict(self._published)

@@ -1,21 +1,25 @@
-"""An engine between fakes: outlets that record and fail when told to, and clocks that stand still until told to go."""
+"""An engine between fakes: outlets that record and fail on demand, clocks that are set; its counters, read by name.
+
+Parts of an engine between fakes: targets with counters of their own, and timers that are served when they are due.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.compiler.program import Program
+from router.compiler.metrics import DROP_REASONS, HISTOGRAM_CELLS, Counters
+from router.compiler.program import Handler, Program, TargetPlan
 from router.engine import InboundEngine, OutboundEngine, Report
 from router.engine.binding import EngineContext, TimerGroup
 from router.engine.deadman import Deadman, feeder
+from router.engine.delivery import FrameOutcome, Outcome
 from router.engine.pacing import Pacer
 from router.engine.timers import Timer
-from tests.engine.ledger import Ledger
 from tests.tables import PROTOS
 
 HEAD = """version: 1
@@ -66,6 +70,55 @@ def program(folder: Path, routes: str, head: str = HEAD, protos: Path | None = N
     checked = check_table(path, {}, _definitions())
     assert checked.program is not None, "\n".join(map(str, checked.diagnostics))
     return checked.program
+
+
+class Ledger:
+    """The counters of a program with their counts at the time of each call; timestamps and histograms left out."""
+
+    def __init__(self, program: Program, counts: Sequence[int]) -> None:
+        self._program = program
+        self._counts = counts
+
+    def counted(self, *prefixes: str) -> Mapping[tuple[str, ...], int]:
+        """What is not zero, by metric and labels, of the metrics whose name starts like one of these."""
+        return {
+            (series.metric, *series.labels): self._counts[index]
+            for series, index in self._program.counters.series()
+            if self._counts[index] and series.metric.startswith(prefixes) and not series.metric.endswith("seconds")
+        }
+
+    def total(self, metric: str, *labels: str) -> int:
+        """The sum over all series of a metric whose labels begin like this."""
+        return sum(count for key, count in self.counted(metric).items() if key[: 1 + len(labels)] == (metric, *labels))
+
+    def imbalances(self) -> Iterator[str]:
+        """Expects that nothing waits: no frame is open, and nothing is held back for later."""
+        inbound = [handler for handlers in self._program.inbound.values() for handler in handlers]
+        outbound = [handler for handlers in self._program.outbound.values() for handler in handlers]
+        received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")
+        accepted = sum(self.total("messages_received", handler.route) for handler in inbound)
+        if received != accepted + rejected:
+            yield f"received {received}, but accepted {accepted} and rejected {rejected}"
+        for handler in inbound:
+            yield from self._time_of_route(handler.route)
+        for handler in (*inbound, *outbound):
+            yield from self._fates(handler)
+
+    def _time_of_route(self, route: str) -> Iterator[str]:
+        accepted = self.total("messages_received", route)
+        first = self._program.counters.index("route_duration_seconds", route)
+        if accepted != (timed := sum(self._counts[first : first + HISTOGRAM_CELLS - 1])):
+            yield f"{route}: accepted {accepted}, but the histogram holds {timed}"
+
+    def _fates(self, handler: Handler) -> Iterator[str]:
+        route, accepted = handler.route, self.total("messages_received", handler.route)
+        for target in handler.targets:
+            delivered = "messages_published" if target.is_topic else "datagrams_sent"
+            metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected")
+            fates = [self.total(metric, route, target.label) for metric in metrics]
+            if accepted != sum(fates):
+                kinds = "delivered, dropped, filtered, collected"
+                yield f"{route} to {target.label}: accepted {accepted}, but {kinds} {fates}"
 
 
 class Rig:
@@ -187,3 +240,56 @@ class Rig:
 
 class PublishError(Exception):
     """What the middleware raises here."""
+
+
+class _Target:
+    route = "a_route"
+
+    def __init__(self, name: str, is_topic: bool, metrics: tuple[str, ...]) -> None:
+        self.name = name
+        self.reports: list[Report] = []
+        self._counters = Counters()
+        for metric in metrics:
+            self._counters.index(metric, self.route, name)
+        for reason in DROP_REASONS:
+            self._counters.index("messages_dropped", self.route, name, reason)
+        self._counts = self._counters.fresh_counts()
+        self._plan = TargetPlan(name, name, is_topic, None)
+
+    def counted(self) -> Mapping[str, int]:
+        """What is not zero, by metric, of what was dropped by reason."""
+        counted = {series: self._counts[index] for series, index in self._counters.series() if self._counts[index]}
+        return {series.labels[2] if len(series.labels) > 2 else series.metric: n for series, n in counted.items()}
+
+
+class Destination(_Target):
+    def __init__(self, name: str = "a_board") -> None:
+        super().__init__(name, False, ("datagrams_sent", "sent_bytes", "messages_filtered"))
+        self.outcome = Outcome(self._counters, self._counts, self.route, self._plan, self.reports.append)
+
+
+class Topic(_Target):
+    """Of a route that collects."""
+
+    def __init__(self, name: str = "a_topic") -> None:
+        super().__init__(name, True, ("messages_published", "messages_filtered", "messages_collected"))
+        self.outcome = FrameOutcome(self._counters, self._counts, self.route, self._plan, self.reports.append)
+
+
+Event = tuple[int, Callable[[int], object]]
+"""When something is called, and what; it is told the time."""
+
+
+def serve(timer: Timer, until: int, late: int = 0) -> None:
+    """Calls the timer whenever it is due, up to and with `until`, each time `late` ns after it is."""
+    while timer.next_due is not None and timer.next_due + late <= until:
+        due = timer.next_due
+        timer.due(due + late)
+        assert timer.next_due is None or timer.next_due > due
+
+
+def play(timer: Timer, events: Iterable[Event], until: int, late: int = 0) -> None:
+    for now, call in events:
+        serve(timer, now, late)
+        call(now)
+    serve(timer, until, late)

@@ -17,7 +17,7 @@ from router.engine import collecting
 from router.engine.collecting import MOST_CLOSED, MOST_FRAMES, MOST_PARTS, Collector
 from router.engine.pacing import NS
 from router.errors import MappingError
-from tests.engine.fakes import Topic, serve
+from tests.engine.rig import Topic, serve
 
 MS = 1_000_000
 Part = tuple[Hashable, int, int]
@@ -64,34 +64,12 @@ def parts_of(key: Hashable, count: int) -> list[Part]:
 # ---- complete
 
 
-@given(st.permutations(range(6)))
-def test_a_frame_comes_out_in_order_whatever_the_order_of_arrival(order: list[int]) -> None:
-    frames = Frames()
-    frames.offer(*(("a", 6, index) for index in order))
-    assert frames.complete == [parts_of("a", 6)]
-    assert frames.counted == {"messages_collected": 5, "messages_published": 1}
-    assert frames.collector.next_due is None
-
-
-def test_a_frame_of_one_is_complete_at_once(frames: Frames) -> None:
-    frames.offer(("a", 1, 0))
-    assert frames.complete == [[("a", 1, 0)]]
-    assert frames.counted == {"messages_published": 1}
-
-
 def test_copies_are_filtered_before_and_after_the_frame_is_complete(frames: Frames) -> None:
     frames.offer(("a", 2, 1), ("a", 2, 1), ("a", 2, 0), ("a", 2, 0), ("a", 2, 1))
     frames.wait(NS - 1)
     frames.offer(("a", 2, 0))
     assert frames.complete == [parts_of("a", 2)]
     assert frames.counted == {"messages_filtered": 4, "messages_collected": 1, "messages_published": 1}
-
-
-def test_a_key_may_come_again_when_the_timeout_is_over(frames: Frames) -> None:
-    frames.offer(*parts_of("a", 2))
-    frames.wait(NS)
-    frames.offer(*parts_of("a", 2))
-    assert frames.complete == [parts_of("a", 2)] * 2
 
 
 # ---- incomplete
@@ -109,16 +87,6 @@ def test_a_frame_whose_time_is_up_counts_once(frames: Frames) -> None:
     assert [report.detail for report in frames.topics[0].reports] == ["3 of 4 parts"]
 
 
-def test_what_comes_after_the_end_of_an_incomplete_frame_is_filtered_and_opens_none(frames: Frames) -> None:
-    frames.offer(("a", 2, 0))
-    frames.wait(NS)
-    frames.offer(("a", 2, 1))
-    assert frames.counted == {"incomplete": 1, "messages_filtered": 1}
-    frames.wait(2 * NS)
-    frames.offer(*parts_of("a", 2))
-    assert frames.complete == [parts_of("a", 2)]
-
-
 def test_a_part_that_comes_in_time_for_nobody_to_have_looked_is_still_too_late(frames: Frames) -> None:
     """Whoever serves the collector is late."""
     frames.offer(("a", 2, 0))
@@ -126,12 +94,6 @@ def test_a_part_that_comes_in_time_for_nobody_to_have_looked_is_still_too_late(f
     frames.offer(("a", 2, 1))
     assert frames.complete == []
     assert frames.counted == {"incomplete": 1, "messages_filtered": 1}
-
-
-def test_a_part_that_tells_another_count_opens_a_new_frame(frames: Frames) -> None:
-    frames.offer(("a", 3, 0), ("a", 3, 1), ("a", 2, 0), ("a", 2, 1))
-    assert frames.complete == [parts_of("a", 2)]
-    assert frames.counted == {"messages_collected": 2, "incomplete": 1, "messages_published": 1}
 
 
 def test_at_the_end_what_is_open_is_incomplete(frames: Frames) -> None:
@@ -164,23 +126,6 @@ def test_the_largest_frame_has_room(frames: Frames) -> None:
     assert frames.complete == [parts_of("a", MOST_PARTS)]
 
 
-def test_the_oldest_frame_makes_room_for_a_new_one(frames: Frames) -> None:
-    for key in range(MOST_FRAMES + 1):
-        frames.offer((key, 2, 0))
-    frames.offer((0, 2, 1), (1, 2, 1))
-    assert frames.complete == [parts_of(1, 2)]
-    assert frames.counted["incomplete"] == 1
-
-
-def test_the_oldest_frame_makes_room_for_more_parts(frames: Frames) -> None:
-    frames.offer(*parts_of("a", MOST_PARTS)[1:], ("b", 3, 0))
-    assert "incomplete" not in frames.counted
-    frames.offer(("b", 3, 1))
-    assert frames.counted["incomplete"] == 1
-    frames.offer(("b", 3, 2))
-    assert frames.complete == [parts_of("b", 3)]
-
-
 class Alive:
     """Counts how many of it there are."""
 
@@ -206,29 +151,6 @@ def test_what_is_held_stays_bounded(most: int) -> None:
 
 
 # ---- two cameras on a bad network
-
-
-def test_shuffled_duplicated_lost_and_interleaved(frames: Frames) -> None:
-    """Complete frames come out once; of the others each counts as incomplete, but those of which nothing arrived."""
-    noise = random.Random(3)
-    arrived: dict[Hashable, set[Part]] = {}
-    for number in range(500):
-        keys = [(camera, number) for camera in ("left", "right")]
-        sent = [part for key in keys for part in parts_of(key, noise.randint(1, 8))]
-        if number % 2:
-            sent = [part for part in sent if noise.random() > 0.3]
-        sent += noise.choices(sent, k=len(sent) // 5)
-        noise.shuffle(sent)
-        frames.offer(*sent)
-        for part in sent:
-            arrived.setdefault(part[0], set()).add(part)
-        frames.wait(frames.now + 33 * MS)
-    frames.wait(frames.now + NS)
-
-    whole = [sorted(parts) for parts in arrived.values() if len(parts) == next(iter(parts))[1]]
-    assert sorted(frames.complete, key=str) == sorted(whole, key=str)
-    assert frames.counted["messages_published"] == len(whole)
-    assert frames.counted["incomplete"] == len(arrived) - len(whole) > 100
 
 
 # ---- against a plain collector
@@ -319,10 +241,3 @@ def test_it_does_what_a_plain_collector_does(steps: list[tuple[int, Part]]) -> N
             assert frames.counted == {name: count for name, count in plain.counted.items() if count}
         frames.wait(frames.now + NS)
     assert sum(frames.counted.values()) == len(steps)
-
-
-def test_keys_of_closed_frames_are_forgotten_when_there_are_too_many(frames: Frames) -> None:
-    for key in range(MOST_CLOSED + 1):
-        frames.offer((key, 1, 0))
-    frames.offer((0, 1, 0), (MOST_CLOSED, 1, 0))
-    assert frames.counted == {"messages_published": MOST_CLOSED + 2, "messages_filtered": 1}

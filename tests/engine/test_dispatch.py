@@ -120,39 +120,21 @@ def both_of_listeners(tmp_path_factory: pytest.TempPathFactory) -> Both:
     return Both(program(tmp_path_factory.mktemp("listeners"), routes, HEAD_OF_LISTENERS))
 
 
-@settings(max_examples=1000)
+@settings(max_examples=10 * settings().max_examples)
 @given(data=damaged(), peer=st.sampled_from(PEERS), listener=st.sampled_from(["trimmed", "exact"]))
-def test_both_paths_agree_on_who_is_believed_by_which_listener(
-    both_of_listeners: Both, data: bytes, peer: Peer, listener: str
+def test_both_paths_agree_with_the_protobuf_library(
+    both: Both, both_of_listeners: Both, data: bytes, peer: Peer, listener: str
 ) -> None:
+    both.receive(data, peer, listener)
     both_of_listeners.receive(data, peer, listener)
 
 
-@pytest.mark.parametrize(
-    ("case", "peer", "believed_by"),
-    [
-        (MANUAL_DRIVE, BASESTATION, "exact"),
-        (GPS, BASESTATION, "trimmed"),
-        (IMU, SENSOR_BOARD, "trimmed exact"),
-        (ARM_POS, LEFT_TOOL, "trimmed"),
-        (ARM_POS, RIGHT_TOOL, "exact"),
-        (DRIVE_DIAG, BASESTATION, "trimmed exact"),
-    ],
-)
-def test_an_endpoint_is_believed_by_its_listener(
-    both_of_listeners: Both, case: int, peer: Peer, believed_by: str
+def test_every_case_from_every_sender_is_taken_as_the_names_of_endpoints_say(
+    both: Both, both_of_listeners: Both
 ) -> None:
-    for listener in ("trimmed", "exact"):
-        rig = Rig(both_of_listeners.rig.program)
-        rig.receive(framed(case, b""), peer, listener)
-        assert rig.rejected(listener) == (None if listener in believed_by else "source_mismatch")
-        assert bool(rig.sent) == (listener in believed_by)
-
-
-@settings(max_examples=1000)
-@given(data=damaged(), peer=st.sampled_from(PEERS), listener=st.sampled_from(["trimmed", "exact"]))
-def test_both_paths_agree_with_the_protobuf_library(both: Both, data: bytes, peer: Peer, listener: str) -> None:
-    both.receive(data, peer, listener)
+    for number, peer, listener in itertools.product(range(1, 30), PEERS, ("trimmed", "exact")):
+        both.receive(framed(number, b""), peer, listener)
+        both_of_listeners.receive(framed(number, b""), peer, listener)
 
 
 def test_short_datagrams_agree_with_the_protobuf_library(made: Program) -> None:
@@ -215,16 +197,11 @@ def test_every_reason_has_its_datagram() -> None:
     assert {reason for reason, _ in REJECTED} == set(REJECT_REASONS)
 
 
-def test_the_report_names_the_sender_and_the_trouble(rig: Rig) -> None:
-    rig.receive(framed(UNKNOWN, b""), STRANGER)
+@pytest.mark.parametrize(("number", "detail"), [(UNKNOWN, "field 99"), (GPS, "gps_info")])
+def test_a_report_names_the_sender_and_what_it_sent(rig: Rig, number: int, detail: str) -> None:
+    rig.receive(framed(number, b""), STRANGER)
     [report] = rig.reports
-    assert (report.kind, report.place, report.detail) == ("reject", "trimmed", "from 192.168.0.99:1234: field 99")
-
-
-def test_the_report_of_a_wrong_sender_says_what_it_sent(rig: Rig) -> None:
-    rig.receive(framed(GPS, b""), ("192.168.0.99", 1234))
-    [report] = rig.reports
-    assert (report.reason, report.detail) == ("source_mismatch", "from 192.168.0.99:1234: gps_info")
+    assert (report.kind, report.place, report.detail) == ("reject", "trimmed", f"from 192.168.0.99:1234: {detail}")
 
 
 def test_unhandled_cases_are_counted_by_name(rig: Rig) -> None:
@@ -267,11 +244,6 @@ def test_all_forms_of_an_envelope_mean_the_same(rig: Rig, data: bytes, listener:
     assert struct.unpack_from("<4x3f", cdr) == (1.0, 2.0, 0.0)
 
 
-def test_the_last_payload_case_wins(rig: Rig) -> None:
-    rig.receive(framed(IMU, X_IS_ONE) + framed(GPS, b""), BASESTATION)
-    assert rig.counted("messages_received") == {("messages_received", "gps_info", "basestation"): 1}
-
-
 # ---- zeros at the end
 
 ALL_ZERO = framed(IMU, b"\x0d" + bytes(4))
@@ -296,17 +268,6 @@ def test_what_is_forwarded_is_what_was_received(rig: Rig) -> None:
     assert [data for endpoint, data in rig.sent if endpoint == "basestation"] == forms
     assert [data for endpoint, data in rig.sent if endpoint == "recorder"] == [data.rstrip(b"\0") for data in forms]
     assert rig.count("sent_bytes", "imu_info", "basestation") == sum(map(len, forms))
-
-
-def test_forwarding_goes_where_the_table_says_and_nowhere_else(rig: Rig) -> None:
-    for number, peer in ((IMU, SENSOR_BOARD), (DRIVE_DIAG, STRANGER), (GPS, LEFT_TOOL), (MANUAL_DRIVE, BASESTATION)):
-        rig.receive(framed(number, b""), peer)
-    went = {endpoint: {data for to, data in rig.sent if to == endpoint} for endpoint, _ in rig.sent}
-    assert went == {
-        "basestation": {framed(IMU, b"")},
-        "recorder": {b"\x6a", b"\x42"},
-        "driving_board": {framed(MANUAL_DRIVE, b"")},
-    }
 
 
 # ---- who sent it

@@ -67,32 +67,6 @@ def software_drives(rig: Rig, ns: int, distance: float = 2.0) -> None:
         rig.pass_time(50 * MS)
 
 
-def test_turns_are_taken_without_a_brake(rig: Rig) -> None:
-    for _ in range(3):
-        operator_drives(rig, 2 * SECOND)
-        software_drives(rig, 2 * SECOND)
-
-    assert brakes(rig) == 0
-    assert rig.changes == []
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "braked"),
-    [(operator_drives, software_drives, "drive_motor"), (software_drives, operator_drives, "manual_drive")],
-)
-def test_who_drove_last_is_braked_when_commands_stop(
-    rig: Rig, first: Callable[[Rig, int], None], last: Callable[[Rig, int], None], braked: str
-) -> None:
-    first(rig, SECOND)
-    last(rig, SECOND)
-    rig.pass_time(449 * MS)
-    assert brakes(rig) == 0
-    rig.pass_time(1 * MS)
-
-    assert brakes(rig) == 1
-    assert rig.changes == [(braked, True)]
-
-
 def test_a_deadman_that_has_tripped_is_released_by_who_takes_over(rig: Rig) -> None:
     operator_drives(rig, SECOND)
     rig.pass_time(2 * SECOND)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from router.engine import MAX_DATAGRAM
 from router.engine.pacing import BURST, LEAST_OVERDRAFT, LEAST_QUEUE, NS, OVERDRAFT, Pacer
 from router.table.model import Priority
-from tests.engine.fakes import Destination, play, serve
+from tests.engine.rig import Destination, play, serve
 
 COMMAND, TELEMETRY, BULK = Priority
 MS = 1_000_000
@@ -140,21 +140,6 @@ def test_nothing_is_saved_up_for_what_is_too_old() -> None:
 # ---- who goes first
 
 
-def test_what_waits_goes_by_priority_and_then_by_age() -> None:
-    link = Link(10_000)
-    waiting = [link.offer(priority, 3000) for priority in (BULK, TELEMETRY, COMMAND, BULK, TELEMETRY, COMMAND)]
-    link.wait(10 * NS)
-    assert link.numbers == [waiting[index] for index in (2, 5, 1, 4, 0, 3)]
-
-
-def test_a_command_does_not_wait_for_what_others_have_used_up() -> None:
-    link = Link(500_000)
-    for _ in range(400):
-        link.offer(BULK, 1400)
-    command = link.offer(COMMAND)
-    assert link.sent[-1] == (0, command)
-
-
 def test_commands_wait_for_each_other_when_they_are_too_far_ahead() -> None:
     """They overdraw the budget by 100 ms of it; the others wait until that is paid."""
     link = Link(100_000)
@@ -201,13 +186,6 @@ def test_the_oldest_of_the_least_urgent_is_dropped_when_there_is_no_room() -> No
     assert link.fate(telemetry[0]) == "queue_full"
     assert link.fate(telemetry[1]) is None
     assert [report.reason for report in link.targets[oldest].reports] == ["queue_full"]
-
-
-def test_a_large_budget_has_room_for_a_second() -> None:
-    link = Link(1_000_000)
-    waiting = [link.offer(BULK, 1000) for _ in range(1100)]
-    assert sum(link.fate(number) == "datagrams_sent" for number in waiting) == 20
-    assert sum(link.fate(number) is None for number in waiting) == 1000
 
 
 def test_what_gets_too_old_while_it_waits_is_dropped_and_uses_up_nothing() -> None:
