@@ -30,7 +30,8 @@ class ForkedProcess:
     def __init__(self, *command: str) -> None:
         stdin, self._to_stdin = os.pipe()
         from_stdout, stdout = os.pipe()
-        request = {"command": command, "environment": dict(os.environ), "folder": str(Path.cwd())}
+        environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_suffix(".xml")), **os.environ}
+        request = {"command": command, "environment": environment, "folder": str(Path.cwd())}
         self.pid: int = _ask(request, stdin, stdout)
         os.close(stdin)
         os.close(stdout)
@@ -58,6 +59,8 @@ class ForkedProcess:
 
     def communicate(self) -> str:
         """End its standard input, wait for its end, and return the rest of its output."""
+        if self.stdout.closed:
+            return ""
         self.stdin.close()
         rest = self.stdout.read()
         self.wait()
@@ -122,7 +125,7 @@ def _run(asked: dict[str, Any], stdin: int, stdout: int) -> int:
     for descriptor, wanted in ((stdin, 0), (stdout, 1)):
         os.dup2(descriptor, wanted)
         os.close(descriptor)
-    sys.stdin, sys.stdout = open(0), open(1, "w")  # noqa: SIM115, PTH123
+    sys.stdin, sys.stdout = open(0), open(1, "w")  # noqa: SIM115
     os.environ.clear()
     os.environ.update(asked["environment"])
     os.chdir(asked["folder"])
@@ -168,8 +171,6 @@ def spin_until_stdin_ends(node: Any, heard: Callable[[str], None] = lambda _: No
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    import rclpy.executors
-    import rclpy.node
     import std_msgs.msg  # noqa: F401
 
     import tests.compiler.ros_objects

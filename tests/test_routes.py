@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 
 import pytest
 from geometry_msgs.msg import TwistStamped
@@ -13,7 +12,6 @@ from sensor_msgs.msg import FluidPressure, Imu, MagneticField, NavSatFix, NavSat
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine import InboundEngine
 from router.table.model import Route, RouteTable, Transport
 from tests.engine.rig import Rig
 from tests.tables import ROUTES

@@ -20,6 +20,7 @@ from tests.acceptance.rover_map import HOSTS, OUTFLOWS, ROUTER, TOPICS_FROM_ROS
 from tests.acceptance.site import IMPATIENT_ROVER, ROOT, RouterProcess, Site, balance, key, site, total, wait_until
 from tests.compiler.ros_objects import serialized
 from tests.ros.publisher import Publisher
+from tests.ros_child import ForkedProcess
 
 TRIPPED = "commands stopped coming: the deadman sends in their place"
 RELEASED = "commands come again: the deadman is released"
@@ -167,7 +168,7 @@ def is_stopped(router: RouterProcess) -> bool:
 
 
 @contextmanager
-def steady(driver: Driver) -> Iterator[subprocess.Popen[Any]]:
+def steady(driver: Driver) -> Iterator[subprocess.Popen[Any] | ForkedProcess]:
     """A process that gives commands all the time, and does not end well."""
     if driver.route in OUTFLOWS:
         kind = TOPICS_FROM_ROS[driver.route]

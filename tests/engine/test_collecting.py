@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.engine import collecting
-from router.engine.collecting import MOST_CLOSED, MOST_FRAMES, MOST_PARTS, Collector
+from router.engine.collecting import MOST_PARTS, Collector
 from router.engine.pacing import NS
 from router.errors import MappingError
 from tests.engine.rig import Topic, serve

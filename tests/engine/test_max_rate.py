@@ -7,7 +7,6 @@ import math
 import random
 from collections.abc import Iterable
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 

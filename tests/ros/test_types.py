@@ -30,7 +30,7 @@ from router.errors import StartError
 from router.ros import types as ros_types
 from router.ros.types import installed_class, installed_type, matching_class
 from router.types.model import Bool, Float, Int, List, MessageType, String, Type
-from router.types.ros import RosInterfaces, ros_interfaces
+from router.types.ros import ros_interfaces
 
 ACTION = """\
 class Wait_Feedback:
@@ -139,17 +139,15 @@ def shape(declared: object) -> object:
             return declared
 
 
-@pytest.fixture(scope="module")
-def interfaces() -> RosInterfaces:
-    return ros_interfaces()
-
-
-@pytest.mark.parametrize("name", sorted(filter(is_installed, ros_interfaces().names())))
-def test_a_class_describes_what_its_msg_file_declares(interfaces: RosInterfaces, name: str) -> None:
-    declared, described = interfaces.get(name), installed_type(name)
-    assert declared
-    assert shape(described) == shape(declared)
-    assert layout(described) == layout(declared)
+def test_a_class_describes_what_its_msg_file_declares() -> None:
+    interfaces = ros_interfaces()
+    names = sorted(filter(is_installed, interfaces.names()))
+    assert len(names) > 50
+    for name in names:
+        declared, described = interfaces.get(name), installed_type(name)
+        assert declared
+        assert shape(described) == shape(declared), name
+        assert layout(described) == layout(declared), name
 
 
 def test_what_belongs_to_a_service_is_named_so_and_its_class_matches() -> None:
@@ -215,8 +213,3 @@ def test_a_type_that_only_idl_has_is_refused_with_its_place(monkeypatch: pytest.
     monkeypatch.setattr(ros_types, "installed_class", lambda _: generated(it=index))
     with pytest.raises(StartError, match=f"^made_msgs/msg/Made.it is a {unknown}, which the router cannot read"):
         installed_type("made_msgs/msg/Made")
-
-
-def test_a_type_that_is_not_installed_is_refused() -> None:
-    with pytest.raises(StartError, match="std_msgs/msg/NoSuch is not installed"):
-        installed_type("std_msgs/msg/NoSuch")
