@@ -29,8 +29,8 @@ from router.table.units import (
     PERIOD,
     RATE,
     SIZE,
+    TOPIC_RATE,
     Quantity,
-    topic_rate,
 )
 
 
@@ -413,7 +413,7 @@ class TopicRate:
     period: int
 
     def __str__(self) -> str:
-        return f"{self.pattern}: {topic_rate(self.period)}"
+        return f"{self.pattern}: {TOPIC_RATE.show(self.period)}"
 
 
 @dataclass(frozen=True, slots=True)

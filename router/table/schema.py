@@ -18,6 +18,7 @@ from router.assets import asset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, nearest
 from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten, to_data
+from router.table.reading import mapping
 
 if TYPE_CHECKING:
     from jsonschema import ValidationError
@@ -105,10 +106,7 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
     found = [error for error in found if error.path not in rests]
     findings.extend(finding(error, tree) for error in found if not _is_broken(tree, error.path))
     tree = rewritten(tree, {error.path: _as_broken for error in found})
-    tree = rewritten(tree, {path[:-1]: _without_rests for path in rests})
-    if not isinstance(tree, MappingNode):
-        raise TypeError("a table's root stays a mapping")
-    return tree
+    return mapping(rewritten(tree, {path[:-1]: _without_rests for path in rests}))
 
 
 def schema_errors(tree: Node, schema: str) -> list[SchemaError]:
@@ -156,10 +154,8 @@ def _is_rest(tree: Node, path: Path) -> bool:
 
 
 def _without_rests(node: Node) -> Node:
-    if not isinstance(node, MappingNode):
-        raise TypeError("only a mapping has keys")
-    rests = _rests(node)
-    return replace(node, entries={name: entry for name, entry in node.entries.items() if name not in rests})
+    rests = _rests(mapping(node))
+    return replace(node, entries={name: entry for name, entry in mapping(node).entries.items() if name not in rests})
 
 
 def _rests(node: MappingNode) -> set[str]:
@@ -167,9 +163,7 @@ def _rests(node: MappingNode) -> set[str]:
 
 
 def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnostic]:
-    if not isinstance(node, MappingNode):
-        raise TypeError("only a mapping has keys")
-    for name, entry in node.entries.items():
+    for name, entry in mapping(node).entries.items():
         if name not in known and not entry.key.broken:
             elsewhere = "" if nearest(name, known) else _owners(name, path)
             hint = elsewhere or did_you_mean(name, known)
@@ -191,12 +185,11 @@ def _has(schema: Any, name: str) -> bool:
 
 
 def _with_known_keys(node: Node, known: list[str]) -> Node:
-    if not isinstance(node, MappingNode):
-        raise TypeError("only a mapping has keys")
+    written = mapping(node).entries
     entries: dict[str, Entry] = {}
     broken = node.broken
-    for name, entry in node.entries.items():
-        meant = name if name in known else nearest(name, [key for key in known if key not in node.entries])
+    for name, entry in written.items():
+        meant = name if name in known else nearest(name, [key for key in known if key not in written])
         if meant is None or (meant != name and meant in entries):
             broken = True  # what the key was to say is lost
         else:

@@ -1,7 +1,7 @@
 """Numbers with units: durations, sizes and rates, from the text of a table and back.
 
-Parsing is exact: what does not come to a whole base unit is refused. Every `parse_*` raises ValueError with a sentence
-that says what is wrong. Formatting gives the shortest text that is parsed as the same number.
+Parsing is exact: what does not come to a whole base unit is refused. Parsers raise ValueError with a sentence that says
+what is wrong. Showing gives the shortest text that is parsed as the same number.
 """
 
 from __future__ import annotations
@@ -75,40 +75,10 @@ def parse_duration(text: str) -> int:
     return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION)
 
 
-def parse_coalesce(text: str) -> int:
-    """`1ms` as nanoseconds, or `never` as 0."""
-    return 0 if text == NEVER else _exact(text, _NANOSECONDS, "nanoseconds", MAX_COALESCE)
-
-
-def parse_size(text: str) -> int:
-    """`4MiB` or `64kB` as bytes."""
-    return _exact(text, _BYTES, "bytes", MAX_SIZE)
-
-
-def parse_disk_size(text: str) -> int:
-    """`4GiB` as bytes of files."""
-    return _exact(text, _DISK_BYTES, "bytes", MAX_DISK_SIZE, MIN_DISK_SIZE)
-
-
-def parse_patience(text: str) -> int:
-    """`5s` as nanoseconds, or `never` as 0."""
-    return 0 if text == NEVER else parse_duration(text)
-
-
-def parse_datagram_size(text: str) -> int:
-    """`1400B` as bytes of a UDP datagram."""
-    return _exact(text, _BYTES, "bytes", LARGEST_DATAGRAM, MIN_DATAGRAM)
-
-
-def parse_message_size(text: str) -> int:
-    """`16MiB` as bytes of one message's text."""
-    return _exact(text, _BYTES, "bytes", MAX_MESSAGE, MIN_MESSAGE)
-
-
 def parse_period(text: str) -> int:
-    """`500ms` as nanoseconds, or `each` as 0."""
-    period = 0 if text == EACH else parse_duration(text)
-    if 0 < period < MIN_PERIOD:
+    """`500ms` as nanoseconds, of a gateway that ticks."""
+    period = parse_duration(text)
+    if period < MIN_PERIOD:
         raise ValueError(f"'{text}' is shorter than {MIN_PERIOD // 10**6}ms; 'each' sends every message")
     return period
 
@@ -119,11 +89,6 @@ def parse_interval(text: str) -> int:
     if interval < MIN_INTERVAL:
         raise ValueError(f"'{text}' is shorter than {MIN_INTERVAL // 10**6}ms")
     return interval
-
-
-def parse_data_rate(text: str) -> int:
-    """`500kB/s` as bytes per second."""
-    return _exact(text, _BYTES_PER_SECOND, "bytes per second", MAX_DATA_RATE)
 
 
 def parse_rate(value: str | float) -> float:
@@ -138,9 +103,7 @@ def parse_rate(value: str | float) -> float:
 
 
 def parse_topic_rate(value: str | float) -> int:
-    """`50 Hz` or a plain number as a period in nanoseconds, or `each` as 0."""
-    if value == EACH:
-        return 0
+    """`50 Hz` or a plain number as a period in nanoseconds."""
     period = round(1e9 / parse_rate(value))
     if not MIN_PERIOD <= period <= MAX_DURATION:
         raise ValueError(f"a topic's rate is at most {10**9 // MIN_PERIOD} Hz, or 'each'")
@@ -174,45 +137,14 @@ def duration(ns: int) -> str:
     return f"{ns} ns"
 
 
-def duration_or_never(ns: int) -> str:
-    """0 is never."""
-    return duration(ns) if ns else NEVER
-
-
-def period(ns: int) -> str:
-    """`500 ms`, or `each` for 0."""
-    return duration(ns) if ns else EACH
-
-
-def size(count: int) -> str:
-    """`4 MiB`, `64 kB`, `1400 B`, for buffers and messages."""
-    return _in_bytes(count, _BYTES)
-
-
-def disk_size(count: int) -> str:
-    """`4 GiB`."""
-    return _in_bytes(count, _DISK_BYTES)
-
-
-def data_rate(count: int) -> str:
-    """`500 kB/s`."""
-    return f"{_in_bytes(count, _BYTES)}/s"
-
-
 def rate(hertz: float) -> str:
     """`30 Hz`."""
     return _in_hertz(hertz, lambda text: parse_rate(text) == hertz)
 
 
 def topic_rate(ns: int) -> str:
-    """A gateway's period as `50 Hz`, or `each` for 0."""
-    return _in_hertz(1e9 / ns, lambda text: parse_topic_rate(text) == ns) if ns else EACH
-
-
-def _in_bytes(count: int, units: Mapping[str, int]) -> str:
-    """In the largest unit that gives a whole number."""
-    unit = next(unit for unit in reversed([*units]) if count % units[unit] == 0)
-    return f"{count // units[unit]} {unit}"
+    """A period as `50 Hz`."""
+    return _in_hertz(1e9 / ns, lambda text: parse_topic_rate(text) == ns)
 
 
 def _in_hertz(hertz: float, is_same: Callable[[str], bool]) -> str:
@@ -224,16 +156,36 @@ def _in_hertz(hertz: float, is_same: Callable[[str], bool]) -> str:
     return f"{hertz:.{_MAX_DECIMALS}f} Hz"
 
 
+def _or(word: str, quantity: Quantity, instead: int | None = 0) -> Quantity:
+    """The quantity, with a word that is read as `instead`."""
+    return Quantity(
+        lambda text: instead if text == word else quantity.parse(text),
+        lambda value: quantity.show(value) if value else word,
+    )
+
+
+def _bytes(units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> Quantity:
+    """Bytes, shown in the largest unit that gives a whole number."""
+
+    def show(count: int) -> str:
+        unit = next(unit for unit in reversed([*units]) if count % units[unit] == 0)
+        return f"{count // units[unit]} {unit}"
+
+    return Quantity(lambda text: _exact(text, units, base, largest, smallest), show)
+
+
 DURATION = Quantity(parse_duration, duration)
-PATIENCE = Quantity(lambda text: parse_patience(text) or None, lambda ns: duration_or_never(ns or 0))
-"""None for `never`."""
-COALESCE = Quantity(parse_coalesce, duration_or_never)
-PERIOD = Quantity(parse_period, period)
+PATIENCE = _or(NEVER, DURATION, instead=None)
+COALESCE = _or(NEVER, Quantity(lambda text: _exact(text, _NANOSECONDS, "nanoseconds", MAX_COALESCE), duration))
+PERIOD = _or(EACH, Quantity(parse_period, duration))
 INTERVAL = Quantity(parse_interval, duration)
-SIZE = Quantity(parse_size, size)
-DATAGRAM_SIZE = Quantity(parse_datagram_size, size)
-MESSAGE_SIZE = Quantity(parse_message_size, size)
-DISK_SIZE = Quantity(parse_disk_size, disk_size)
-DATA_RATE = Quantity(parse_data_rate, data_rate)
 RATE = Quantity(parse_rate, rate)
-TOPIC_RATE = Quantity(parse_topic_rate, topic_rate)
+TOPIC_RATE = _or(EACH, Quantity(parse_topic_rate, topic_rate))
+SIZE = _bytes(_BYTES, "bytes", MAX_SIZE)
+"""Of a buffer."""
+DATAGRAM_SIZE = _bytes(_BYTES, "bytes", LARGEST_DATAGRAM, MIN_DATAGRAM)
+MESSAGE_SIZE = _bytes(_BYTES, "bytes", MAX_MESSAGE, MIN_MESSAGE)
+"""Of the text of one message."""
+DISK_SIZE = _bytes(_DISK_BYTES, "bytes", MAX_DISK_SIZE, MIN_DISK_SIZE)
+"""Of files."""
+DATA_RATE = _bytes(_BYTES_PER_SECOND, "bytes per second", MAX_DATA_RATE)

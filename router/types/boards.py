@@ -164,7 +164,7 @@ def largest_encoding(message: Descriptor, options_of: OptionsOf) -> int | None:
     """
     if any(unbounded_fields(message, options_of)):
         return None
-    return _message_size(message, options_of)
+    return _size_of(message.fields, options_of)
 
 
 def largest_beside(oneof: OneofDescriptor, options_of: OptionsOf) -> int:
@@ -211,10 +211,6 @@ def _why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
     return None
 
 
-def _message_size(message: Descriptor, options_of: OptionsOf) -> int:
-    return _size_of(message.fields, options_of)
-
-
 def _size_of(fields: Iterable[FieldDescriptor], options_of: OptionsOf) -> int:
     total = 0
     in_oneofs: dict[str, int] = {}
@@ -243,7 +239,7 @@ def _value_size(field: FieldDescriptor, options: BoardOptions, options_of: Optio
     if field.type == FieldDescriptor.TYPE_ENUM:
         return max(_varint_size(value.number) for value in enum_of(field).values)
     if field.type == FieldDescriptor.TYPE_MESSAGE:
-        inner = _message_size(message_of(field), options_of)
+        inner = _size_of(message_of(field).fields, options_of)
         return _varint_size(inner) + inner
     if field.type == FieldDescriptor.TYPE_STRING:
         size = options.string_size or 1

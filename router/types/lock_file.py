@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,6 @@ ENVELOPE, ONEOF = "PBEnvelope", "payload"
 """The envelope's names where there is neither table nor lock to say them."""
 
 _FIELD = re.compile(r"(?:oneof (?P<oneof>\w+): )?(?P<type>\S.*) (?P<name>\w+)")
-_NUMBER = re.compile(r"-?[0-9]+")
-_RANGE = re.compile(r"(-?[0-9]+) to (-?[0-9]+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,20 +57,22 @@ class Lock:
 
 def read_lock(path: Path) -> Lock | None:
     """None where there is no such file. Raises TableError for a broken one."""
+    span = SourceSpan(shown_path(path))
     try:
         content = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_without_duplicates)
         return _parsed(content)
     except FileNotFoundError:
         return None
     except json.JSONDecodeError as error:
-        span = SourceSpan(shown_path(path), error.lineno, error.colno, error.colno + 1)
+        span = SourceSpan(span.file, error.lineno, error.colno, error.colno + 1)
         if re.match("<{7}|={7}|>{7}", error.doc.split("\n")[error.lineno - 1]):
             hint = "take one side; `router validate` then says how to record what the other one had"
             raise TableError([Diagnostic(span, Code.BAD_FILE, "an unresolved merge", hint)]) from None
         problem = error.msg
     except (OSError, ValueError, RecursionError) as error:
-        span = SourceSpan(shown_path(path))
         problem = str(error)
+    except (LookupError, TypeError, AttributeError):
+        problem = "it has another structure"
     hint = "take the file from version control; without it nobody knows which numbers are taken"
     raise TableError([Diagnostic(span, Code.BAD_FILE, f"not a lock file: {problem}", hint)])
 
@@ -140,77 +140,41 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Two branches that gave out one number leave two equal keys after a merge."""
     content = dict(pairs)
     if len(content) < len(pairs):
-        seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        twice = next(key for index, (key, _) in enumerate(pairs) if key in dict(pairs[:index]))
         raise ValueError(f"the key '{twice}' stands there twice")
     return content
 
 
-def _parsed(content: object) -> Lock:
-    top = _mapping(content, "the file")
-    envelope = _mapping(top.get("envelope"), "envelope")
-    max_size = envelope.get("max_size")
-    if not isinstance(max_size, int):
-        raise ValueError("envelope.max_size is no number")
+def _parsed(content: Any) -> Lock:
+    """Raises ValueError, LookupError, TypeError or AttributeError where the content has another structure."""
+    envelope = content["envelope"]
     return Lock(
-        message=_text(envelope.get("message"), "envelope.message"),
-        oneof=_text(envelope.get("oneof"), "envelope.oneof"),
-        max_size=max_size,
-        messages={
-            name: Declaration(file, frozenset(_field_entries(members, name)), reserved)
-            for name, file, members, reserved in _declarations(top, "messages", "fields")
-        },
-        enums={
-            name: Declaration(file, frozenset(_value_entries(members, name)), reserved)
-            for name, file, members, reserved in _declarations(top, "enums", "values")
-        },
+        message=str(envelope["message"]),
+        oneof=str(envelope["oneof"]),
+        max_size=int(envelope["max_size"]),
+        messages={name: _declared(each, "fields", _field_entries) for name, each in content["messages"].items()},
+        enums={name: _declared(each, "values", _value_entries) for name, each in content["enums"].items()},
     )
 
 
-def _declarations(
-    top: Mapping[str, Any], kind: str, members: str
-) -> Iterator[tuple[str, str, Mapping[str, Any], frozenset[tuple[int, int]]]]:
-    for name, content in _mapping(top.get(kind), kind).items():
-        declared = _mapping(content, name)
-        file = _text(declared.get("file"), f"{name}.file")
-        ranges = declared.get("reserved", [])
-        if not isinstance(ranges, list):
-            raise ValueError(f"{name}.reserved is no list")
-        reserved = frozenset(_range(text, f"{name}.reserved") for text in ranges)
-        yield name, file, _mapping(declared.get(members), name), reserved
+def _declared(content: Any, kind: str, entries: Callable[[Mapping[str, str]], Iterator[Entry]]) -> Declaration:
+    reserved = frozenset(map(_range, content.get("reserved", ())))
+    return Declaration(str(content["file"]), frozenset(entries(content[kind])), reserved)
 
 
-def _range(text: object, what: str) -> tuple[int, int]:
+def _range(text: str) -> tuple[int, int]:
     """`20 to 29`."""
-    found = _RANGE.fullmatch(_text(text, what))
-    if found is None:
-        raise ValueError(f"{what} has '{text}' where two numbers belong")
-    return int(found[1]), int(found[2])
+    first, last = text.split(" to ")
+    return int(first), int(last)
 
 
-def _field_entries(fields: Mapping[str, Any], message: str) -> Iterator[Entry]:
+def _field_entries(fields: Mapping[str, str]) -> Iterator[Entry]:
     for number, declared in fields.items():
-        found = _FIELD.fullmatch(_text(declared, f"{message}.{number}"))
-        if not number.isdecimal() or found is None:
-            raise ValueError(f"{message} has '{number}: {declared}' where number, type and name belong")
+        if (found := _FIELD.fullmatch(declared)) is None:
+            raise ValueError(f"'{number}: {declared}' where number, type and name belong")
         yield Entry(int(number), found["name"], found["type"], found["oneof"] or "")
 
 
-def _value_entries(values: Mapping[str, Any], enum: str) -> Iterator[Entry]:
+def _value_entries(values: Mapping[str, str]) -> Iterator[Entry]:
     for number, names in values.items():
-        if not _NUMBER.fullmatch(number):
-            raise ValueError(f"{enum} has '{number}: {names}' where number and name belong")
-        for name in _text(names, f"{enum}.{number}").split():
-            yield Entry(int(number), name)
-
-
-def _mapping(value: object, what: str) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError(f"{what} is no mapping")
-    return value
-
-
-def _text(value: object, what: str) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{what} is no text")
-    return value
+        yield from (Entry(int(number), name) for name in names.split())

@@ -137,9 +137,6 @@ class ProtoSources:
         for file in self._files.values():
             self._add_file(file)
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._places
-
     def file(self, name: str) -> str:
         """The file that declares `name`, relative to the folder of the protos, with `/`."""
         return self._places[name].file

@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -90,16 +91,11 @@ class RosbagsDefinitions:
     out of them takes longer, and loses what a `byte` is.
     """
 
-    def __init__(self) -> None:
-        self._loaded: dict[str, Any] | None = None
-
-    @property
+    @cached_property
     def _definitions(self) -> dict[str, Any]:
-        if self._loaded is None:
-            from rosbags.typesys.stores.ros2_jazzy import FIELDDEFS
+        from rosbags.typesys.stores.ros2_jazzy import FIELDDEFS
 
-            self._loaded = FIELDDEFS
-        return self._loaded
+        return FIELDDEFS
 
     def find(self, name: str) -> FoundDefinition | None:
         if name not in self._definitions:
