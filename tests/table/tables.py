@@ -7,6 +7,7 @@ from pathlib import Path
 
 from router.errors import Code, Diagnostic
 from router.table import load_table
+from router.table.keys import flat
 from router.table.model import RouteTable
 
 GOOD = """\
@@ -64,6 +65,13 @@ routes:
     - {source: ros, topics: [{topic: it, type: comms/msg/DetectedObject}], fields: auto, destinations: [basestation]}
 """
 
+SMALL = """\
+version: 1
+envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
+listen: {rover: {address: 0.0.0.0:5000}}
+routes: {}
+"""
+
 GATEWAY = """\
   vr_headset:
     transport: {udp: "${HEADSET:-10.0.20.219:8502}"}
@@ -97,6 +105,32 @@ def load(
     path = folder / "table.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8"))
     return load_table(path, environ or {})
+
+
+def good(folder: Path, text: str, environ: Mapping[str, str] | None = None) -> RouteTable:
+    """The table of a text without a finding."""
+    table, findings = load(folder, text, environ)
+    assert findings == []
+    assert table
+    return table
+
+
+def parts(folder: Path, text: str) -> tuple[RouteTable, list[Diagnostic]]:
+    """What is left of the table of a text with findings."""
+    table, findings = load(folder, text)
+    assert table
+    assert findings
+    return table, findings
+
+
+def shown(part: object) -> dict[str, str]:
+    """Every setting of a part of a table, and of the parts in its lists, by key and index."""
+    settings = flat(part)
+    for key in [key for key in ("destinations", "topics", "inbound") if hasattr(part, key)]:
+        settings.pop(key, None)
+        for index, member in enumerate(getattr(part, key)):
+            settings |= {f"{key}.{index}.{name}": value for name, value in flat(member).items()}
+    return settings
 
 
 def places(findings: list[Diagnostic]) -> list[tuple[Code, int, int]]:

@@ -6,7 +6,7 @@ import pytest
 
 from router.errors import Code
 from router.table.addresses import Address
-from tests.table.tables import GOOD, load
+from tests.table.tables import GOOD, good, load
 
 
 @pytest.fixture
@@ -24,9 +24,7 @@ endpoints:
 routes:
   imu_info: {destinations: [tool]}
 """
-    table, findings = load(base, text)
-    assert not findings
-    assert table
+    table = good(base, text)
     assert list(table.endpoints) == ["sensor_board", "basestation", "tool"]
     basestation = table.endpoints["basestation"]
     assert basestation.address.value == Address("127.0.0.9", 1)
@@ -38,15 +36,9 @@ routes:
 
 def test_a_route_is_turned_off_and_on_as_a_whole(base: Path) -> None:
     (base / "off.yaml").write_text("extends: base.yaml\nroutes:\n  imu_info: {ignore: no sensor in this rover}\n")
-    table, findings = load(base, "extends: off.yaml\n")
-    assert table
-    assert not findings
+    table = good(base, "extends: off.yaml\n")
     assert (table.routes[0].ignore is not None, table.routes[0].topics) == (True, ())
-    table, findings = load(
-        base, "extends: off.yaml\nroutes:\n  imu_info: {source: sensor_board, destinations: [basestation]}\n"
-    )
-    assert table
-    assert not findings
+    table = good(base, "extends: off.yaml\nroutes:\n  imu_info: {source: sensor_board, destinations: [basestation]}\n")
     assert (table.routes[0].ignore, table.routes[0].topics) == (None, ())
 
 
@@ -58,9 +50,7 @@ routes:
   detected_object: {source: any, destinations: [basestation]}
   ph_info: [{source: any, destinations: [basestation]}]
 """
-    table, findings = load(base, text)
-    assert not findings
-    assert table
+    table = good(base, text)
     names = [route.name for route in table.routes]
     assert names == [
         "imu_info_from_sensor_board", "imu_info_from_ros", "arm_target", "ph_info", "manual_drive", "detected_object",
@@ -78,24 +68,19 @@ routes:
 def test_a_deadman_merges_but_for_the_payload_of_another_case(
     base: Path, send: str, case: str, fields: dict[str, str]
 ) -> None:
-    table, findings = load(base, f"extends: base.yaml\nroutes:\n  manual_drive: {{deadman: {{send: {send}}}}}\n")
-    assert not findings
-    assert table
+    table = good(base, f"extends: base.yaml\nroutes:\n  manual_drive: {{deadman: {{send: {send}}}}}\n")
     [deadman] = [route.deadman for route in table.routes if route.deadman]
     assert (deadman.timeout.value, deadman.case.value) == (300_000_000, case)
     assert {".".join(entry.path): entry.value.text for entry in deadman.fields.entries} == fields
 
 
 def test_a_reason_takes_the_place_of_a_deadman(base: Path) -> None:
-    table, findings = load(base, "extends: base.yaml\nroutes:\n  manual_drive: {deadman: no wheels here}\n")
-    assert not findings
-    assert table
+    table = good(base, "extends: base.yaml\nroutes:\n  manual_drive: {deadman: no wheels here}\n")
     assert not any(route.deadman for route in table.routes)
 
 
 def test_values_keep_the_place_where_they_were_written(base: Path) -> None:
-    table, _ = load(base, "extends: base.yaml\nendpoints:\n  basestation: {address: 127.0.0.9:1}\n")
-    assert table
+    table = good(base, "extends: base.yaml\nendpoints:\n  basestation: {address: 127.0.0.9:1}\n")
     address = table.endpoints["basestation"].address.span
     assert (Path(address.file).name, address.line) == ("table.yaml", 3)
     assert Path(table.endpoints["sensor_board"].span.file).name == "base.yaml"
@@ -104,16 +89,12 @@ def test_values_keep_the_place_where_they_were_written(base: Path) -> None:
 def test_chains_are_followed_from_file_to_file(base: Path) -> None:
     (base / "deep").mkdir()
     (base / "deep" / "middle.yaml").write_text("extends: ../base.yaml\nnode: {name: middle}\n")
-    table, findings = load(base, "extends: deep/middle.yaml\n")
-    assert not findings
-    assert table
+    table = good(base, "extends: deep/middle.yaml\n")
     assert (table.node.name, len(table.files)) == ("middle", 3)
 
 
 def test_variables_are_filled_in_the_path(base: Path) -> None:
-    table, findings = load(base, "extends: ${BASE}.yaml\n", {"BASE": "base"})
-    assert table
-    assert not findings
+    good(base, "extends: ${BASE}.yaml\n", {"BASE": "base"})
 
 
 @pytest.mark.parametrize(
