@@ -58,15 +58,13 @@ def with_envelope(root: Path) -> Path:
     return root
 
 
-@pytest.fixture
-def envelope() -> Callable[[ProtoSchema], Envelope]:
-    """The envelope `Envelope.payload` of a schema."""
-    return lambda schema: find_envelope(schema, ONEOF)
-
-
 def settings(root: Path, message: str = "Envelope") -> tuple[Located[Path], Located[str]]:
     """The folder and the envelope's name as a table says them."""
     return Located(root, SourceSpan("table.yaml", 2, 1)), Located(message, SourceSpan("table.yaml", 3, 12))
+
+
+def proto(body: str) -> str:
+    return f'syntax = "proto3";\n{body}\n'
 
 
 @pytest.fixture(scope="session")

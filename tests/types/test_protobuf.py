@@ -12,7 +12,7 @@ import pytest
 from router.errors import Code, Diagnostic, SourceSpan, TableError
 from router.types.lock import LockComparison
 from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
-from router.types.model import Bool, Bytes, Enum, Float, Int, List, String, Type
+from router.types.model import Bytes, Enum, Float, Int, List, MessageType, String
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.types.conftest import ONEOF, settings
 
@@ -309,74 +309,73 @@ def test_folder_whose_imports_are_elsewhere_in_it_is_the_right_one(refused: Refu
     assert finding.hint == "did you mean 'protos/rover/imu/imu.proto'?"
 
 
-I32, I64, U32, U64 = Int(32, True), Int(64, True), Int(32, False), Int(64, False)
+TYPES = """\
+syntax = "proto3";
+package p;
+import "google/protobuf/timestamp.proto";
+enum E { option allow_alias = true; A = 0; B = 0; C = -3; }
+message Scalars {
+  bool z = 19; float a = 2; double b = 3; string c = 4; bytes d = 5;
+  int32 e = 6; sint32 f = 7; sfixed32 g = 8; uint32 h = 9; fixed32 i = 10;
+  int64 j = 11; sint64 k = 12; sfixed64 l = 13; uint64 m = 14; fixed64 n = 15;
+}
+message Kinds {
+  // Acceleration,
+  // all axes.
+  float plain = 1;  // m/s^2
+  optional int32 maybe = 2;
+  Kinds itself = 3;
+  oneof choice { E one = 4; }
+  repeated float many = 5;
+  map<string, float> pairs = 6;
+  google.protobuf.Timestamp at = 7;
+  message Inner { enum Mode { X = 0; } Mode mode = 1; }
+  repeated Inner inner = 8;
+}
+"""
 
 
-@pytest.mark.parametrize(
-    ("declared", "type_"),
-    [
-        ("bool", Bool()), ("float", Float(32)), ("double", Float(64)), ("string", String()), ("bytes", Bytes()),
-        ("int32", I32), ("sint32", I32), ("sfixed32", I32), ("uint32", U32), ("fixed32", U32),
-        ("int64", I64), ("sint64", I64), ("sfixed64", I64), ("uint64", U64), ("fixed64", U64),
-        ("repeated float", List(Float(32))),
-    ],
-)  # fmt: skip
-def test_scalars(load: Load, declared: str, type_: Type) -> None:
-    schema = load({"a.proto": f'syntax = "proto3";\nmessage A {{ {declared} x = 7; }}'})
-    (field,) = schema.messages["A"].fields
-    assert (field.name, field.number, field.type) == ("x", 7, type_)
+def listed(message: MessageType) -> list[str]:
+    """The fields in their declared order."""
+    return [
+        f"{field.name} = {field.number}: {field.type}"
+        + " with presence" * field.has_presence
+        + " required" * field.is_required
+        + (f" in {field.oneof}" if field.oneof else "")
+        + (f"  # {field.comment}" if field.comment else "")
+        for field in message.fields
+    ]
 
 
-def test_fields_keep_their_declared_order(load: Load) -> None:
-    schema = load({"a.proto": 'syntax = "proto3";\nmessage A { bool z = 9; bool a = 1; bool m = 5; }'})
-    assert [field.name for field in schema.messages["A"].fields] == ["z", "a", "m"]
-
-
-def test_presence_is_that_of_optional_oneof_and_message_fields(load: Load) -> None:
-    schema = load(
-        {
-            "a.proto": 'syntax = "proto3";\nmessage A {\n'
-            "  int32 plain = 1;\n  optional int32 maybe = 2;\n  A nested = 3;\n"
-            "  oneof choice { int32 one = 4; }\n  repeated int32 many = 5;\n}"
-        }
-    )
-    presence = {field.name: field.has_presence for field in schema.messages["A"].fields}
-    assert presence == {"plain": False, "maybe": True, "nested": True, "one": True, "many": False}
-
-
-def test_enum_knows_names_aliases_and_negative_values(load: Load) -> None:
-    schema = load(
-        {
-            "a.proto": 'syntax = "proto3";\nenum E { option allow_alias = true; A = 0; B = 0; C = -3; }\n'
-            "message M { E e = 1; }"
-        }
-    )
-    declared = Enum("E", (("A", 0), ("B", 0), ("C", -3)))
-    assert schema.enums == {"E": declared}
-    assert schema.messages["M"].fields[0].type == declared
-
-
-def test_nested_types_have_full_names(load: Load) -> None:
-    schema = load(
-        {"a.proto": 'syntax = "proto3";\npackage p;\nmessage A { message B { enum C { X = 0; } C c = 1; } B b = 1; }'}
-    )
-    assert list(schema.messages) == ["p.A", "p.A.B", "Envelope"]
-    assert list(schema.enums) == ["p.A.B.C"]
-    assert schema.messages["p.A"].fields[0].type is schema.messages["p.A.B"]
-
-
-def test_message_may_contain_itself(load: Load) -> None:
-    schema = load({"a.proto": 'syntax = "proto3";\nmessage A { A a = 1; repeated B b = 2; }\nmessage B { A a = 1; }'})
-    a = schema.messages["A"]
-    assert a.fields[0].type is a
-    assert a.fields[1].type == List(schema.messages["B"])
-
-
-def test_map_is_a_list_of_its_entries(load: Load) -> None:
-    schema = load({"a.proto": 'syntax = "proto3";\nmessage A { map<string, float> m = 1; }'})
-    entry = schema.messages["A.MEntry"]
-    assert schema.messages["A"].fields[0].type == List(entry)
-    assert [(field.name, field.type) for field in entry.fields] == [("key", String()), ("value", Float(32))]
+def test_every_kind_of_field_has_its_type(load: Load) -> None:
+    schema = load({"a.proto": TYPES})
+    ours = {name: message for name, message in schema.messages.items() if name.startswith("p.")}
+    assert {name: listed(message) for name, message in ours.items()} == {
+        "p.Scalars": [
+            "z = 19: bool", "a = 2: float32", "b = 3: float64", "c = 4: string", "d = 5: bytes", "e = 6: int32",
+            "f = 7: int32", "g = 8: int32", "h = 9: uint32", "i = 10: uint32", "j = 11: int64", "k = 12: int64",
+            "l = 13: int64", "m = 14: uint64", "n = 15: uint64",
+        ],
+        "p.Kinds": [
+            "plain = 1: float32  # Acceleration, all axes. m/s^2",
+            "maybe = 2: int32 with presence in _maybe",
+            "itself = 3: p.Kinds with presence",
+            "one = 4: p.E with presence in choice",
+            "many = 5: float32[]",
+            "pairs = 6: p.Kinds.PairsEntry[]",
+            "at = 7: google.protobuf.Timestamp with presence",
+            "inner = 8: p.Kinds.Inner[]",
+        ],
+        "p.Kinds.PairsEntry": ["key = 1: string required", "value = 2: float32 required"],
+        "p.Kinds.Inner": ["mode = 1: p.Kinds.Inner.Mode"],
+    }  # fmt: skip
+    assert list(schema.messages) == ["google.protobuf.Timestamp", *ours, "Envelope"]
+    assert schema.enums["p.E"] == Enum("p.E", (("A", 0), ("B", 0), ("C", -3)))
+    assert list(schema.enums) == ["p.E", "p.Kinds.Inner.Mode"]
+    kinds = schema.messages["p.Kinds"]
+    assert kinds.fields[2].type is kinds, "a name has one type"
+    stamp = schema.messages["google.protobuf.Timestamp"]
+    assert [(field.name, str(field.type)) for field in stamp.fields] == [("seconds", "int64"), ("nanos", "int32")]
 
 
 def test_proto2_with_required_groups_and_extensions(load: Load) -> None:
@@ -388,30 +387,8 @@ def test_proto2_with_required_groups_and_extensions(load: Load) -> None:
         }
     )
     x, part = schema.messages["A"].fields
-    assert (x.type, x.has_presence) == (I32, True)
+    assert (x.type, x.has_presence, x.is_required) == (Int(32, True), True, True)
     assert (part.name, part.type) == ("part", List(schema.messages["A.Part"]))
-
-
-def test_well_known_types_can_be_imported(load: Load) -> None:
-    schema = load(
-        {
-            "a.proto": 'syntax = "proto3";\nimport "google/protobuf/timestamp.proto";\n'
-            "message A { google.protobuf.Timestamp at = 1; }"
-        }
-    )
-    stamp = schema.messages["google.protobuf.Timestamp"]
-    assert schema.messages["A"].fields[0].type is stamp
-    assert [(field.name, field.type) for field in stamp.fields] == [("seconds", I64), ("nanos", I32)]
-
-
-def test_comments_above_and_beside_a_field_are_one_line(load: Load) -> None:
-    schema = load(
-        {
-            "a.proto": 'syntax = "proto3";\nmessage A {\n  // Acceleration,\n  // all axes.\n'
-            "  float x = 1;  // m/s^2\n  float y = 2;\n}"
-        }
-    )
-    assert [field.comment for field in schema.messages["A"].fields] == ["Acceleration, all axes. m/s^2", ""]
 
 
 def test_options_of_the_boards_are_bounds(load: Load) -> None:

@@ -9,13 +9,9 @@ import pytest
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
 from router.types.protobuf import load_protos
-from tests.types.conftest import settings, with_envelope
+from tests.types.conftest import proto, settings, with_envelope
 
 Write = Callable[[Mapping[str, str]], Path]
-
-
-def proto(body: str) -> str:
-    return f'syntax = "proto3";\n{body}\n'
 
 
 def test_nothing_is_printed(write: Write, capfd: pytest.CaptureFixture[str]) -> None:
