@@ -154,8 +154,9 @@ def _is_rest(tree: Node, path: Path) -> bool:
 
 
 def _without_rests(node: Node) -> Node:
-    rests = _rests(mapping(node))
-    return replace(node, entries={name: entry for name, entry in mapping(node).entries.items() if name not in rests})
+    written = mapping(node)
+    rests = _rests(written)
+    return replace(written, entries={name: entry for name, entry in written.entries.items() if name not in rests})
 
 
 def _rests(node: MappingNode) -> set[str]:
@@ -185,16 +186,16 @@ def _has(schema: Any, name: str) -> bool:
 
 
 def _with_known_keys(node: Node, known: list[str]) -> Node:
-    written = mapping(node).entries
+    written = mapping(node)
     entries: dict[str, Entry] = {}
-    broken = node.broken
-    for name, entry in written.items():
-        meant = name if name in known else nearest(name, [key for key in known if key not in written])
+    broken = written.broken
+    for name, entry in written.entries.items():
+        meant = name if name in known else nearest(name, [key for key in known if key not in written.entries])
         if meant is None or (meant != name and meant in entries):
             broken = True  # what the key was to say is lost
         else:
             entries[meant] = entry
-    return replace(node, entries=entries, broken=broken)
+    return replace(written, entries=entries, broken=broken)
 
 
 # Messages

@@ -96,7 +96,9 @@ def test_a_reader_that_leaves_early_is_no_reason_to_complain() -> None:
 def test_a_caller_may_close_the_standard_streams() -> None:
     router = [sys.executable, "-m", "router", "validate", str(ROUTES / "sim.yaml")]
     started = [
-        subprocess.Popen(["sh", "-c", f'exec "$@" {closed}', "sh", *router], cwd=REPOSITORY, stdout=subprocess.DEVNULL)
+        subprocess.Popen(
+            ["/bin/sh", "-c", f'exec "$@" {closed}', "sh", *router], cwd=REPOSITORY, stdout=subprocess.DEVNULL
+        )
         for closed in ("<&-", ">&-", "2>&-", "<&- >&- 2>&-")
     ]
     assert [process.wait(timeout=60) for process in started] == [OK] * len(started)
