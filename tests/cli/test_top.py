@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import http.server
 import os
 import pty
 import re
@@ -13,7 +12,6 @@ import struct
 import subprocess
 import sys
 import termios
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,9 +20,11 @@ import pytest
 
 from router.cli import BAD_USAGE, OK, main
 from tests.ports import free_port
+from tests.tools.answering import answering
 
 PATIENCE = 30.0
-METRICS = b"""\
+BASE = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
+METRICS = """\
 router_datagrams_received_total{listener="rover"} 7
 router_messages_received_total{route="imu_info",source="sensor_board"} 7
 router_messages_received_total{route="gps_info",source="sensor_board"} 0
@@ -35,49 +35,26 @@ router_endpoint_last_seen_timestamp_seconds{endpoint="sensor_board"} 0
 """
 
 
-class Handler(http.server.BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
-        assert self.path == "/metrics"
-        self.send_response(200)
-        self.end_headers()
-        self.wfile.write(METRICS)
-
-    def log_message(self, *_: object) -> None:
-        """Keep quiet."""
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def served() -> Iterator[str]:
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-        thread.join()
+    with answering(METRICS) as url:
+        yield url
 
 
 def test_without_a_terminal_it_is_shown_once(served: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top", "--url", served, "--interval", "0.01", "--sort", "drops"]) == OK
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("in 7 (0.0/s), delivered 7") or lines[0].startswith("in 7 (0/s), delivered 7")
+    assert lines[0].startswith("in 7 (0/s), delivered 7")
     assert [line.split()[0] for line in lines[3:]] == ["gps_info", "imu_info"]
 
 
-def test_the_address_is_that_of_the_table(served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = tmp_path / "table.yaml"
-    base = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
-    table.write_text(f"version: 1\nextends: {base}\nmetrics: {{address: {served.removeprefix('http://')}}}\n")
-    assert main(["top", str(table), "--once", "--interval", "0.01"]) == OK
-    assert "imu_info" in capsys.readouterr().out
-
-
-def test_a_table_with_errors_has_an_address_all_the_same(
-    served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("more", ["", "endpoints: {arm_board: {kind: bord}}\n"], ids=["good", "with errors"])
+def test_the_address_is_that_of_the_table(
+    served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: str
 ) -> None:
     table = tmp_path / "table.yaml"
-    base = Path(__file__).parents[1] / "bad_tables" / "base" / "base.yaml"
-    text = f"version: 1\nextends: {base}\nmetrics: {{address: {served.removeprefix('http://')}}}\n"
-    table.write_text(f"{text}endpoints: {{arm_board: {{kind: bord}}}}\n")
+    address = served.removeprefix("http://")
+    table.write_text(f"version: 1\nextends: {BASE}\nmetrics: {{address: {address}}}\n{more}")
     assert main(["top", str(table), "--once", "--interval", "0.01"]) == OK
     assert "imu_info" in capsys.readouterr().out
 
@@ -94,31 +71,20 @@ def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> N
     assert re.fullmatch(r"router top: no router answers at 127\.0\.0\.1:\d+: .*\n", capsys.readouterr().err)
 
 
-@pytest.mark.parametrize(
-    "text", [b"<html>hello</html>", b"", b'node_cpu{cpu="0"} 1\n', b'router_kernel_drops{a="b"} 1\n']
-)
-def test_what_is_no_router_is_said_in_a_line(
-    served: str, text: bytes, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(f"{__name__}.METRICS", text)
-    assert main(["top", "--url", served, "--interval", "0.01"]) == 1
-    assert re.fullmatch(rf"router top: what answers at {served}/metrics is no router.*\n", capsys.readouterr().err)
+@pytest.mark.parametrize("text", ["<html>hello</html>", "", 'node_cpu{cpu="0"} 1\n', 'router_kernel_drops{a="b"} 1\n'])
+def test_what_is_no_router_is_said_in_a_line(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with answering(text) as url:
+        assert main(["top", "--url", url, "--interval", "0.01"]) == 1
+    assert re.fullmatch(rf"router top: what answers at {url}/metrics is no router.*\n", capsys.readouterr().err)
 
 
-@pytest.mark.parametrize("url", ["http://a:99999", "http://[::1", "ftp://a", "http://", "http://a b:1", "a:port"])
-def test_what_is_no_address_is_wrong_usage(url: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top", "--url", url]) == BAD_USAGE
-    assert f"'{url}' is not like http://127.0.0.1:9108" in capsys.readouterr().err
-
-
-def read_until(terminal: int, wanted: str, seen: str = "") -> str:
-    """What the terminal shows until it shows `wanted`."""
-    limit = time.monotonic() + PATIENCE
+def read_until(terminal: int, wanted: str) -> None:
+    """Read what the terminal shows until it shows `wanted`."""
+    limit, seen = time.monotonic() + PATIENCE, ""
     while wanted not in seen:
         ready, _, _ = select.select([terminal], [], [], limit - time.monotonic())
         assert ready, f"no {wanted!r} in {seen!r}"
         seen += os.read(terminal, 65536).decode()
-    return seen
 
 
 def test_on_a_terminal_keys_sort_and_end_it(served: str) -> None:
