@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
-
 COLLECTED_AT = 1_500_000_000.25
 """When its numbers were read, s."""
 

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
-from time import time
 
 import pytest
 
@@ -31,7 +30,7 @@ from router.tools.doctor_checks import (
     shared_memory,
 )
 from tests.ports import free_port
-from tests.tools.answering import answering
+from tests.tools.answering import COLLECTED_AT, answering
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -165,9 +164,8 @@ def test_an_open_ros_domain_is_a_warning(
     monkeypatch.setattr(doctor_checks, "interface_is_up", lambda _: True)
     assert list(open_domain(compiled(table), variables)) == []  # without topics
     topic = "ph_info: {source: sensor_board, topics: [{topic: ph, type: comms/msg/SensorBoardPHInfo, fields: auto}]"
-    found = open_domain(
-        rewritten(table, "ph_info: {source: sensor_board, destinations: [basestation]", topic), variables
-    )
+    program = rewritten(table, "ph_info: {source: sensor_board, destinations: [basestation]", topic)
+    found = open_domain(program, variables)
     assert [(each.grade, each.text.partition("looked for ")[2]) for each in found] == (
         [(Grade.WARNING, warned)] if warned else []
     )
@@ -320,7 +318,7 @@ def serving(program: Program, *samples: str) -> Iterator[None]:
 
 
 def seen(endpoint: str, ago: float) -> str:
-    return f'router_endpoint_last_seen_timestamp_seconds{{endpoint="{endpoint}"}} {time() - ago}'
+    return f'router_endpoint_last_seen_timestamp_seconds{{endpoint="{endpoint}"}} {COLLECTED_AT - ago}'
 
 
 def diagnosis(table: Path, *samples: str) -> list[CheckResult]:
