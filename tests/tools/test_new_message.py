@@ -38,21 +38,45 @@ TEST = """\
 """
 PAGE = Path(__file__).parents[2] / "docs" / "adding-a-message.md"
 SITE = Path(__file__).parent / "new_message_site"
+LOCK = "protos/envelope.lock.json"
+ENVELOPE = "protos/components/common/envelope.proto"
+RADIATION_PROTO = "protos/components/sensor_board/radiation.proto"
 Files = dict[str, str]
 
 
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A small rover with everything that a new message touches, in which the router then works.
-
-    Not the rover itself: that may have a radiation sensor some day.
+@pytest.fixture(scope="module")
+def small_rover(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small rover with everything that a new message touches. Not the rover itself: that may have a radiation sensor
+    some day.
     """
-    shutil.copytree(SITE, tmp_path, dirs_exist_ok=True)
+    folder = tmp_path_factory.mktemp("small") / "rover"
+    shutil.copytree(SITE, folder)
     for schema in asset("schemas").glob("*.json"):
-        shutil.copy(schema, tmp_path / "schemas")
-    monkeypatch.setattr(router.assets, "_PLACES", (tmp_path,))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+        shutil.copy(schema, folder / "schemas")
+    return folder
+
+
+def work_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(router.assets, "_PLACES", (folder,))
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
+def site(small_rover: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the small rover, in which the router then works."""
+    return work_in(shutil.copytree(small_rover, tmp_path, dirs_exist_ok=True), monkeypatch)
+
+
+def rewrite(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def assert_clean() -> None:
+    assert main(["validate", "--strict", "routes"]) == OK
+    assert main(["test", "routes"]) == OK
 
 
 def contents(site: Path) -> Files:
@@ -64,7 +88,7 @@ def added(before: Files, after: Files) -> dict[str, list[str]]:
     found = {}
     for name, text in after.items():
         lines = list(difflib.ndiff(before.get(name, "").splitlines(), text.splitlines()))
-        if name != "protos/envelope.lock.json":
+        if name != LOCK:
             assert [line for line in lines if line.startswith("- ")] == []
         if new := [line[2:] for line in lines if line.startswith("+ ")]:
             found[name] = new
@@ -75,9 +99,9 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
     before = contents(site)
     assert main(["new", *RADIATION, *FIELDS]) == OK
     new = added(before, contents(site))
-    lock = new.pop("protos/envelope.lock.json")
+    lock = new.pop(LOCK)
     assert '        "27": "oneof payload: SensorBoardRadiationInfo radiation_info"' in lock
-    assert new.pop("protos/components/sensor_board/radiation.proto") == [
+    assert new.pop(RADIATION_PROTO) == [
         "// Radiation info from the sensor board.",
         'syntax = "proto3";',
         "",
@@ -89,7 +113,7 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
         "  SensorStatus status = 3;",
         "}",
     ]
-    assert new.pop("protos/components/common/envelope.proto") == [
+    assert new.pop(ENVELOPE) == [
         'import "components/sensor_board/radiation.proto";',
         "",
         "    // sensor board",
@@ -112,6 +136,10 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
     assert new.pop("routes/rover.test.yaml") == TEST.splitlines()
     assert new.pop("routes/legacy.yaml") == ["  radiation_info: {source: any, destinations: [dst_a, dst_b]}"]
     assert new == {}
+    locked = contents(site)[LOCK]
+    assert_clean()
+    assert main(["schema", "lock", "--protos", "protos"]) == OK
+    assert contents(site)[LOCK] == locked
 
 
 def test_the_page_about_it_shows_what_is_written(site: Path) -> None:
@@ -127,27 +155,17 @@ def test_the_page_about_it_shows_what_is_written(site: Path) -> None:
         assert any("\n".join(map(str.strip, block.splitlines())) in text for text in written), block
 
 
-def test_tables_and_tests_are_clean_afterwards_and_the_lock_has_it_all(site: Path) -> None:
-    assert main(["new", *RADIATION, *FIELDS]) == OK
-    locked = contents(site)["protos/envelope.lock.json"]
-    assert main(["validate", "--strict", "routes"]) == OK
-    assert main(["test", "routes"]) == OK
-    assert main(["schema", "lock", "--protos", "protos"]) == OK
-    assert contents(site)["protos/envelope.lock.json"] == locked
-
-
 def test_a_second_one_of_the_board_stands_beside_the_first(site: Path) -> None:
     assert main(["new", *RADIATION]) == OK
     before = contents(site)
     assert main(["new", "SensorBoardDustInfo", "--number", "28", "--board", "sensor_board"]) == OK
-    envelope = added(before, contents(site))["protos/components/common/envelope.proto"]
+    envelope = added(before, contents(site))[ENVELOPE]
     assert envelope == ['import "components/sensor_board/dust.proto";', "    SensorBoardDustInfo dust_info = 28;"]
 
 
 def test_without_fields_it_has_a_number_and_what_most_messages_of_the_board_have(site: Path) -> None:
     assert main(["new", *RADIATION]) == OK
-    text = (site / "protos/components/sensor_board/radiation.proto").read_text(encoding="utf-8")
-    assert "{\n  float value = 1;\n  SensorState state = 2;\n}\n" in text
+    assert "{\n  float value = 1;\n  SensorState state = 2;\n}\n" in contents(site)[RADIATION_PROTO]
 
 
 def test_what_the_basestation_sends_goes_to_ros_alone(site: Path) -> None:
@@ -167,16 +185,14 @@ def test_a_board_without_routes_gets_a_section_at_the_end(site: Path) -> None:
     lines = added(before, contents(site))["routes/rover.yaml"]
     assert lines[1].startswith("  # ---- container board ----")
     assert lines[3] == "  lid:"
-    assert main(["validate", "--strict", "routes"]) == OK
-    assert main(["test", "routes"]) == OK
+    assert_clean()
 
 
 def test_long_names_do_not_make_long_lines(site: Path) -> None:
     name = "DrivingBoardWheelSlipAndWhateverElseThereIsToKnow"
     fields = ("--fields", "left:MotorInformation right:MotorInformation")
     assert main(["new", name, "--number", "27", "--board", "driving", *fields]) == OK
-    assert main(["validate", "--strict", "routes"]) == OK
-    assert main(["test", "routes"]) == OK
+    assert_clean()
     after = contents(site)
     lines = [*after["routes/rover.yaml"].splitlines(), *after["routes/rover.test.yaml"].splitlines()]
     assert max(map(len, lines)) <= 120
@@ -196,45 +212,46 @@ def test_a_table_beside_that_routes_in_its_own_way_is_left_to_a_person(
 
 
 @pytest.mark.parametrize(
-    ("words", "why"),
+    ("asked", "why"),
     [
-        (("SensorBoardRadiationInfo", "26", "sensor"), "number 26 belongs to 'manual_brake', for ever; 27 is free"),
-        (("SensorBoardRadiationInfo", "30", "sensor"), "says: Number 30 is promised"),
-        (("SensorBoardRadiationInfo", "0", "sensor"), "0 is no field number of protobuf; 27 is free"),
-        (("SensorBoardRadiationInfo", "19500", "sensor"), "19500 is no field number of protobuf"),
-        (("SensorBoardRadiationInfo", "27", "sensors"), "has no board 'sensors'; did you mean 'sensor'?"),
-        (("DoseInfo", "27", "sensor"), "write it as SensorBoardDoseInfo"),
-        (("SensorBoarddose", "27", "sensor"), "write it as SensorBoardDose"),
-        (("dose_info", "27", "sensor"), "of sensor_board; write it as SensorBoardRadiationInfo"),
-        (("SensorBoardPumpInfo", "27", "sensor"), "there is a message 'SensorBoardPumpInfo' already"),
-        (("SensorBoardManualBrake", "27", "sensor"), "has a payload case 'manual_brake' already, number 26"),
-        (("SensorBoardWantedControlMode", "27", "sensor"), "has a topic 'wanted_control_mode' already"),
-        (("SensorBoardImuSensorInfo", "27", "sensor"), "imu_sensor.proto already"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose"), "'dose' is no field; write name:type"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose:flot"), "did you mean 'float'?"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "dose:string"), "there is no type 'string'"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "Dose:float"), "'Dose' is no name of a field"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "from:float"), "'from' is no name of a field"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "on:bool"), "take another name"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool b:bool # both"), "belongs to one field"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:bool a:float"), "there are 2 fields 'a'"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "double:float"), "'double' is a word of C or C++"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "is:State"), "'is' is no name of a field"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", "a:string"), "there are bool, float, double,"),
-        (("SensorBoardSwitch", "27", "sensor"), "'switch' is a word of C or C++"),
-        (("SensorBoardOn", "27", "sensor"), "'on' is no text to readers of YAML"),
-        (("SensorBoardNull", "27", "sensor"), "'null' is no text to readers of YAML"),
-        (("SensorBoardRadiationInfo", "27", "sensor", "--fields", " "), "--fields names no field"),
+        ("SensorBoardRadiationInfo 26 sensor", "number 26 belongs to 'manual_brake', for ever; 27 is free"),
+        ("SensorBoardRadiationInfo 30 sensor", "says: Number 30 is promised"),
+        ("SensorBoardRadiationInfo 0 sensor", "0 is no field number of protobuf; 27 is free"),
+        ("SensorBoardRadiationInfo 19500 sensor", "19500 is no field number of protobuf"),
+        ("SensorBoardRadiationInfo 27 sensors", "has no board 'sensors'; did you mean 'sensor'?"),
+        ("DoseInfo 27 sensor", "write it as SensorBoardDoseInfo"),
+        ("SensorBoarddose 27 sensor", "write it as SensorBoardDose"),
+        ("dose_info 27 sensor", "of sensor_board; write it as SensorBoardRadiationInfo"),
+        ("SensorBoardPumpInfo 27 sensor", "there is a message 'SensorBoardPumpInfo' already"),
+        ("SensorBoardManualBrake 27 sensor", "has a payload case 'manual_brake' already, number 26"),
+        ("SensorBoardWantedControlMode 27 sensor", "has a topic 'wanted_control_mode' already"),
+        ("SensorBoardImuSensorInfo 27 sensor", "imu_sensor.proto already"),
+        ("SensorBoardSwitch 27 sensor", "'switch' is a word of C or C++"),
+        ("SensorBoardNull 27 sensor", "'null' is no text to readers of YAML"),
+        ("SensorBoardDose 27 sensor dose", "'dose' is no field; write name:type"),
+        ("SensorBoardDose 27 sensor dose:flot", "did you mean 'float'?"),
+        (
+            "SensorBoardDose 27 sensor dose:string",
+            "there is no type 'string' for 'dose'; there are bool, float, double,",
+        ),
+        ("SensorBoardDose 27 sensor Dose:float", "'Dose' is no name of a field"),
+        ("SensorBoardDose 27 sensor from:float", "'from' is no name of a field"),
+        ("SensorBoardDose 27 sensor on:bool", "take another name"),
+        ("SensorBoardDose 27 sensor a:bool b:bool # both", "belongs to one field"),
+        ("SensorBoardDose 27 sensor a:bool a:float", "there are 2 fields 'a'"),
+        ("SensorBoardDose 27 sensor double:float", "'double' is a word of C or C++"),
+        ("SensorBoardDose 27 sensor  ", "--fields names no field"),
     ],
 )
 def test_what_cannot_be_is_refused_and_nothing_is_written(
-    site: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], why: str
+    small_rover: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], asked: str, why: str
 ) -> None:
-    before = contents(site)
-    name, number, board, *rest = words
-    assert main(["new", name, "--number", number, "--board", board, *rest]) == BAD_USAGE
+    before = contents(work_in(small_rover, monkeypatch))
+    name, number, board, *fields = asked.split(" ", 3)
+    words = ["--number", number, "--board", board, *(["--fields", *fields] if fields else [])]
+    assert main(["new", name, *words]) == BAD_USAGE
     assert why in capsys.readouterr().err
-    assert contents(site) == before
+    assert contents(small_rover) == before
 
 
 def test_a_type_that_several_messages_have_is_to_be_said_whose(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -251,9 +268,9 @@ def test_the_type_of_a_field_may_be_in_a_file_that_nothing_imports_yet(site: Pat
     proto.write_text('syntax = "proto3";\nenum RadiationLevel { RADIATION_UNKNOWN = 0; }\n', encoding="utf-8")
     assert main(["validate", "--strict", "routes/rover.yaml"]) == OK
     assert main(["new", *RADIATION, "--fields", "level:RadiationLevel"]) == OK
-    text = (site / "protos/components/sensor_board/radiation.proto").read_text(encoding="utf-8")
-    assert 'import "components/sensor_board/radiation_level.proto";' in text
-    assert '"RADIATION_UNKNOWN"' in (site / "protos/envelope.lock.json").read_text(encoding="utf-8")
+    after = contents(site)
+    assert 'import "components/sensor_board/radiation_level.proto";' in after[RADIATION_PROTO]
+    assert '"RADIATION_UNKNOWN"' in after[LOCK]
 
 
 def test_a_type_in_a_file_with_a_fault_is_missed_with_the_fault(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -289,9 +306,8 @@ def test_the_route_goes_below_one_that_is_laid_out_in_another_way(site: Path, st
 
 
 def test_the_import_goes_where_imports_go(site: Path) -> None:
-    path = site / "protos/components/common/envelope.proto"
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace('import "', 'import  "'), encoding="utf-8")
+    path = site / ENVELOPE
+    rewrite(path, 'import "', 'import  "')
     assert main(["new", *RADIATION]) == OK
     lines = path.read_text(encoding="utf-8").splitlines()
     place = lines.index('import "components/sensor_board/radiation.proto";')
@@ -318,8 +334,10 @@ def test_a_name_and_its_value_stay_on_one_line_of_the_test(site: Path, kind: str
     assert not any(line.endswith(":") for line in lines)
 
 
-@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), KeyboardInterrupt()])
-@pytest.mark.parametrize("ending", [".proto", "rover.test.yaml"])
+@pytest.mark.parametrize(
+    ("error", "ending"),
+    [(PermissionError(13, "Permission denied"), "rover.test.yaml"), (KeyboardInterrupt(), ".proto")],
+)
 def test_what_is_interrupted_is_taken_back(
     site: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, ending: str
 ) -> None:
@@ -359,13 +377,9 @@ def test_what_is_interrupted_while_it_is_checked_is_taken_back(site: Path, monke
 
 
 def test_a_number_that_was_given_out_once_stays_taken(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lock = site / "protos/envelope.lock.json"
-    text = lock.read_text(encoding="utf-8")
     was = '"26": "oneof payload: BasestationManualBrake manual_brake"'
-    lock.write_text(text.replace(was, f'{was},\n        "27": "Gone gone_info"'), encoding="utf-8")
-    envelope = site / "protos/components/common/envelope.proto"
-    declared = envelope.read_text(encoding="utf-8")
-    envelope.write_text(declared.replace("  oneof payload {", "  reserved 27;\n  oneof payload {"), encoding="utf-8")
+    rewrite(site / LOCK, was, f'{was},\n        "27": "Gone gone_info"')
+    rewrite(site / ENVELOPE, "  oneof payload {", "  reserved 27;\n  oneof payload {")
     assert main(["new", *RADIATION]) == BAD_USAGE
     assert "number 27 belongs to 'gone_info', for ever; 28 is free" in capsys.readouterr().err
     assert main(["new", "SensorBoardGoneInfo", "--number", "28", "--board", "sensor"]) == BAD_USAGE
@@ -384,13 +398,7 @@ def test_what_turns_out_wrong_is_taken_back(site: Path, capsys: pytest.CaptureFi
 
 
 def test_a_table_with_errors_is_repaired_first(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = site / "routes/rover.yaml"
-    path.write_text(
-        path.read_text(encoding="utf-8").replace(
-            "type: comms/msg/SensorBoardPumpInfo", "type: comms/msg/SensorBoardPumpInf"
-        ),
-        encoding="utf-8",
-    )
+    rewrite(site / "routes/rover.yaml", "type: comms/msg/SensorBoardPumpInfo", "type: comms/msg/SensorBoardPumpInf")
     before = contents(site)
     assert main(["new", *RADIATION]) == BAD_TABLE
     assert "repair that first" in capsys.readouterr().err
@@ -417,11 +425,10 @@ def test_where_there_is_no_table_nothing_is_written(
 
 
 def test_the_lock_may_be_elsewhere(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lock = (site / "protos/envelope.lock.json").rename(site / "wire.lock.json")
+    lock = (site / LOCK).rename(site / "wire.lock.json")
     for table in (site / "routes/rover.yaml", site / "routes/legacy.yaml"):
-        text = table.read_text(encoding="utf-8")
-        table.write_text(text.replace("oneof: payload", "oneof: payload, lock: ../wire.lock.json"), encoding="utf-8")
+        rewrite(table, "oneof: payload", "oneof: payload, lock: ../wire.lock.json")
     assert main(["new", *RADIATION]) == OK
     assert "changed  wire.lock.json" in capsys.readouterr().out
     assert '"27": "oneof payload: SensorBoardRadiationInfo radiation_info"' in lock.read_text(encoding="utf-8")
-    assert not (site / "protos/envelope.lock.json").exists()
+    assert not (site / LOCK).exists()
