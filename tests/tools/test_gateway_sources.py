@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from websockets.sync.server import ServerConnection, serve
 
 from router.errors import Located
-from router.gateway.packets import PacketError, unpack
+from router.gateway.packets import unpack
 from router.table.addresses import Address
 from router.table.model import GatewayFormat, ZenohSettings
-from router.tools.gateway_sources import LONGEST, Source, Splitter, TcpSource, UdpSource, WebsocketSource, open_source
+from router.tools import gateway_sources
+from router.tools.gateway_sources import Source, Splitter, TcpSource, UdpSource, WebsocketSource, open_source
 from router.tools.zenoh_source import ZenohSource
 from tests.ports import free_port
 
@@ -26,7 +27,8 @@ Said = list[str]
 
 
 @pytest.fixture
-def said() -> Said:
+def said(monkeypatch: pytest.MonkeyPatch) -> Said:
+    monkeypatch.setattr(gateway_sources, "_TRY_AGAIN", 0.02)
     return []
 
 
@@ -44,14 +46,22 @@ def until(source: Source, condition: Callable[[], object]) -> None:
 
 
 @contextmanager
-def udp_source(gateway: Address | None, said: Said) -> Iterator[tuple[UdpSource, Address]]:
+def udp_source(said: Said, gateway: Address | None = None) -> Iterator[tuple[UdpSource, Address]]:
     port = free_port()
     with closing(UdpSource(Address("127.0.0.1", port), gateway, said.append)) as source:
         yield source, Address("127.0.0.1", port)
 
 
+@contextmanager
+def tcp_source(port: socket.socket, said: Said, form: GatewayFormat | None = None) -> Iterator[TcpSource]:
+    """Connected to `port`, which is to accept it."""
+    with closing(TcpSource(Address(*port.getsockname()), form, said.append)) as source:
+        assert list(source.arrivals(0.01)) == []
+        yield source
+
+
 def test_udp_takes_whole_datagrams_of_any_size(said: Said) -> None:
-    with udp_source(None, said) as (source, address), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
+    with udp_source(said) as (source, address), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
         gateway.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
         assert list(source.arrivals(0.01)) == []
         for data in (b"a", b"", b"x" * 65_507):
@@ -64,7 +74,7 @@ def test_udp_asks_from_the_port_on_which_it_listens(said: Said) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
         gateway.bind(("127.0.0.1", 0))
         gateway.settimeout(5)
-        with udp_source(Address(*gateway.getsockname()), said) as (source, address):
+        with udp_source(said, Address(*gateway.getsockname())) as (source, address):
             source.ask()
             data, peer = gateway.recvfrom(100)
     assert peer == address
@@ -72,7 +82,7 @@ def test_udp_asks_from_the_port_on_which_it_listens(said: Said) -> None:
 
 
 def test_udp_tells_what_the_kernel_dropped_for_want_of_room(said: Said) -> None:
-    with udp_source(None, said) as (source, address), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
+    with udp_source(said) as (source, address), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway:
         while not source.lost:
             gateway.sendto(b"x" * 60_000, address)
         assert source.lost > 0
@@ -80,7 +90,7 @@ def test_udp_tells_what_the_kernel_dropped_for_want_of_room(said: Said) -> None:
 
 
 def test_udp_that_cannot_ask_says_why(said: Said) -> None:
-    with udp_source(Address("255.255.255.255", 9), said) as (source, _):
+    with udp_source(said, Address("255.255.255.255", 9)) as (source, _):
         source.ask()
     assert said == ["cannot ask 255.255.255.255:9: Permission denied"]
 
@@ -102,18 +112,16 @@ def port() -> Iterator[socket.socket]:
     ],
 )
 def test_tcp_splits_the_stream(port: socket.socket, said: Said, form: GatewayFormat | None, stream: bytes) -> None:
-    with closing(TcpSource(Address(*port.getsockname()), form, said.append)) as source:
-        assert list(source.arrivals(0.01)) == []
-        with port.accept()[0] as gateway:
-            gateway.sendall(stream)
-            assert received(source, 2) == [b'{"op":"x"}', b'{"op":"y"}']
+    with tcp_source(port, said, form) as source, port.accept()[0] as gateway:
+        gateway.sendall(stream)
+        assert received(source, 2) == [b'{"op":"x"}', b'{"op":"y"}']
+        source.close()
     assert said == []
 
 
 def test_tcp_connects_again_when_the_gateway_went_away(port: socket.socket, said: Said) -> None:
     address = Address(*port.getsockname())
-    with closing(TcpSource(address, None, said.append)) as source:
-        assert list(source.arrivals(0.01)) == []
+    with tcp_source(port, said) as source:
         with port.accept()[0] as gateway:
             gateway.sendall(b'{"n":1}\n{"half')
             [first] = source.arrivals(5)
@@ -132,7 +140,7 @@ def test_tcp_connects_again_when_the_gateway_went_away(port: socket.socket, said
 def test_tcp_waits_for_a_gateway_that_is_not_there_and_says_so_once(said: Said) -> None:
     address = Address("127.0.0.1", free_port(kind=socket.SOCK_STREAM))
     with closing(TcpSource(address, None, said.append)) as source:
-        for _ in range(30):
+        for _ in range(3):
             source.arrivals(0.05)
         with socket.create_server(address):
             until(source, lambda: len(said) > 1)
@@ -143,13 +151,11 @@ def test_tcp_waits_for_a_gateway_that_is_not_there_and_says_so_once(said: Said) 
 
 
 def test_tcp_leaves_a_gateway_whose_stream_makes_no_sense(port: socket.socket, said: Said) -> None:
-    with closing(TcpSource(Address(*port.getsockname()), None, said.append)) as source:
-        source.arrivals(0.01)
-        with port.accept()[0] as gateway:
-            gateway.sendall(struct.pack("<I", 3) + b"abc" + b"\xff" * 8)
-            assert received(source, 1) == [b"abc"]
-            until(source, lambda: said)
-            assert gateway.recv(1) == b""
+    with tcp_source(port, said) as source, port.accept()[0] as gateway:
+        gateway.sendall(struct.pack("<I", 3) + b"abc" + b"\xff" * 8)
+        assert received(source, 1) == [b"abc"]
+        until(source, lambda: said)
+        assert gateway.recv(1) == b""
     assert "is left (a packet of 4294967295 bytes); trying again" in said[0]
 
 
@@ -264,9 +270,6 @@ def test_zenoh_tells_what_a_gateway_could_not_answer(rover: tuple[zenoh.Session,
     assert said == ["a gateway could not answer: not now"]
 
 
-V1, LINES = GatewayFormat.GATEWAY_V1, GatewayFormat.JSON_LINES
-
-
 def framed(packet: bytes) -> bytes:
     return struct.pack("<I", len(packet)) + packet
 
@@ -276,7 +279,7 @@ def fed(splitter: Splitter, stream: bytes, size: int) -> list[bytes]:
     return [whole for piece in pieces for whole in splitter.feed(piece)]
 
 
-@given(st.lists(st.binary(max_size=300)), st.integers(1, 50), st.sampled_from([V1, None]))
+@given(st.lists(st.binary(max_size=300)), st.integers(1, 50), st.sampled_from([GatewayFormat.GATEWAY_V1, None]))
 def test_packets_are_found_wherever_the_stream_is_cut(
     packets: list[bytes], size: int, form: GatewayFormat | None
 ) -> None:
@@ -288,21 +291,10 @@ def test_packets_are_found_wherever_the_stream_is_cut(
 @given(st.lists(st.binary(max_size=50).map(lambda text: b'{"op"' + text.replace(b"\n", b""))), st.integers(1, 50))
 def test_lines_are_found_and_recognised_wherever_the_stream_is_cut(lines: list[bytes], size: int) -> None:
     stream = b"".join(line + b"\n" for line in lines)
-    assert fed(Splitter(LINES), stream, size) == lines
+    assert fed(Splitter(GatewayFormat.JSON_LINES), stream, size) == lines
     assert fed(Splitter(None), stream, size) == lines
 
 
 def test_a_packet_whose_length_begins_like_a_document_is_a_packet() -> None:
     packet = b"x" * ord("{")
     assert fed(Splitter(None), framed(packet), 200) == [packet]
-
-
-def test_what_is_unfinished_is_known() -> None:
-    splitter = Splitter(V1)
-    assert list(splitter.feed(framed(b"abc") + b"\5\0\0\0ab")) == [b"abc"]
-    assert splitter.unfinished == 6
-
-
-def test_a_length_that_no_packet_has_ends_the_stream() -> None:
-    with pytest.raises(PacketError, match=f"a packet of {LONGEST} bytes"):
-        list(Splitter(V1).feed(struct.pack("<I", LONGEST)))

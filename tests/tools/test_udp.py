@@ -50,19 +50,11 @@ def test_peers_are_named_by_their_address(table: RouteTable) -> None:
 @pytest.mark.parametrize(
     ("resolve", "text", "complaint"),
     [
-        (
-            udp.destination,
-            "boart",
-            "'boart' is neither HOST:PORT nor a name of the route table; did you mean 'board'",
-        ),
+        (udp.destination, "boart", "'boart' is neither HOST:PORT nor a name of the route table; did you mean 'board'"),
         (udp.destination, "127.0.0.1:0", "'0' is not a UDP port; ports are 1 to 65535"),
         (udp.destination, "127.0.0.1:70000", "'70000' is not a UDP port; ports are 1 to 65535"),
         (udp.listening, "127.0.0.1", "'127.0.0.1' is neither [HOST:]PORT nor a name of the route table; known: "),
-        (
-            udp.origin,
-            "statio",
-            "'statio' is neither HOST[:PORT] nor a name of the route table; did you",
-        ),
+        (udp.origin, "statio", "'statio' is neither HOST[:PORT] nor a name of the route table; did you"),
     ],
 )
 def test_a_place_that_is_none_is_explained(
@@ -107,21 +99,3 @@ def test_a_port_where_nobody_listens_is_noticed_and_does_not_stop_the_sending() 
 def test_one_datagram_alone_has_no_rate() -> None:
     assert Sent(count=1, seconds=0.0).rate == 0
     assert Sent(count=11, seconds=2.0).rate == 5
-
-
-def test_the_sender_keeps_the_address_it_was_opened_with() -> None:
-    with open_udp(HERE, "receiver") as receiver, open_udp(Address("127.0.6.1", 0), "sender") as sender:
-        receiver.settimeout(5)
-        send(sender, Address(*receiver.getsockname()), b"x", 1, None, Sent())
-        _, peer = receiver.recvfrom(10)
-        assert peer[0] == "127.0.6.1"
-
-
-def test_the_refusal_of_the_last_datagram_is_seen_too() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
-        gone.bind(("127.0.0.1", 0))
-        nobody = Address(*gone.getsockname())
-    sent = Sent()
-    with open_udp(HERE, "sender") as sender:
-        send(sender, nobody, b"hello", 1, None, sent)
-    assert sent.refused == 1

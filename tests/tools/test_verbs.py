@@ -36,44 +36,34 @@ def place(receiver: socket.socket) -> str:
     return f"{host}:{port}"
 
 
-def test_send_prints_what_it_sent(receiver: socket.socket, protos: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["plain", "value=1.5", "--to", place(receiver), "--protos", str(protos)]
-    assert main(["send", *words]) == 0
-    assert receiver.recv(100).hex() == "12050d0000c03f"
-    assert capsys.readouterr().out == f"sent plain to {place(receiver)}: 7 bytes 12050d0000c03f\n"
+def test_send_says_what_it_sent_once_or_at_a_rate_trimmed_or_padded(
+    receiver: socket.socket, protos: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    to = place(receiver)
+    for words, sent, says in (
+        (["value=1.5"], ["12050d0000c03f"], f"sent plain to {to}: 7 bytes 12050d0000c03f\n"),
+        (["--rate", "500", "--count", "4"], ["1200"] * 4, f"sent plain to {to} 4 times in "),
+        (["--trim"], ["12"], f"sent plain to {to}: 1 bytes 12\n"),
+        (["--pad", "5"], ["1200000000"], f"sent plain to {to}: 5 bytes 1200000000\n"),
+    ):
+        assert main(["send", "plain", *words, "--to", to, "--protos", str(protos)]) == 0
+        assert [receiver.recv(100).hex() for _ in sent] == sent
+        assert capsys.readouterr().out.startswith(says)
 
 
-def test_send_repeats_at_a_rate(receiver: socket.socket, protos: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--to", place(receiver), "--rate", "500", "--count", "4", "--protos", str(protos)]
-    assert main(["send", "plain", *options]) == 0
-    assert [receiver.recv(100) for _ in range(4)] == [EMPTY_PLAIN] * 4
-    assert f"sent plain to {place(receiver)} 4 times in " in capsys.readouterr().out
-
-
-def test_send_trims_and_pads_as_the_old_boards_do(receiver: socket.socket, protos: Path) -> None:
-    assert main(["send", "plain", "--to", place(receiver), "--trim", "--protos", str(protos)]) == 0
-    assert main(["send", "plain", "--to", place(receiver), "--pad", "5", "--protos", str(protos)]) == 0
-    assert [receiver.recv(100).hex() for _ in range(2)] == ["12", "1200000000"]
-
-
-def test_send_goes_from_endpoint_to_listener_by_their_names(table_path: Callable[..., Path]) -> None:
-    path = table_path()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as router:
-        router.bind(("127.0.0.1", read_table(path).listeners["rover"].address.value.port))
-        router.settimeout(5)
-        assert main(["send", "plain", "--table", str(path), "--to", "rover", "--from", "station"]) == 0
-        data, peer = router.recvfrom(100)
-    assert (data, peer[0]) == (EMPTY_PLAIN, "127.0.6.10")
-
-
-def test_send_says_when_the_router_will_not_take_it(
+def test_send_goes_from_endpoint_to_listener_and_says_when_the_router_will_not_take_it(
     table_path: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = table_path()
+    words = ["send", "plain", "--table", str(path), "--to", "rover"]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as router:
         router.bind(("127.0.0.1", read_table(path).listeners["rover"].address.value.port))
-        assert main(["send", "plain", "--table", str(path), "--to", "rover"]) == 0
-    assert "the table takes plain from station only; add --from station" in capsys.readouterr().err
+        router.settimeout(5)
+        assert main([*words, "--from", "station"]) == 0
+        data, peer = router.recvfrom(100)
+        assert (data, peer[0], capsys.readouterr().err) == (EMPTY_PLAIN, "127.0.6.10", "")
+        assert main(words) == 0
+        assert "the table takes plain from station only; add --from station" in capsys.readouterr().err
 
 
 def test_send_notices_that_nobody_listens(
@@ -159,6 +149,7 @@ def test_tap_that_waits_for_a_topic_ends_with_ctrl_c() -> None:
         (["--topic", "t", "--type", "no/msg/Such"], "no/msg/Such is not installed"),
         (["--topic", "no topic", "--type", "std_msgs/msg/String"], "topic 'no topic' cannot be listened to: "),
         (["5000", "--type", "std_msgs/msg/String"], "--type belongs to --topic"),
+        (["5000", "--topic", "imu_data"], "either --topic imu_data or '5000'\n"),
     ],
 )
 def test_a_mistake_in_tap_is_one_line_and_exit_code_2(
@@ -177,11 +168,6 @@ def test_tap_of_a_topic_without_ros_says_what_is_missing() -> None:
     assert done.stderr.startswith("router tap: a topic needs ROS 2, which is not installed here (")
 
 
-def test_tap_listens_to_a_port_or_a_topic_not_both(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["tap", "5000", "--topic", "imu_data"]) == 2
-    assert capsys.readouterr().err == "router tap: either --topic imu_data or '5000'\n"
-
-
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_sim_ends_on_a_signal_with_its_final_statistics(
     table_path: Callable[..., Path], ending: signal.Signals
@@ -192,9 +178,8 @@ def test_sim_ends_on_a_signal_with_its_final_statistics(
         first = json.loads(sim.stdout.readline())
         sim.send_signal(ending)
         *_, last = map(json.loads, sim.stdout)
-    assert sim.returncode == 0
-    assert (first["final"], last["final"]) == (False, True)
-    assert {endpoint: list(cases) for endpoint, cases in last["sent"].items()} == {
+    assert (sim.returncode, first["final"], last["final"]) == (0, False, True)
+    assert {endpoint: [*cases] for endpoint, cases in last["sent"].items()} == {
         "board": ["every_kind"],
         "station": ["plain"],
     }
@@ -232,13 +217,10 @@ def test_sim_tells_when_a_board_stops_and_what_it_cannot_read(table_path: Callab
     assert "received 1, undecodable 1" in last
 
 
-def test_sim_explains_a_silence_that_it_does_not_understand(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_sim_cannot_use_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "--silent", "basestation"]) == 2
     complaint = "'basestation' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-"
     assert capsys.readouterr().err == f"router sim: {complaint}\n"
-
-
-def test_a_table_with_errors_is_shown_with_its_findings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text("version: 1\nlisten: 5\n")
     assert main(["sim", str(path)]) == 78
