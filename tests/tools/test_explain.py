@@ -55,42 +55,44 @@ def told(folder: Path, more: str, old: str = OLD) -> list[str]:
     [
         ("", []),
         (
-            "metrics: {address: 127.0.0.1:9999}",
-            ["table: -metrics.address: 127.0.0.1:9108", "table: +metrics.address: 127.0.0.1:9999"],
+            (
+                "metrics: {address: 127.0.0.1:9999}\nreload: {on_change: true}\nnode: {diagnostics: true}\n"
+                "foxglove: {address: 127.0.0.1:8767}"
+            ),
+            [
+                "table: -node.diagnostics: false",
+                "table: -reload.on_change: false",
+                "table: -metrics.address: 127.0.0.1:9108",
+                "table: -foxglove.address: 127.0.0.1:8766",
+                "table: +node.diagnostics: true",
+                "table: +reload.on_change: true",
+                "table: +metrics.address: 127.0.0.1:9999",
+                "table: +foxglove.address: 127.0.0.1:8767",
+            ],
         ),
         (
-            "reload: {on_change: true}",
-            ["table: -reload.on_change: false", "table: +reload.on_change: true"],
+            "listen: {rover: {receive_buffer: 1MiB, interface: lo, coalesce: 250us}}",
+            [
+                "listener rover: -receive_buffer: 4 MiB",
+                "listener rover: -coalesce: 1 ms",
+                "listener rover: +receive_buffer: 1 MiB",
+                "listener rover: +coalesce: 250 us",
+                "listener rover: +interface: lo",
+            ],
         ),
         (
-            "node: {diagnostics: true}",
-            ["table: -node.diagnostics: false", "table: +node.diagnostics: true"],
-        ),
-        (
-            "foxglove: {address: 127.0.0.1:8767}",
-            ["table: -foxglove.address: 127.0.0.1:8766", "table: +foxglove.address: 127.0.0.1:8767"],
-        ),
-        (
-            "listen: {rover: {receive_buffer: 1MiB}}",
-            ["listener rover: -receive_buffer: 4 MiB", "listener rover: +receive_buffer: 1 MiB"],
-        ),
-        ("listen: {rover: {interface: lo}}", ["listener rover: +interface: lo"]),
-        ("endpoints: {arm_board: {listener: rover}}", ["endpoint arm_board: +listener: rover"]),
-        (
-            "endpoints: {arm_board: {address: 10.0.0.9:99}}",
-            ["endpoint arm_board: -address: 192.168.0.40:8", "endpoint arm_board: +address: 10.0.0.9:99"],
-        ),
-        (
-            "endpoints: {arm_board: {stale_after: 2s}}",
-            ["endpoint arm_board: -stale_after: 5 s", "endpoint arm_board: +stale_after: 2 s"],
+            "endpoints: {arm_board: {address: 10.0.0.9:99, listener: rover, stale_after: 2s}}",
+            [
+                "endpoint arm_board: -address: 192.168.0.40:8",
+                "endpoint arm_board: +address: 10.0.0.9:99",
+                "endpoint arm_board: -stale_after: 5 s",
+                "endpoint arm_board: +stale_after: 2 s",
+                "endpoint arm_board: +listener: rover",
+            ],
         ),
         (
             "endpoints: {arm_board: {stale_after: never}}",
             ["endpoint arm_board: -stale_after: 5 s", "endpoint arm_board: +stale_after: never"],
-        ),
-        (
-            "listen: {rover: {coalesce: 250us}}",
-            ["listener rover: -coalesce: 1 ms", "listener rover: +coalesce: 250 us"],
         ),
         (
             "endpoints: {x: {address: 10.0.0.9:99, kind: tool}}",

@@ -2,12 +2,9 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-from contextlib import suppress
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from router.gateway.documents import data_document, rejected_document, schema_document
 from router.gateway.packets import Packet, PacketError, compress, pack
@@ -36,19 +33,13 @@ def packet(payload: bytes, is_compressed: bool = False) -> bytes:
     return pack(Packet(5.0, is_compressed, "/imu", "sensor_msgs/msg/Imu", payload))
 
 
-def test_a_packet_holds_a_message_compressed_or_not() -> None:
+def test_a_packet_holds_a_message_compressed_or_not_or_with_all_keys_of_one_a_schema() -> None:
     message = Message(5.0, "/imu", "sensor_msgs/msg/Imu", {"x": [0.01]}, is_wrapped=True)
     assert read(packet(b'{"x":[0.01]}')) == message
     assert read(packet(compress(b'{"x":[0.01]}', 3), is_compressed=True)) == message
-
-
-def test_a_packet_with_the_keys_of_a_schema_is_one() -> None:
     assert read(packet(json.dumps(SCHEMA).encode())) == Schema(5.0, "/imu", "sensor_msgs/msg/Imu", SCHEMA, SHAPE)
-
-
-def test_a_message_with_fields_of_these_names_is_none() -> None:
     data = {"name": ["n"], "namespace": ["ns"], "fields": [[]]}
-    assert read(packet(json.dumps(data).encode())) == Message(5.0, "/imu", "sensor_msgs/msg/Imu", data, is_wrapped=True)
+    assert read(packet(json.dumps(data).encode())) == message._replace(data=data)
 
 
 def test_documents_say_what_they_are() -> None:
@@ -91,20 +82,6 @@ def test_what_means_nothing_is_refused_with_the_reason(data: bytes, complaint: s
         read(data)
 
 
-JSON = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.text(),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["fields", "name", "type"]), inner),
-)
-
-
-@given(st.dictionaries(st.sampled_from(["op", "name", "namespace", "fields", "time", "topic", "type"]), JSON))
-def test_any_json_is_read_or_refused(content: object) -> None:
-    text = json.dumps(content).encode()
-    for data in (text, packet(text)):
-        with suppress(PacketError):
-            read(data)
-
-
 NOON = dt.datetime(2026, 5, 1, 12, 0, 0, 123_000).timestamp()  # noqa: DTZ001 - local, as it is shown
 FIELDS = {
     "x": Shape("float32", False, {}),
@@ -120,10 +97,6 @@ def line(heard: Heard) -> str:
 
 def message(data: dict[str, Any], is_wrapped: bool = True, shape: Any = FIELDS) -> Message:
     return Message(NOON, "/imu", "p/msg/T", data, is_wrapped, shape)
-
-
-def test_a_line_has_time_topic_type_and_values() -> None:
-    assert line(message({"x": [1.5]})) == "12:00:00.123 /imu p/msg/T x=1.5"
 
 
 @pytest.mark.parametrize(
@@ -146,16 +119,12 @@ def test_a_line_has_time_topic_type_and_values() -> None:
     ],
 )
 def test_single_values_stand_without_their_list_and_long_lists_are_cut(data: dict[str, Any], values: str) -> None:
-    assert line(message(data)).split(" ", 3)[3] == values
+    assert line(message(data)) == f"12:00:00.123 /imu p/msg/T {values}"
 
 
-def test_before_the_schema_values_are_shown_as_received() -> None:
-    assert line(message({"x": [1.5], "header": [{"frame_id": ["base"]}]}, shape=None)).endswith(
-        " x=[1.5] header[0].frame_id=[base]"
-    )
-
-
-def test_plain_data_is_shown_as_it_is() -> None:
+def test_before_the_schema_and_where_nothing_is_wrapped_values_are_shown_as_received() -> None:
+    early = message({"x": [1.5], "header": [{"frame_id": ["base"]}]}, shape=None)
+    assert line(early).endswith(" x=[1.5] header[0].frame_id=[base]")
     data = {"x": 1.5, "list": [0.5], "header": {"frame_id": "base"}, "points": [{"y": 1}]}
     assert line(message(data, is_wrapped=False)).endswith(" x=1.5 list=[0.5] header.frame_id=base points[0].y=1")
 

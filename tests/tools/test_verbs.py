@@ -8,13 +8,13 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from geometry_msgs.msg import Point
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from router.cli import main
@@ -108,25 +108,30 @@ def test_tap_prints_what_arrives(table_path: Callable[..., Path]) -> None:
     assert tap.returncode == 0
 
 
-@pytest.fixture
-def publisher() -> Iterator[Publisher]:
-    """Of `tap_test`; what it has published reaches late subscribers as well."""
+@contextmanager
+def publishing(*messages: Point) -> Iterator[None]:
+    """A publisher of `tap_test`, whose messages reach late subscribers as well."""
     context = Context()
     context.init()
     node = Node("tap_test_publisher", context=context)
     qos = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    yield node.create_publisher(Point, "tap_test", qos)
+    publisher = node.create_publisher(Point, "tap_test", qos)
+    for message in messages:
+        publisher.publish(message)
+    yield
     node.destroy_node()
     context.shutdown()
 
 
-def test_tap_prints_what_a_topic_carries(publisher: Publisher) -> None:
-    publisher.publish(Point(x=1.5))
-    publisher.publish(Point(z=-2.0))
+def test_tap_waits_for_a_topic_and_prints_what_it_carries() -> None:
     command = [sys.executable, "-m", "router", "tap", "--topic", "tap_test", "--count", "2"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stderr.splitlines()[-1] == "listening to tap_test of geometry_msgs/msg/Point; Ctrl-C ends it"
-    assert [line.split(" ", 1)[1] for line in done.stdout.splitlines()] == [
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
+        assert tap.stderr is not None
+        assert tap.stderr.readline() == "waiting for a publisher of tap_test; Ctrl-C ends it\n"
+        with publishing(Point(x=1.5), Point(z=-2.0)):
+            out, err = tap.communicate(timeout=60)
+    assert err == "listening to tap_test of geometry_msgs/msg/Point; Ctrl-C ends it\n"
+    assert [line.split(" ", 1)[1] for line in out.splitlines()] == [
         "geometry_msgs/msg/Point x=1.5",
         "geometry_msgs/msg/Point z=-2.0",
     ]
