@@ -13,31 +13,16 @@ Times are wall-clock seconds. No document has a newline in it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple, Union
 
 import msgspec
 import orjson
 
 from router.gateway.json_codec import InvalidMessageError, shown
+from router.gateway.json_types import example, schema_text
 from router.gateway.packets import PacketError
-
-
-class TopicRow(NamedTuple):
-    """A topic that is served; `rate` in messages per second as they come in."""
-
-    topic: str
-    type_name: str
-    rate: float
-
-
-class InboundRow(NamedTuple):
-    """A topic that clients may publish on: the JSON text of its schema, and a message of defaults as plain data."""
-
-    topic: str
-    type_name: str
-    schema: str
-    example: object
+from router.types.model import MessageType
 
 
 class PublishRequest(NamedTuple):
@@ -70,15 +55,17 @@ def schema_document(type_name: str, time: float, text: str) -> bytes:
     return orjson.dumps({"op": "schema", "type": type_name, "time": time, "schema": orjson.Fragment(text)})
 
 
-def topics_document(time: float, rows: Iterable[TopicRow]) -> bytes:
-    topics = [{"topic": row.topic, "type": row.type_name, "rate": row.rate} for row in rows]
+def topics_document(time: float, rates: Iterable[tuple[str, str, float]]) -> bytes:
+    """The topics that are served: name, type, and messages per second as they come in."""
+    topics = [{"topic": topic, "type": type_name, "rate": rate} for topic, type_name, rate in rates]
     return orjson.dumps({"op": "topics", "time": time, "topics": topics})
 
 
-def inbound_document(rows: Iterable[InboundRow]) -> bytes:
+def inbound_document(types: Mapping[str, MessageType]) -> bytes:
+    """The topics that clients may publish on, and their types."""
     topics = [
-        {"topic": row.topic, "type": row.type_name, "schema": orjson.Fragment(row.schema), "example": row.example}
-        for row in rows
+        {"topic": topic, "type": type_.name, "schema": orjson.Fragment(schema_text(type_)), "example": example(type_)}
+        for topic, type_ in types.items()
     ]
     return orjson.dumps({"op": "inbound", "topics": topics})
 

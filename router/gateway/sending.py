@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
-from router.gateway.encoding import LARGE, Encoding
+from router.gateway.encoding import LARGE, Encoding, Sample
 from router.gateway.json_codec import UnreadableError
 from router.gateway.publishers import Selection
-from router.gateway.samples import Sample
 from router.gateway.subscriptions import TopicSubscription
 from router.gateway.transport.base import Frame
 from router.table.model import EACH, Gateway, Transport

@@ -9,10 +9,10 @@ from router.compiler.program import GatewayPlan
 from router.gateway.clients import Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
-from router.gateway.documents import InboundRow, inbound_document, rejected_document, topics_document
+from router.gateway.documents import inbound_document, rejected_document, topics_document
 from router.gateway.encoding import ENCODINGS
 from router.gateway.inbound import InboundPublisher, RefusedError
-from router.gateway.json_types import Style, example, schema_text
+from router.gateway.json_types import Style
 from router.gateway.sending import TopicSender
 from router.gateway.topics import Topics
 from router.gateway.transport.base import Client, Frame, Transport
@@ -143,15 +143,12 @@ class GatewayService:
         """Return what a client may send, for one that can show that to a person."""
         if not self._has_page:
             return []
-        rows = [
-            InboundRow(inbound.label, inbound.type.name, schema_text(inbound.type), example(inbound.type))
-            for inbound in self.plan.inbound.values()
-        ]
-        return [self._document("inbound", inbound_document(rows))]
+        types = {inbound.label: inbound.type for inbound in self.plan.inbound.values()}
+        return [self._document("inbound", inbound_document(types))]
 
     async def _send_topics(self) -> None:
-        rows = list(self._topics.rates(_TOPICS_S))
-        self._deliver([self._document("topics", topics_document(self._context.wall_s(), rows))])
+        document = topics_document(self._context.wall_s(), self._topics.rates(_TOPICS_S))
+        self._deliver([self._document("topics", document)])
 
     def _document(self, kind: str, data: bytes) -> Frame:
         """Make a frame of a document of no topic; for a slow client, a newer one of its `kind` replaces it."""

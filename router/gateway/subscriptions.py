@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from router.compiler.lookup import layout
 from router.errors import StartError, TableError
+from router.gateway.encoding import ReadyType, Sample
 from router.gateway.publishers import Selection, select
-from router.gateway.samples import ReadyType, Sample
 from router.types.model import MessageType
 from router.types.ros import RosInterfaces
 
@@ -41,7 +41,6 @@ class TopicSubscription:
     ) -> None:
         self.topic = topic
         self.type_name = ready.message.name
-        self.message = ready.message
         self.schema = ready.schema
         self._type = ready
         self._topics = topics
@@ -51,7 +50,9 @@ class TopicSubscription:
         self._tap: TopicTap | None = None
         self._is_reliable = self._keeps = False
         self._depth = DEPTH if is_each else 1
-        self._arrived = self._taken = self._missed = 0
+        self.missed = 0
+        """Messages for callbacks that newer ones replaced in the middleware's queue."""
+        self._arrived = self._taken = 0
         self._is_synchronised = False  # `_taken` counts from when it was equal to `_arrived`
         self._waits = False  # something arrived that was not taken
         self._turn: asyncio.Handle | None = None
@@ -63,11 +64,6 @@ class TopicSubscription:
         if not self._callbacks:
             self._count()
         return self._arrived
-
-    @property
-    def missed(self) -> int:
-        """Messages for callbacks that newer ones replaced in the middleware's queue."""
-        return self._missed
 
     @property
     def is_open(self) -> bool:
@@ -153,9 +149,9 @@ class TopicSubscription:
         if self._take(READ_PER_TURN) == READ_PER_TURN:
             self._turn = self._loop.call_soon(self._on_turn)
         elif self._is_synchronised:
-            self._missed = max(self._missed, self._arrived - self._taken)
+            self.missed = max(self.missed, self._arrived - self._taken)
         else:
-            self._is_synchronised, self._taken = True, self._arrived - self._missed
+            self._is_synchronised, self._taken = True, self._arrived - self.missed
 
     def _count(self) -> None:
         if self._tap and (arrived := self._tap.arrived()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,8 +120,7 @@ class GatewayThread:
         self._call(self._abandon(change))
 
     async def _abandon(self, change: GatewayChange) -> None:
-        for service in change.opened:
-            await service.close()
+        await _close(change.opened)
         async with AsyncExitStack() as opening:  # all of them, whatever one raises
             for service in change.left:
                 if service.is_closed:
@@ -135,12 +134,7 @@ class GatewayThread:
 
     def retire(self, change: GatewayChange) -> None:
         """Close the services of `left`; `abandon` would still open them again."""
-        self._call(self._retire(change))
-
-    async def _retire(self, change: GatewayChange) -> None:
-        async with AsyncExitStack() as closing:  # all of them, whatever one raises
-            for service in change.left:
-                closing.push_async_callback(service.close)
+        self._call(_close(change.left))
 
     def finish(self, change: GatewayChange) -> None:
         """Start the new services, and forget those of `left`."""
@@ -170,7 +164,7 @@ class GatewayThread:
         return service
 
     def _transport(self, settings: Gateway, events: Events) -> Transport:
-        transport = new_transport(settings, events)
+        transport = _new_transport(settings, events)
         if isinstance(transport, UdpTransport) and settings.receive is not None:
             self.kernel_drops[settings.name] = transport.kernel_drops
         return transport
@@ -184,18 +178,13 @@ class GatewayThread:
     def stop(self) -> None:
         """Close all gateways and end the thread."""
         try:
-            self._call(self._close())
+            self._call(_close(self._services.values()))
         finally:  # a running thread would keep the process
+            self._loop.call_soon_threadsafe(self._subscriptions.close)
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
             self._converting.shutdown()
             self._loop.close()
-
-    async def _close(self) -> None:
-        async with AsyncExitStack() as closing:  # all of them, whatever one raises
-            closing.callback(self._subscriptions.close)
-            for service in self._services.values():
-                closing.push_async_callback(service.close)
 
     def _call(self, work: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
@@ -206,7 +195,14 @@ class GatewayThread:
         self._failed(error if isinstance(error, Exception) else RuntimeError(context["message"]))
 
 
-def new_transport(settings: Gateway, events: Events) -> Transport:
+async def _close(services: Iterable[GatewayService]) -> None:
+    """Close all of them, whatever one raises."""
+    async with AsyncExitStack() as closing:
+        for service in services:
+            closing.push_async_callback(service.close)
+
+
+def _new_transport(settings: Gateway, events: Events) -> Transport:
     """Return the transport that a gateway's settings ask for, not open yet."""
     most = settings.max_inbound if settings.inbound else MOST_REQUEST
     if settings.zenoh is not None:

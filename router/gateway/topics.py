@@ -13,9 +13,8 @@ from router.compiler.selection import TopicSelector
 from router.errors import StartError
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
-from router.gateway.documents import TopicRow
+from router.gateway.encoding import Sample
 from router.gateway.publishers import Selection
-from router.gateway.samples import Sample
 from router.gateway.sending import ServedTopic, TopicSender
 from router.gateway.subscriptions import TopicSubscription
 from router.gateway.transport.base import Frame
@@ -216,11 +215,9 @@ class Topics:
             self._sender.introduced(frames)
         return frames
 
-    def rates(self, seconds: float) -> Iterator[TopicRow]:
-        """Yield every topic with its rate over the `seconds` since the last call."""
-        for served in self._served.values():
+    def rates(self, seconds: float) -> Iterator[tuple[str, str, float]]:
+        """Yield every topic with its type and its rate over the `seconds` since the last call."""
+        for topic, served in self._served.items():
             arrived = served.subscription.arrived
-            yield TopicRow(
-                served.subscription.topic, served.subscription.type_name, (arrived - served.reported) / seconds
-            )
+            yield topic, served.subscription.type_name, (arrived - served.reported) / seconds
             served.reported = arrived

@@ -25,7 +25,6 @@ from router.gateway.service import GatewayService
 from router.gateway.subscriptions import Subscriptions
 from router.gateway.transport.base import Client, Events, Frame
 from router.ros.topics import DiscoveredPublisher, RosTopics
-from router.table.addresses import Address
 from router.types.model import MessageType
 from router.types.ros import ros_interfaces
 from tests.tables import PROTOS
@@ -129,9 +128,6 @@ class PlayedClient:
 
 class PlayedTransport:
     """Its client is there from the start. `last_words` come from it while the gateway closes."""
-
-    is_ready = True
-    address: Address | None = None
 
     def __init__(self, events: Events) -> None:
         self.client = PlayedClient()

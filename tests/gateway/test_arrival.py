@@ -17,25 +17,12 @@ from router.clock import wall_ns
 from router.errors import Located, SourceSpan
 from router.gateway.transport import arrival as gateway_arrival
 from router.gateway.transport.arrival import AWAY_NS, CATCH_UP_NS, LoopClock
-from router.gateway.transport.base import Transport
-from router.gateway.transport.stream import Limits, StreamTransport
-from router.gateway.transport.tcp import TcpTransport
-from router.gateway.transport.websocket import WebsocketTransport
 from router.gateway.transport.zenoh import ZenohTransport
-from router.table.addresses import Address
 from router.table.model import ZenohSettings
 from tests.gateway.asynchronous import asynchronous, until
+from tests.gateway.stream_peers import GREETING, KINDS, framed, join, transport_of
 from tests.gateway.transport_events import Events, opened
 from tests.ports import free_port
-
-ANY = Address("127.0.0.1", 0)
-LIMITS = Limits(10, 10, 1000)
-GREETING = (
-    b"GET / HTTP/1.1\r\nHost: rover\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-)
-MASKED = b"\x82\x84" + bytes(4) + b"stop"
-"""One websocket message."""
 
 
 def away() -> None:
@@ -57,12 +44,12 @@ class Now:
 def started(now: Now) -> Iterator[LoopClock]:
     """Its own ticks come as real time goes by, which it does not here."""
     clock = LoopClock(now)
-    assert clock.away_since() is None
+    assert clock.delay() == 0
     clock.start()
     yield clock
     clock.stop()
     now.ns += 10 * AWAY_NS
-    assert clock.away_since() is None
+    assert clock.delay() == 0
 
 
 @asynchronous
@@ -71,7 +58,7 @@ async def test_a_loop_that_is_there_finds_what_has_just_come() -> None:
     with started(now) as clock:
         for _ in range(10):
             now.ns += AWAY_NS
-            assert clock.away_since() is None
+            assert clock.delay() == 0
             clock.tick()
 
 
@@ -81,15 +68,15 @@ async def test_what_is_found_after_it_was_away_may_be_as_old_as_that_and_for_a_w
     with started(now) as clock:
         left = now.ns
         now.ns += AWAY_NS + 1
-        assert clock.away_since() == left
+        assert clock.delay() == now.ns - left
         clock.tick()
         back = now.ns
         for _ in range(CATCH_UP_NS // AWAY_NS):
-            assert clock.away_since() == left
+            assert clock.delay() == now.ns - left
             now.ns += AWAY_NS
             clock.tick()
         now.ns = max(now.ns, back + CATCH_UP_NS)
-        assert clock.away_since() is None
+        assert clock.delay() == 0
 
 
 @asynchronous
@@ -102,50 +89,34 @@ async def test_a_stamp_is_of_the_wall_clock() -> None:
         assert before - 5_000_000_000 <= clock.stamp() <= wall_ns() - 5_000_000_000
 
 
-def tcp(events: Events) -> TcpTransport:
-    return TcpTransport(ANY, events, LIMITS, prefixed=False)
+GREETINGS = {"packets": b"", "lines": b"", "websocket": GREETING}
 
 
-def websocket(events: Events) -> WebsocketTransport:
-    return WebsocketTransport(ANY, events, LIMITS, text=False, page=b"")
-
-
-def dial(transport: Transport) -> socket.socket:
-    assert transport.address is not None
-    return socket.create_connection(transport.address)
-
-
-@pytest.mark.parametrize(
-    ("make", "greeting", "one"), [(tcp, b"", b"stop\n"), (websocket, GREETING, MASKED)], ids=["tcp", "websocket"]
-)
+@pytest.mark.parametrize("kind", KINDS)
 class TestStreams:
     @asynchronous
-    async def test_all_that_waited_while_the_loop_was_away_is_as_old_as_that(
-        self, make: type[StreamTransport], greeting: bytes, one: bytes
-    ) -> None:
+    async def test_all_that_waited_while_the_loop_was_away_is_as_old_as_that(self, kind: str) -> None:
         """More than is handled in one turn."""
-        count = 100
         events = Events()
-        transport = make(events)  # type: ignore[call-arg,arg-type]
+        transport = transport_of(kind, events)
         async with opened(transport):
-            with dial(transport) as peer:
-                peer.sendall(greeting)
-                await until(lambda: events.clients)
-                peer.sendall(one * count)
-                left = wall_ns()
-                away()
-                await until(lambda: len(events.said) == count)
-                assert max(events.arrivals) <= left
+            peer = await join(kind, transport)
+            await until(lambda: events.clients)
+            peer.writer.write(framed(kind, *[b"stop"] * 100))
+            left = wall_ns()
+            away()
+            await until(lambda: len(events.said) == 100)
+            assert max(events.arrivals) <= left
+            peer.leave()
 
     @asynchronous
-    async def test_so_is_what_a_client_said_that_came_meanwhile(
-        self, make: type[StreamTransport], greeting: bytes, one: bytes
-    ) -> None:
+    async def test_so_is_what_a_client_said_that_came_meanwhile(self, kind: str) -> None:
         events = Events()
-        transport = make(events)  # type: ignore[call-arg,arg-type]
+        transport = transport_of(kind, events)
         async with opened(transport):
-            with dial(transport) as peer:
-                peer.sendall(greeting + one)
+            assert transport.address is not None
+            with socket.create_connection(transport.address) as peer:
+                peer.sendall(GREETINGS[kind] + framed(kind, b"stop"))
                 connected = wall_ns()
                 away()
                 await until(lambda: events.said)
@@ -153,19 +124,18 @@ class TestStreams:
 
     @asynchronous
     async def test_what_comes_while_the_loop_is_there_has_just_come(
-        self, monkeypatch: pytest.MonkeyPatch, make: type[StreamTransport], greeting: bytes, one: bytes
+        self, monkeypatch: pytest.MonkeyPatch, kind: str
     ) -> None:
         monkeypatch.setattr(gateway_arrival, "AWAY_NS", 10**12)
         events = Events()
-        transport = make(events)  # type: ignore[call-arg,arg-type]
+        transport = transport_of(kind, events)
         async with opened(transport):
-            with dial(transport) as peer:
-                peer.sendall(greeting)
-                await until(lambda: events.clients)
-                sent = wall_ns()
-                peer.sendall(one)
-                await until(lambda: events.said)
-                assert sent <= events.arrivals[0] <= wall_ns()
+            peer = await join(kind, transport)
+            sent = wall_ns()
+            await peer.say(b"go")
+            await until(lambda: events.said)
+            assert sent <= events.arrivals[0] <= wall_ns()
+            peer.leave()
 
 
 @asynchronous

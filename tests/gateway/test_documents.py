@@ -7,10 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from router.gateway.documents import (
-    InboundRow,
     PublishRequest,
     SchemaRequest,
-    TopicRow,
     data_document,
     inbound_document,
     rejected_document,
@@ -19,9 +17,12 @@ from router.gateway.documents import (
     topics_document,
 )
 from router.gateway.json_codec import InvalidMessageError
+from router.gateway.json_types import schema_text
 from router.gateway.packets import PacketError
+from router.types.model import Field, Float, MessageType, String
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]))
+TYPE = MessageType("p/msg/T", (Field("x", Float(64)),))
 TIMES = st.floats(allow_nan=False, allow_infinity=False)
 
 
@@ -41,14 +42,14 @@ def test_the_text_of_a_message_stands_in_its_document_as_it_is() -> None:
 
 
 def test_topics_inbound_and_refusals_are_documents_too() -> None:
-    assert json.loads(topics_document(2.5, [TopicRow("/t", "p/msg/T", 49.5)])) == {
+    assert json.loads(topics_document(2.5, [("/t", "p/msg/T", 49.5)])) == {
         "op": "topics",
         "time": 2.5,
         "topics": [{"topic": "/t", "type": "p/msg/T", "rate": 49.5}],
     }
-    assert json.loads(inbound_document([InboundRow("/t", "p/msg/T", '{"fields":[]}', {"x": 0.0})])) == {
+    assert json.loads(inbound_document({"/t": TYPE})) == {
         "op": "inbound",
-        "topics": [{"topic": "/t", "type": "p/msg/T", "schema": {"fields": []}, "example": {"x": 0.0}}],
+        "topics": [{"topic": "/t", "type": "p/msg/T", "schema": json.loads(schema_text(TYPE)), "example": {"x": 0.0}}],
     }
     assert json.loads(rejected_document("invalid", "no 'x'\n", "/t")) == {
         "op": "rejected",
@@ -63,8 +64,8 @@ def test_no_document_has_a_newline(name: str) -> None:
     documents = [
         data_document(name, name, 1.0, b"{}"),
         schema_document(name, 1.0, "{}"),
-        topics_document(1.0, [TopicRow(name, name, 1.0)]),
-        inbound_document([InboundRow(name, name, "{}", {"x": name})]),
+        topics_document(1.0, [(name, name, 1.0)]),
+        inbound_document({name: MessageType(name, (Field(name, String(), default=name),))}),
         rejected_document("invalid", name, name),
     ]
     assert not any(b"\n" in document for document in documents)

@@ -1,159 +1,206 @@
-"""Limits of TCP and websocket clients: connections in all and of one host, and the time for one message."""
+"""What holds for TCP and websocket clients: fast, slow, stopped and hostile ones on the loopback interface."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
 import struct
-from contextlib import suppress
+from contextlib import ExitStack
 
 import pytest
 from structlog.testing import capture_logs
 
+from router.errors import StartError
 from router.gateway.transport import stream as gateway_stream
-from router.gateway.transport import websocket as gateway_websocket
-from router.gateway.transport.stream import Limits, StreamTransport
-from router.gateway.transport.tcp import TcpTransport
-from router.gateway.transport.websocket import WebsocketTransport
-from router.table.addresses import Address
-from tests.gateway.asynchronous import asynchronous, until
-from tests.gateway.transport_events import Events, opened
+from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client
+from router.gateway.transport.stream import Limits
+from tests.gateway.asynchronous import PATIENCE_SECONDS, asynchronous, until
+from tests.gateway.stream_peers import KINDS, MOST, framed, join, transport_of, websocket_frame
+from tests.gateway.transport_events import Events, data, opened, resident_kib
 
-ANY = Address("127.0.0.1", 0)
-MOST = 1000
-GREETING = (
-    b"GET / HTTP/1.1\r\nHost: rover\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-)
-KINDS = pytest.mark.parametrize("kind", ["packets", "lines", "websocket"])
+EACH_KIND = pytest.mark.parametrize("kind", KINDS)
 
 
-def transport_of(kind: str, events: Events, limits: Limits) -> StreamTransport:
-    if kind == "websocket":
-        return WebsocketTransport(ANY, events, limits, text=False, page=b"")
-    return TcpTransport(ANY, events, limits, prefixed=kind == "packets")
-
-
-async def connect(transport: StreamTransport, host: str = "127.0.0.1", greeting: bytes = b"") -> socket.socket:
-    """Connect from a local address, and send a greeting."""
-    assert transport.address is not None
-    peer = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    peer.bind((host, 0))
-    peer.setblocking(False)
-    await asyncio.get_running_loop().sock_connect(peer, transport.address)
-    await asyncio.get_running_loop().sock_sendall(peer, greeting)
-    return peer
-
-
-async def is_closed(peer: socket.socket) -> bool:
-    """Whether the other side closes it before long, whatever it says before."""
-
-    async def read_all() -> None:
-        with suppress(ConnectionError):
-            while await asyncio.get_running_loop().sock_recv(peer, 4096):
-                pass
-
-    try:
-        await asyncio.wait_for(read_all(), 5.0)
-    except asyncio.TimeoutError:
-        return False
-    return True
-
-
-def label(peer: socket.socket) -> str:
-    return "{}:{}".format(*peer.getsockname())
-
-
-def frame(payload: bytes, opcode: int = 2, length: int | None = None, fin: bool = True) -> bytes:
-    """Part of a websocket message, as a client sends it; the payload may end before its length does."""
-    length = len(payload) if length is None else length
-    return struct.pack(">BBH", opcode | fin << 7, 0x80 | 126, length) + bytes(4) + payload
-
-
-@KINDS
+@EACH_KIND
 @asynchronous
-async def test_one_host_has_so_many_places_and_other_hosts_have_theirs(kind: str) -> None:
-    greeting = GREETING if kind == "websocket" else b""
+async def test_a_large_message_arrives_whole_between_small_ones_while_others_are_served(kind: str) -> None:
+    large = b"x" * 7_000_000
+    messages = [b"before", large, b"after", large[:70_000], b"end"]
     events = Events()
-    transport = transport_of(kind, events, Limits(100, 3, MOST))
+    transport = transport_of(kind, events)
+    async with opened(transport):
+        peer = await join(kind, transport)
+        await until(lambda: events.clients)
+        events.clients[0].write([data(message) for message in messages])
+        assert events.clients[0].backlog() > 6_000_000
+        other = await join(kind, transport)
+        await until(lambda: len(events.clients) == 2)
+        transport.write_all(events.clients, [data(b"both")])
+        assert await other.hear() == b"both"
+        assert [await peer.hear() for _ in (*messages, b"both")] == [*messages, b"both"]
+        await until(lambda: events.eased == [events.clients[0]])
+        peer.leave()
+        other.leave()
+
+
+@EACH_KIND
+@asynchronous
+async def test_clients_that_stand_still_hold_up_nobody_and_cost_no_memory_of_their_own(kind: str) -> None:
+    """Fifty of them, each with 7 MB to get: the pieces are shared."""
+    events = Events()
+    transport = transport_of(kind, events, Limits(51, 51, MOST))
+    async with opened(transport):
+        still = [await join(kind, transport) for _ in range(50)]
+        for each in still:
+            each.stand_still()
+        await until(lambda: len(events.clients) == 50)
+        peer = await join(kind, transport)
+        await until(lambda: len(events.clients) == 51)
+        before = resident_kib()
+        transport.write_all(events.clients, [data(b"x" * 7_000_000)])
+        assert len(await peer.hear()) == 7_000_000
+        assert all(client.backlog() > 6_000_000 for client in events.clients[:50])
+        assert resident_kib() - before < 100_000
+        transport.write_all(events.clients[50:], [data(b"next")])
+        assert await peer.hear() == b"next"
+        assert events.eased == [events.clients[50]]
+        await transport.close()  # at once, though they do not answer
+        for each in (peer, *still):
+            each.leave()
+
+
+@EACH_KIND
+@asynchronous
+async def test_a_slow_client_is_written_to_while_it_takes_and_told_when_it_has_drained(kind: str) -> None:
+    """As a service does it: nothing over HIGH_WATER, and on from `drained`."""
+    message, wanted, sent = b"x" * 9996, 400, 0
+    events = Events()
+    transport = transport_of(kind, events)
+
+    def send(client: Client) -> None:
+        nonlocal sent
+        while sent < wanted and client.backlog() < HIGH_WATER:
+            client.write([data(b"%04d" % sent + message)])
+            sent += 1
+
+    def go_on(client: Client) -> None:
+        assert client.backlog() < LOW_WATER
+        send(client)
+
+    events.on_drained = go_on
+    async with opened(transport):
+        peer = await join(kind, transport)
+        await until(lambda: events.clients)
+        send(events.clients[0])
+        assert sent < wanted
+        assert HIGH_WATER <= events.clients[0].backlog() < HIGH_WATER + 11_000
+        for number in range(wanted):
+            assert await peer.hear() == b"%04d" % number + message
+        assert len(events.eased) > 2
+        peer.leave()
+
+
+@EACH_KIND
+@asynchronous
+async def test_a_client_that_takes_nothing_for_long_is_closed_and_told(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gateway_stream, "STALLED_SECONDS", 0.3)
+    events = Events()
+    transport = transport_of(kind, events)
     with capture_logs() as logs:
         async with opened(transport):
-            greedy = [await connect(transport, "127.0.0.1", greeting) for _ in range(4)]
-            await until(lambda: len(events.clients) == 3)
-            assert await is_closed(greedy[3])
-            other = await connect(transport, "127.0.0.2", greeting)
-            await until(lambda: len(events.clients) == 4)
-            assert events.clients[3].label == label(other)
-            greedy[0].close()
-            await until(lambda: len(events.gone) == 1)
-            again = await connect(transport, "127.0.0.1", greeting)
-            await until(lambda: len(events.clients) == 4)
-            for peer in (*greedy, other, again):
-                peer.close()
-    [warning] = [log for log in logs if log["log_level"] == "warning"]
-    assert warning["limit"] == "max_clients_per_host"
+            peer = await join(kind, transport)
+            peer.stand_still()
+            await until(lambda: events.clients)
+            [client] = events.clients
+            client.write([data(b"x" * 10_000_000)])
+            await until(lambda: events.gone == [client])
+            peer.leave()
+    assert ["send stalled" in log["event"] for log in logs if log["log_level"] == "warning"] == [True]
 
 
+@EACH_KIND
 @asynchronous
-async def test_connections_of_one_host_without_a_websocket_take_no_room_from_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(gateway_websocket, "STRANGERS", 10)
-    monkeypatch.setattr(gateway_websocket, "STRANGERS_PER_HOST", 2)
+async def test_a_client_that_is_killed_leaves(kind: str) -> None:
     events = Events()
-    transport = transport_of("websocket", events, Limits(4, 2, MOST))
+    transport = transport_of(kind, events)
     async with opened(transport):
-        first = await connect(transport, "127.0.0.1", GREETING)
-        await until(lambda: len(events.clients) == 1)
-        strangers = [await connect(transport, "127.0.0.2") for _ in range(20)]
-        assert await is_closed(strangers[19])
-        second = await connect(transport, "127.0.0.1", GREETING)
-        await until(lambda: len(events.clients) == 2)
-        assert events.gone == []
-        for peer in (first, second, *strangers):
-            peer.close()
+        peer = await join(kind, transport)
+        await until(lambda: events.clients)
+        [client] = events.clients
+        client.write([data(b"x" * 1_000_000)])
+        reset = struct.pack("ii", 1, 0)
+        peer.writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset)
+        peer.leave()
+        await until(lambda: events.gone == [client])
+        client.write([data(b"too late")])
+        assert events.eased == []
 
 
-BEGUN = {
-    "packets": [b"\x05", b"\x00\x00\x00", *[b"x"] * 4],
-    "lines": [b"x"] * 9,
-    "websocket": [frame(b"x", length=9), *[b"x"] * 8],
-}
-UNFINISHED = [*BEGUN.items()]
-UNFINISHED.append(("websocket", [frame(b"x", fin=False), *[frame(b"x", opcode=0, fin=False)] * 8]))
+@EACH_KIND
+@asynchronous
+async def test_places_are_limited_for_each_host_and_for_all(kind: str) -> None:
+    events = Events()
+    transport = transport_of(kind, events, Limits(4, 3, MOST))
+    with capture_logs() as logs:
+        async with opened(transport):
+            peers = [await join(kind, transport) for _ in range(3)]
+            await until(lambda: len(events.clients) == 3)
+            refused = await join(kind, transport)
+            assert await refused.is_closed()
+            peers.append(await join(kind, transport, "127.0.0.2"))
+            await until(lambda: len(events.clients) == 4)
+            assert events.clients[3].label == peers[3].label
+            one_more = await join(kind, transport, "127.0.0.3")
+            assert await one_more.is_closed()
+            peers[0].leave()
+            await until(lambda: len(events.gone) == 1)
+            peers.append(await join(kind, transport))
+            await until(lambda: len(events.clients) == 4)
+            for peer in (refused, one_more, *peers):
+                peer.leave()
+    warnings = [log for log in logs if log["log_level"] == "warning"]
+    assert [warning["limit"] for warning in warnings] == ["max_clients_per_host", "max_clients"]
+    assert all("too many" in warning["event"] for warning in warnings)
+    assert len(events.gone) == 5
 
 
-@pytest.mark.parametrize(("kind", "pieces"), UNFINISHED)
+BEGUN = [
+    ("packets", [b"\x05", b"\x00\x00\x00", *[b"x"] * 4]),
+    ("lines", [b"x"] * 9),
+    ("websocket", [websocket_frame(b"x", length=9), *[b"x"] * 8]),
+    ("websocket", [websocket_frame(b"x", fin=False), *[websocket_frame(b"x", opcode=0, fin=False)] * 8]),
+]
+
+
+@pytest.mark.parametrize(("kind", "pieces"), BEGUN)
 @asynchronous
 async def test_a_message_has_to_end_in_time_although_a_byte_comes_now_and_then(
     kind: str, pieces: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
-    monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.3)
-    greeting = GREETING if kind == "websocket" else b""
+    monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.2)
     events = Events()
-    transport = transport_of(kind, events, Limits(10, 10, MOST))
+    transport = transport_of(kind, events)
     with capture_logs() as logs:
         async with opened(transport):
-            slow, silent = [await connect(transport, greeting=greeting) for _ in range(2)]
+            slow, silent = [await join(kind, transport) for _ in range(2)]
             await until(lambda: len(events.clients) == 2)
             for piece in pieces:
                 if events.gone:
                     break
-                await asyncio.get_running_loop().sock_sendall(slow, piece)
-                await asyncio.sleep(0.1)
-            assert [client.label for client in events.gone] == [label(slow)]
-            assert [client.label for client in events.clients] == [label(silent)]
+                await slow.send(piece)
+                await asyncio.sleep(0.05)
+            assert [client.label for client in events.gone] == [slow.label]
+            assert [client.label for client in events.clients] == [silent.label]
             assert events.said == []
-            slow.close()
-            silent.close()
+            slow.leave()
+            silent.leave()
     assert ["did not end" in log["event"] for log in logs if log["log_level"] == "warning"] == [True]
 
 
-MESSAGES = {"packets": b"\x03\x00\x00\x00abc", "lines": b"abc\n", "websocket": frame(b"abc")}
-
-
-@KINDS
+@EACH_KIND
 @asynchronous
 async def test_the_time_is_for_each_message_where_one_follows_the_other(
     kind: str, monkeypatch: pytest.MonkeyPatch
@@ -161,26 +208,108 @@ async def test_the_time_is_for_each_message_where_one_follows_the_other(
     """Also where what comes at a time always ends in the middle of a message."""
     monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
     monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.3)
-    message = MESSAGES[kind]
+    message = framed(kind, b"abc")
     events = Events()
-    transport = transport_of(kind, events, Limits(10, 10, MOST))
+    transport = transport_of(kind, events)
     async with opened(transport):
-        peer = await connect(transport, greeting=GREETING if kind == "websocket" else b"")
+        peer = await join(kind, transport)
         await until(lambda: events.clients)
-        stream = message * 12
+        stream = message * 7
         ends = range(len(message) - 2, len(stream), len(message))
         for begin, end in zip([0, *ends], ends, strict=False):
-            await asyncio.get_running_loop().sock_sendall(peer, stream[begin:end])
+            await peer.send(stream[begin:end])
             await asyncio.sleep(0.1)
-        assert (events.gone, len(events.said)) == ([], 11)
-        peer.close()
+        assert (events.gone, len(events.said)) == ([], 6)
+        peer.leave()
 
 
+@pytest.mark.parametrize(
+    ("kind", "hostile"),
+    [
+        ("packets", struct.pack("<I", MOST + 1)),
+        ("packets", b"GET / HTTP/1.1\r\n\r\n"),
+        ("lines", b"x" * (MOST + 1)),
+        ("lines", b"x" * (MOST + 1) + b"\n"),
+        ("websocket", websocket_frame(b"x" * (MOST + 1))),
+    ],
+)
 @asynchronous
-async def test_a_handshake_has_to_end_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway_websocket, "MESSAGE_SECONDS", 0.2)
-    transport = transport_of("websocket", Events(), Limits(10, 10, MOST))
+async def test_what_is_too_long_is_refused_and_its_sender_closed(kind: str, hostile: bytes) -> None:
+    events = Events()
+    transport = transport_of(kind, events)
+    with capture_logs() as logs:
+        async with opened(transport):
+            peer = await join(kind, transport)
+            await peer.say(b"x" * MOST)
+            await peer.send(hostile)
+            assert await peer.is_closed()
+            peer.leave()
+            await until(lambda: events.gone)
+            assert (events.said, events.refusals) == ([b"x" * MOST], ["too_large"])
+    if kind != "websocket":  # where code 1009 says it
+        assert [log["event"] for log in logs if log["log_level"] == "warning"] == ["a client was closed"]
+
+
+@EACH_KIND
+@asynchronous
+async def test_a_port_that_is_taken_is_refused_with_who_has_it_and_free_again_at_once_after_closing(kind: str) -> None:
+    events = Events()
+    first = transport_of(kind, events)
+    async with opened(first):
+        assert first.address is not None
+        second = transport_of(kind, Events(), address=first.address)
+        with pytest.raises(StartError, match=r"127\.0\.0\.1:\d+ cannot be used: .*\(pid \d+\) has the port"):
+            await second.open()
+        await second.close()
+        peer = await join(kind, first)
+        await until(lambda: events.clients)
+        closing = asyncio.create_task(first.close())
+        assert await peer.is_closed()
+        peer.leave()
+        await closing
+    async with opened(second):
+        pass
+
+
+@EACH_KIND
+@asynchronous
+async def test_a_fault_of_ours_is_told_and_closes_that_client_alone(kind: str) -> None:
+    events = Events()
+    faults: list[Exception] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
+    transport = transport_of(kind, events)
+
+    def stumble(client: Client, data: bytes, arrived_ns: int) -> None:
+        if data == b"stumble":
+            raise ZeroDivisionError
+        events.said.append(data)
+
+    events.received = stumble  # type: ignore[method-assign]
     async with opened(transport):
-        peer = await connect(transport, greeting=b"GET / HTTP/1.1\r\n")
-        assert await is_closed(peer)
-        peer.close()
+        peer, other = [await join(kind, transport) for _ in range(2)]
+        await until(lambda: len(events.clients) == 2)
+        await peer.say(b"stumble")
+        assert await peer.is_closed()
+        peer.leave()
+        await until(lambda: len(events.gone) == 1)
+        await other.say(b"go on")
+        await until(lambda: events.said)
+        assert len(events.clients) == 1
+        other.leave()
+    assert [type(fault) for fault in faults] == [ZeroDivisionError]
+
+
+@EACH_KIND
+@pytest.mark.parametrize("turns", range(4))
+@asynchronous
+async def test_closing_ends_although_clients_are_just_coming(kind: str, turns: int) -> None:
+    """`turns` are those of the loop since they connected."""
+    transport = transport_of(kind, Events())
+    await transport.open()
+    assert transport.address is not None
+    with ExitStack() as connected:
+        for _ in range(20):
+            connected.enter_context(socket.create_connection(transport.address))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)

@@ -1,11 +1,10 @@
-"""A gateway's websocket clients and its page, with the library's own client, and with sockets that misbehave."""
+"""A gateway's websocket clients and its page, with the library's own client. test_stream.py has the rest."""
 
 from __future__ import annotations
 
 import asyncio
 import base64
 import re
-import socket
 from contextlib import AsyncExitStack, suppress
 from hashlib import sha256
 
@@ -14,18 +13,13 @@ from structlog.testing import capture_logs
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from router.errors import StartError
-from router.gateway.transport import stream as gateway_stream
 from router.gateway.transport import websocket as gateway_websocket
-from router.gateway.transport.base import HIGH_WATER, Client
 from router.gateway.transport.stream import Limits
 from router.gateway.transport.websocket import WebsocketTransport
-from router.table.addresses import Address
 from tests.gateway.asynchronous import asynchronous, until
-from tests.gateway.transport_events import Events, close_while_clients_come, data, opened, resident_kib
+from tests.gateway.stream_peers import ANY, MOST, join
+from tests.gateway.transport_events import Events, data, opened
 
-ANY = Address("127.0.0.1", 0)
-MOST = 1000
 PAGE = b"<!doctype html><style>a{}</style><p>\xc3\xa4</p><script>let a;</script><script>let b;</script>"
 
 
@@ -43,22 +37,6 @@ def dial(transport: WebsocketTransport, path: str = "/", host: str = "", **setti
     uri = f"ws://{host or transport.address}{path}"
     where = {"host": transport.address.host, "port": transport.address.port}
     return connect(uri, max_size=None, proxy=None, **where, **settings)  # type: ignore[arg-type]
-
-
-async def dial_and_stand_still(transport: WebsocketTransport) -> socket.socket:
-    """A client that shakes hands and reads nothing, with a small buffer."""
-    assert transport.address is not None
-    peer = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    peer.setblocking(False)
-    loop = asyncio.get_running_loop()
-    await loop.sock_connect(peer, transport.address)
-    key = base64.b64encode(b"0123456789abcdef").decode()
-    await loop.sock_sendall(
-        peer, _request("/", "Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}")
-    )
-    assert (await loop.sock_recv(peer, 12)) == b"HTTP/1.1 101"
-    return peer
 
 
 def _request(path: str, *headers: str) -> bytes:
@@ -134,75 +112,16 @@ async def test_a_large_message_is_cut_so_that_pings_pass_and_arrives_whole() -> 
 
 
 @asynchronous
-async def test_clients_that_stand_still_hold_up_nobody_and_cost_no_memory_of_their_own() -> None:
-    events = Events()
-    transport = documents(events, max_clients=51)
-    async with opened(transport):
-        still = [await dial_and_stand_still(transport) for _ in range(50)]
-        await until(lambda: len(events.clients) == 50)
-        async with dial(transport) as end:
-            await until(lambda: len(events.clients) == 51)
-            before = resident_kib()
-            transport.write_all(events.clients, [data(b"x" * 7_000_000)])
-            assert len(await end.recv()) == 7_000_000
-            assert resident_kib() - before < 100_000
-            assert all(client.backlog() > 6_000_000 for client in events.clients[:50])
-            events.clients[50].write([data(b"next")])
-            assert await end.recv() == "next"
-        await transport.close()  # at once, though they will not say goodbye
-        for peer in still:
-            peer.close()
-
-
-@asynchronous
-async def test_a_slow_client_is_told_when_it_has_drained_and_gets_all_in_order() -> None:
-    wanted = 400
-    events = Events()
-    transport = documents(events)
-    sent = 0
-
-    def send(client: Client) -> None:
-        nonlocal sent
-        while sent < wanted and client.backlog() < HIGH_WATER:
-            client.write([data(b"%04d" % sent + b"x" * 10_000)])
-            sent += 1
-
-    events.on_drained = send
-    async with opened(transport), dial(transport) as end:
-        await until(lambda: events.clients)
-        send(events.clients[0])
-        assert sent < wanted
-        for number in range(wanted):
-            message = await end.recv()
-            assert str(message).startswith(f"{number:04d}x")
-
-
-@asynchronous
-async def test_a_client_that_takes_nothing_for_long_is_closed_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway_stream, "STALLED_SECONDS", 0.3)
-    events = Events()
-    transport = documents(events)
-    with capture_logs() as logs:
-        async with opened(transport):
-            peer = await dial_and_stand_still(transport)
-            await until(lambda: events.clients)
-            [client] = events.clients
-            client.write([data(b"x" * 10_000_000)])
-            await until(lambda: events.gone == [client])
-            peer.close()
-    assert ["send stalled" in log["event"] for log in logs if log["log_level"] == "warning"] == [True]
-
-
-@asynchronous
 async def test_a_client_that_does_not_answer_pings_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gateway_websocket, "PING_SECONDS", 0.1)
     monkeypatch.setattr(gateway_websocket, "CLOSING_SECONDS", 0.1)
     events = Events()
     transport = documents(events)
     async with opened(transport):
-        peer = await dial_and_stand_still(transport)
+        peer = await join("websocket", transport)
+        peer.stand_still()
         await until(lambda: len(events.gone) == 1)
-        peer.close()
+        peer.leave()
 
 
 @asynchronous
@@ -211,12 +130,13 @@ async def test_a_client_that_pings_without_end_and_reads_nothing_is_closed() -> 
     events = Events()
     transport = documents(events)
     async with opened(transport):
-        peer = await dial_and_stand_still(transport)
+        peer = await join("websocket", transport)
+        peer.stand_still()
         with suppress(ConnectionError):
             while not events.gone:
-                await asyncio.get_running_loop().sock_sendall(peer, pings)
+                await peer.send(pings)
         await until(lambda: len(events.gone) == 1)
-        peer.close()
+        peer.leave()
 
 
 @asynchronous
@@ -357,37 +277,6 @@ async def test_clients_that_say_goodbye_hear_that_the_gateway_goes_away() -> Non
 
 
 @asynchronous
-async def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
-    first = documents(Events())
-    async with opened(first):
-        assert first.address is not None
-        second = WebsocketTransport(first.address, Events(), Limits(1, 1, MOST), text=True, page=PAGE)
-        with pytest.raises(StartError, match=r"127\.0\.0\.1:\d+ cannot be used: .*\(pid \d+\) has the port"):
-            await second.open()
-        await second.close()
-
-
-@asynchronous
-async def test_a_fault_of_ours_is_told_and_closes_that_client_alone() -> None:
-    events = Events()
-    faults: list[Exception] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
-    transport = documents(events)
-
-    def stumble(client: Client, data: bytes, arrived_ns: int) -> None:
-        raise ZeroDivisionError
-
-    events.received = stumble  # type: ignore[method-assign]
-    async with opened(transport), dial(transport) as one, dial(transport):
-        await until(lambda: len(events.clients) == 2)
-        with suppress(ConnectionClosed):
-            await one.send("x")
-            await one.recv()
-        await until(lambda: len(events.gone) == 1)
-    assert [type(fault) for fault in faults] == [ZeroDivisionError]
-
-
-@asynchronous
 async def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
     events = Events()
     transport = documents(events, max_clients=100)
@@ -398,6 +287,32 @@ async def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
         assert await asyncio.gather(*(end.recv() for end in ends)) == ["hello"] * 100
 
 
-@pytest.mark.parametrize("turns", range(4))
-def test_closing_ends_although_clients_are_just_coming(turns: int) -> None:
-    asyncio.run(close_while_clients_come(documents(Events()), turns))
+@asynchronous
+async def test_connections_of_one_host_without_a_websocket_take_no_room_from_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(gateway_websocket, "STRANGERS", 10)
+    monkeypatch.setattr(gateway_websocket, "STRANGERS_PER_HOST", 2)
+    events = Events()
+    transport = documents(events, max_clients=2)
+    async with opened(transport):
+        first = await join("websocket", transport, "127.0.0.1")
+        await until(lambda: len(events.clients) == 1)
+        strangers = [await join("stranger", transport, "127.0.0.2") for _ in range(20)]
+        assert await strangers[19].is_closed()
+        second = await join("websocket", transport, "127.0.0.1")
+        await until(lambda: len(events.clients) == 2)
+        assert events.gone == []
+        for peer in (first, second, *strangers):
+            peer.leave()
+
+
+@asynchronous
+async def test_a_handshake_has_to_end_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_websocket, "MESSAGE_SECONDS", 0.2)
+    transport = documents(Events())
+    async with opened(transport):
+        peer = await join("stranger", transport)
+        await peer.send(b"GET / HTTP/1.1\r\n")
+        assert await peer.is_closed()
+        peer.leave()

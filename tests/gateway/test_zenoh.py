@@ -8,6 +8,7 @@ import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import zenoh
@@ -55,23 +56,57 @@ def session(mode: str, **endpoints: str) -> Iterator[zenoh.Session]:
         yield joined
 
 
+class Serving(NamedTuple):
+    """A gateway that listens at `where` and owns its key."""
+
+    transport: ZenohTransport
+    events: Events
+    client: Client
+    where: str
+
+
 @asynccontextmanager
-async def serving(transport: ZenohTransport) -> AsyncIterator[None]:
-    """Open, and sure that nobody else has its key."""
+async def serving(most: int = MOST, *, is_patient: bool = False) -> AsyncIterator[Serving]:
+    events, where = Events(), locator()
+    chosen = patient(where) if is_patient else settings(listen=(where,))
+    transport = ZenohTransport(chosen, events, most)
     async with opened(transport):
-        await until(lambda: transport.is_ready)
-        yield
+        await until(lambda: events.clients)
+        yield Serving(transport, events, events.clients[0], where)
 
 
-class Listener:
-    """What a session hears, as (key, payload)."""
+@asynccontextmanager
+async def listening(served: Serving) -> AsyncIterator[list[tuple[str, bytes]]]:
+    """What another session hears from now on, as (key, payload)."""
+    heard: list[tuple[str, bytes]] = []
 
-    def __init__(self, joined: zenoh.Session, key: str) -> None:
-        self.heard: list[tuple[str, bytes]] = []
-        joined.declare_subscriber(key, self._hear)
+    def is_heard() -> bool:
+        served.client.write([data(b"are you there", "/hello")])
+        return bool(heard)
 
-    def _hear(self, sample: zenoh.Sample) -> None:
-        self.heard.append((str(sample.key_expr), sample.payload.to_bytes()))
+    with session("client", connect=served.where) as far:
+        far.declare_subscriber(
+            f"{KEY}/**", lambda sample: heard.append((str(sample.key_expr), sample.payload.to_bytes()))
+        )
+        await until(is_heard)  # the wish to hear has to arrive first
+        await asyncio.sleep(0.1)
+        heard.clear()
+        yield heard
+
+
+@asynccontextmanager
+async def sending(served: Serving) -> AsyncIterator[zenoh.Session]:
+    """Another session, that the gateway hears."""
+
+    def is_heard() -> bool:
+        far.put(f"{KEY}/inbound/hello", b"are you there")
+        return bool(served.events.said)
+
+    with session("peer", connect=served.where) as far:
+        await until(is_heard)
+        await asyncio.sleep(0.1)
+        served.events.said.clear()
+        yield far
 
 
 def schema(type_name: str) -> Frame:
@@ -80,98 +115,60 @@ def schema(type_name: str) -> Frame:
 
 @asynchronous
 async def test_data_is_found_by_topic_and_schemas_by_type() -> None:
-    events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
-    async with serving(transport):
-        assert transport.is_ready
-        [client] = events.clients
+    async with serving() as served:
+        client = served.client
         assert client.label == f"zenoh {KEY}"
-        with session("client", connect=where) as far:
-            listener = Listener(far, f"{KEY}/**")
-            await _heard_by(client, listener)
-            listener.heard.clear()
-            transport.write_all([client], [schema("sensor_msgs/msg/Imu"), data(b"one", "/loki_1/imu")])
+        async with listening(served) as heard:
+            served.transport.write_all([client], [schema("sensor_msgs/msg/Imu"), data(b"one", "/loki_1/imu")])
             client.write([data(b"two", "/loki_1/imu")])
-            await until(lambda: len(listener.heard) == 3)
-            assert listener.heard == [
+            await until(lambda: len(heard) == 3)
+            assert heard == [
                 (f"{KEY}/schema/sensor_msgs/msg/Imu", b"a schema"),
                 (f"{KEY}/data/loki_1/imu", b"one"),
                 (f"{KEY}/data/loki_1/imu", b"two"),
             ]
             await until(lambda: not client.backlog())
-    assert events.gone == [client]
-    assert events.failures == []
+    assert served.events.gone == [client]
+    assert served.events.failures == []
     client.write([data(b"too late")])
     assert client.backlog() == 0
 
 
-async def _heard_by(client: Client, listener: Listener) -> None:
-    """Waits until what is put arrives: the far end's wish to hear has to arrive first."""
-
-    def is_heard() -> bool:
-        client.write([data(b"are you there", "/hello")])
-        return bool(listener.heard)
-
-    await until(is_heard)
-    await asyncio.sleep(0.1)
-
-
-async def _hears(events: Events, far: zenoh.Session) -> None:
-    """Waits until what is put by `far` arrives, the same way round."""
-
-    def is_heard() -> bool:
-        far.put(f"{KEY}/inbound/hello", b"are you there")
-        return bool(events.said)
-
-    await until(is_heard)
-    await asyncio.sleep(0.1)
-    events.said.clear()
-
-
 @asynchronous
 async def test_what_is_put_under_inbound_is_heard() -> None:
-    events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events, 100)
-    async with serving(transport):
-        with session("peer", connect=where) as far:
-            await _hears(events, far)
-            far.put(f"{KEY}/inbound/cmd_vel", b"go")
-            far.put(f"{KEY}/inbound/cmd_vel", b"x" * 101)
-            far.put(f"{KEY}/inbound", b"x" * 100)
-            far.delete(f"{KEY}/inbound/cmd_vel")
-            far.put(f"{KEY}/data/cmd_vel", b"not for us")
-            far.put("rovers/loki_2/inbound/cmd_vel", b"nor this")
-            far.put(f"{KEY}/inbound/cmd_vel", b"stop")
-            await until(lambda: len(events.said) == 3)
-            assert events.said == [b"go", b"x" * 100, b"stop"]
-            assert set(events.said_by) == {events.clients[0]}
-            assert events.refusals == ["too_large"]
+    async with serving(most=100) as served, sending(served) as far:
+        far.put(f"{KEY}/inbound/cmd_vel", b"go")
+        far.put(f"{KEY}/inbound/cmd_vel", b"x" * 101)
+        far.put(f"{KEY}/inbound", b"x" * 100)
+        far.delete(f"{KEY}/inbound/cmd_vel")
+        far.put(f"{KEY}/data/cmd_vel", b"not for us")
+        far.put("rovers/loki_2/inbound/cmd_vel", b"nor this")
+        far.put(f"{KEY}/inbound/cmd_vel", b"stop")
+        await until(lambda: len(served.events.said) == 3)
+        assert served.events.said == [b"go", b"x" * 100, b"stop"]
+        assert set(served.events.said_by) == {served.client}
+        assert served.events.refusals == ["too_large"]
 
 
 @asynchronous
 async def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gateway_zenoh, "MOST_RECEIVED", 5)
-    events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
-    async with serving(transport):
-        with session("peer", connect=where) as far:
-            await _hears(events, far)
-            for number in range(2000):
-                far.put(f"{KEY}/inbound/cmd_vel", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
-            await until(lambda: len(events.said) + len(events.refusals) == 2000)
-            assert set(events.refusals) <= {"rate_limited"}
-            assert events.failures == []
-            numbers = list(map(int, events.said))
-            assert numbers == sorted(numbers)
+    async with serving() as served, sending(served) as far:
+        events = served.events
+        for number in range(2000):
+            far.put(f"{KEY}/inbound/cmd_vel", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
+        await until(lambda: len(events.said) + len(events.refusals) == 2000)
+        assert set(events.refusals) <= {"rate_limited"}
+        assert events.failures == []
+        numbers = list(map(int, events.said))
+        assert numbers == sorted(numbers)
 
 
 @asynchronous
 async def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -> None:
-    events, where = Events(), locator()
-    events.shown = [schema("std_msgs/msg/Bool"), data(b"true", "/on"), data(b"false", "/off")]
-    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
-    async with serving(transport):
-        with session("client", connect=where) as far:
+    async with serving() as served:
+        served.events.shown = [schema("std_msgs/msg/Bool"), data(b"true", "/on"), data(b"false", "/off")]
+        with session("client", connect=served.where) as far:
 
             def ask(key: str) -> list[tuple[str, bytes]]:
                 return [
@@ -190,55 +187,38 @@ async def test_a_late_joiner_asks_and_gets_schemas_and_latest_values_at_once() -
             assert await asyncio.to_thread(ask, f"{KEY}/data/unknown") == []
             several = await asyncio.gather(*(asyncio.to_thread(ask, f"{KEY}/data/on") for _ in range(20)))
             assert several == [everything[1:2]] * 20
-    assert events.failures == []
+    assert served.events.failures == []
 
 
 @asynchronous
 async def test_a_large_message_arrives_whole_and_small_ones_need_not_wait_for_it() -> None:
     large = b"x" * 7_000_000
-    events, where = Events(), locator()
-    transport = ZenohTransport(patient(where), events, MOST)
-    async with serving(transport):
-        [client] = events.clients
-        with session("client", connect=where) as far:
-            listener = Listener(far, f"{KEY}/**")
-            await _heard_by(client, listener)
-            listener.heard.clear()
-            client.write([schema("Cloud"), data(large, "/cloud"), data(b"small", "/imu")])
-            await until(lambda: not client.backlog())  # though the large one may still be on its way
-            await until(lambda: len(listener.heard) == 3)
-            assert listener.heard[0][0] == f"{KEY}/schema/Cloud"
-            assert dict(listener.heard)[f"{KEY}/data/cloud"] == large
+    async with serving(is_patient=True) as served, listening(served) as heard:
+        served.client.write([schema("Cloud"), data(large, "/cloud"), data(b"small", "/imu")])
+        await until(lambda: not served.client.backlog())  # though the large one may still be on its way
+        await until(lambda: len(heard) == 3)
+        assert heard[0][0] == f"{KEY}/schema/Cloud"
+        assert dict(heard)[f"{KEY}/data/cloud"] == large
 
 
 @asynchronous
 async def test_of_large_values_only_the_newest_waits_and_the_others_are_told() -> None:
-    events, where = Events(), locator()
-    transport = ZenohTransport(patient(where), events, MOST)
-    async with serving(transport):
-        [client] = events.clients
-        with session("client", connect=where) as far:
-            listener = Listener(far, f"{KEY}/**")
-            await _heard_by(client, listener)
-            listener.heard.clear()
-            client.write([data(b"%03d" % number + b"x" * 3_000_000, "/cloud") for number in range(20)])
-            last = f"{KEY}/data/cloud"
-            await until(lambda: any(key == last and value[:3] == b"019" for key, value in listener.heard))
-            lost = sum(lost for _, _, lost in events.failures)
-            assert lost > 0
-            assert len(listener.heard) + lost == 20
+    async with serving(is_patient=True) as served, listening(served) as heard:
+        served.client.write([data(b"%03d" % number + b"x" * 3_000_000, "/cloud") for number in range(20)])
+        last = f"{KEY}/data/cloud"
+        await until(lambda: any(key == last and value[:3] == b"019" for key, value in heard))
+        lost = sum(lost for _, _, lost in served.events.failures)
+        assert lost > 0
+        assert len(heard) + lost == 20
 
 
 @asynchronous
 async def test_much_that_is_written_at_once_is_put_and_the_client_drains() -> None:
-    events, where = Events(), locator()
-    transport = ZenohTransport(settings(listen=(where,)), events, MOST)
-    async with serving(transport):
-        [client] = events.clients
-        client.write([data(b"x" * 10_000)] * 100)
-        assert client.backlog() > HIGH_WATER
-        await until(lambda: events.eased == [client])
-        assert client.backlog() == 0
+    async with serving() as served:
+        served.client.write([data(b"x" * 10_000)] * 100)
+        assert served.client.backlog() > HIGH_WATER
+        await until(lambda: served.events.eased == [served.client])
+        assert served.client.backlog() == 0
 
 
 @asynchronous
@@ -248,24 +228,15 @@ async def test_a_router_that_is_not_there_yet_is_tried_again(monkeypatch: pytest
     transport = ZenohTransport(settings("client", connect=(where,)), events, MOST)
     with capture_logs() as logs:
         async with opened(transport):
-            assert not transport.is_ready
             await asyncio.sleep(0.1)
             assert events.clients == []
-            with session("router", listen=where) as router:
-                await until(lambda: transport.is_ready)
-                [client] = events.clients
-                listener = Listener(router, f"{KEY}/**")
-                await _heard_by(client, listener)
+            with session("router", listen=where):
+                await until(lambda: events.clients)
+                async with listening(Serving(transport, events, events.clients[0], where)):
+                    pass
     assert [log["log_level"] for log in logs if log["log_level"] != "debug"] == ["warning", "info"]
     assert "Unable to connect" in logs[0]["why"]
     assert ".rs" not in logs[0]["why"]
-
-
-@asynchronous
-async def test_closing_while_the_router_is_not_there_is_prompt() -> None:
-    transport = ZenohTransport(settings("client", connect=(locator(),)), Events(), MOST)
-    async with opened(transport):
-        pass
 
 
 @asynchronous
@@ -341,8 +312,9 @@ async def test_who_has_no_password_yet_is_tried_again() -> None:
     """Zenoh says no more of a refused password than of a router that is not there."""
     where = locator()
     given = ZenohConfig(SourceSpan("rover.yaml"), "{}")
-    transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), Events(), MOST)
+    events = Events()
+    transport = ZenohTransport(replace(settings("client", connect=(where,)), config=given), events, MOST)
     with capture_logs() as logs:
         async with opened(transport):
-            assert not transport.is_ready
+            assert events.clients == []
     assert [log["log_level"] for log in logs] == ["warning"]

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
-import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import ExitStack, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from router.gateway.transport.base import Client, Frame, Transport
-from router.gateway.transport.stream import StreamTransport
-from tests.gateway.asynchronous import PATIENCE_SECONDS, until
+from tests.gateway.asynchronous import until
 
 
 def data(payload: bytes, topic: str = "/imu", type_name: str = "T") -> Frame:
@@ -77,7 +75,6 @@ async def opened(transport: Transport) -> AsyncIterator[None]:
         yield
     finally:
         await transport.close()
-    assert not transport.is_ready
     await until(lambda: asyncio.all_tasks() <= tasks)
     await until(lambda: _threads() <= threads)
     await until(lambda: _sockets() <= sockets)
@@ -99,15 +96,3 @@ def _sockets() -> int:
 
 def resident_kib() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
-
-
-async def close_while_clients_come(transport: StreamTransport, turns: int) -> None:
-    """Closes it when the loop has had so many turns since they connected. Fails if that does not end."""
-    await transport.open()
-    assert transport.address
-    with ExitStack() as connected:
-        for _ in range(20):
-            connected.enter_context(socket.create_connection(transport.address))
-        for _ in range(turns):
-            await asyncio.sleep(0)
-        await asyncio.wait_for(transport.close(), PATIENCE_SECONDS)

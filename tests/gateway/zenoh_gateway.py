@@ -94,7 +94,7 @@ async def main(key: str, where: str, config: str, mode: str) -> None:
         told = None
         while True:
             others = [log["other"] for log in logs if log["log_level"] == "error"]
-            state = {"ready": transport.is_ready, "others": others, "contentions": events.contentions}
+            state = {"ready": bool(events.clients), "others": others, "contentions": events.contentions}
             if state != told:
                 told = state
                 print(json.dumps(state), flush=True)

@@ -41,17 +41,16 @@ class LoopClock:
 
     def stamp(self) -> int:
         """Return the wall-clock time (ns) at which what is read now arrived at the earliest. Thread-safe."""
-        since = self.away_since()
-        return wall_ns() if since is None else wall_ns() - (self._clock_ns() - since)
+        return wall_ns() - self.delay()
 
-    def away_since(self) -> int | None:
-        """Return since when (by `clock_ns`) what is read now may have been waiting, None if it has just come."""
+    def delay(self) -> int:
+        """Return for how long (ns) what is read now may have been waiting."""
         if self._ticking is None:
-            return None
+            return 0
         now = self._clock_ns()
         if now - self._last_tick > AWAY_NS:
-            return self._last_tick
-        return self._left if now < self._caught_up else None
+            return now - self._last_tick
+        return now - self._left if now < self._caught_up else 0
 
     def tick(self) -> None:
         """Record that the loop runs."""

@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Protocol
 
-from router.table.addresses import Address
-
 HIGH_WATER = 256 * 1024
 """Bytes waiting for a client from which on nothing more is written to it."""
 
@@ -72,13 +70,7 @@ class Events(Protocol):
 
 
 class Transport(Protocol):
-    """A way to clients. `address` is the local one, if there is one; `is_ready` tells whether clients can come."""
-
-    @property
-    def address(self) -> Address | None: ...
-
-    @property
-    def is_ready(self) -> bool: ...
+    """A way to clients."""
 
     async def open(self) -> None:
         """Open the sockets. A local address that this machine does not have yet is retried in the background.

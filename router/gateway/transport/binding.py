@@ -24,10 +24,9 @@ RECEIVE_BUFFER = 64 * 1024
 
 
 class Binding:
-    """Calls `attempt` until it succeeds, after which `is_ready`. `protocol` is udp or tcp."""
+    """Calls `attempt` until it succeeds. `protocol` is udp or tcp."""
 
     def __init__(self, protocol: str, address: Address, attempt: Callable[[], Awaitable[None]]) -> None:
-        self.is_ready = False
         self._protocol = protocol
         self._address = address
         self._attempt = attempt
@@ -42,11 +41,8 @@ class Binding:
                 raise StartError(self._why_not(error)) from error
             logger.warning("no network interface has this address yet: waiting for it", address=str(self._address))
             self._retrying = asyncio.get_running_loop().create_task(self._retry())
-        else:
-            self.is_ready = True
 
     async def close(self) -> None:
-        self.is_ready = False
         if self._retrying is not None:
             self._retrying.cancel()
             with suppress(asyncio.CancelledError):
@@ -54,7 +50,7 @@ class Binding:
 
     async def _retry(self) -> None:
         reported = errno.EADDRNOTAVAIL
-        while not self.is_ready:
+        while True:
             await asyncio.sleep(RETRY_SECONDS)
             try:
                 await self._attempt()
@@ -66,8 +62,8 @@ class Binding:
                 what = {"message": f"a fault in the router itself kept {self._address} closed", "exception": error}
                 asyncio.get_running_loop().call_exception_handler(what)
             else:
-                self.is_ready = True
                 logger.info("the address is here now, and used", address=str(self._address))
+                return
 
     def _why_not(self, error: OSError) -> str:
         what = f"{self._address} cannot be used"

@@ -140,7 +140,7 @@ class StreamClient:
 
 
 class StreamTransport(ABC):
-    """Listens at `address` and enforces `limits` and the deadline for a message."""
+    """Listens, and enforces `limits` and the deadline for a message. `address` is known once it is bound."""
 
     def __init__(self, address: Address, events: Events, limits: Limits) -> None:
         self.address: Address | None = None
@@ -153,10 +153,6 @@ class StreamTransport(ABC):
         self._binding = Binding("tcp", address, self._bind)
         self._watching: asyncio.TimerHandle | None = None
         self._log = FloodLog()
-
-    @property
-    def is_ready(self) -> bool:
-        return self._binding.is_ready
 
     async def open(self) -> None:
         await self._binding.open()

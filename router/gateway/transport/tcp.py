@@ -15,7 +15,6 @@ from router.gateway.transport.stream import (
     READ_PER_TURN,
     Encoded,
     Limits,
-    Piece,
     StreamClient,
     StreamTransport,
 )
@@ -41,27 +40,14 @@ class TcpTransport(StreamTransport):
         self._server: asyncio.Server | None = None
 
     def encode(self, frames: Sequence[Frame]) -> Encoded:
-        """Copy small frames together; a large one becomes views of its pieces."""
-        pieces: list[Piece] = []
-        small: list[bytes] = []
-        small_bytes = size = 0
-        for frame in frames:
-            before, after = (LENGTH.pack(len(frame.data)), b"") if self._prefixed else (b"", b"\n")
-            size += len(before) + len(frame.data) + len(after)
-            small.append(before)
-            if len(frame.data) > PIECE:
-                pieces.append(b"".join(small))
-                whole = memoryview(frame.data)
-                pieces += [whole[start : start + PIECE] for start in range(0, len(whole), PIECE)]
-                small, small_bytes = [after], 0
-                continue
-            small += frame.data, after
-            small_bytes += len(frame.data)
-            if small_bytes > PIECE:
-                pieces.append(b"".join(small))
-                small, small_bytes = [], 0
-        pieces.append(b"".join(small))
-        return Encoded([piece for piece in pieces if piece], size)
+        if self._prefixed:
+            wire = b"".join([part for frame in frames for part in (LENGTH.pack(len(frame.data)), frame.data)])
+        else:
+            wire = b"".join([part for frame in frames for part in (frame.data, b"\n")])
+        if len(wire) <= PIECE:
+            return Encoded([wire], len(wire))
+        whole = memoryview(wire)
+        return Encoded([whole[start : start + PIECE] for start in range(0, len(wire), PIECE)], len(wire))
 
     async def _serve(self, listening: socket.socket) -> None:
         limit = self.limits.message - 1  # of a line without its first byte

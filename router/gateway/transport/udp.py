@@ -44,10 +44,6 @@ class UdpTransport:
         self._socket: socket.socket | None = None
         self._drops_at_close = 0
 
-    @property
-    def is_ready(self) -> bool:
-        return self._binding.is_ready
-
     async def open(self) -> None:
         await self._binding.open()
 

@@ -30,7 +30,6 @@ from router.gateway.transport.zenoh_session import (
     this_owner,
 )
 from router.log import logger
-from router.table.addresses import Address
 from router.table.model import ZenohSettings
 from router.threads import DaemonThread
 
@@ -70,7 +69,6 @@ class ZenohTransport:
     """
 
     def __init__(self, settings: ZenohSettings, events: Events, most: int) -> None:
-        self.address: Address | None = None
         self._settings = settings
         self._events = events
         self._most = most
@@ -87,10 +85,6 @@ class ZenohTransport:
         self._answering = DaemonThread("zenoh answers")
         self._is_closed = False
         self._tasks: list[asyncio.Task[None]] = []
-
-    @property
-    def is_ready(self) -> bool:
-        return self._client is not None
 
     async def open(self) -> None:
         config = session_config(self._settings)

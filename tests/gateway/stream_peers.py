@@ -1,0 +1,116 @@
+"""Transports for streams of three kinds, and what connects to them: peers, and what a hostile one would send."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+from contextlib import suppress
+
+from router.gateway.transport.stream import Limits, StreamTransport
+from router.gateway.transport.tcp import TcpTransport
+from router.gateway.transport.websocket import WebsocketTransport
+from router.table.addresses import Address
+
+KINDS = ("packets", "lines", "websocket")
+ANY = Address("127.0.0.1", 0)
+MOST = 1000
+TEN = Limits(10, 10, MOST)
+GREETING = (
+    b"GET / HTTP/1.1\r\nHost: rover:8765\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+CLOSE = 8
+"""The opcode of the frame that ends a websocket."""
+
+
+def transport_of(kind: str, events: object, limits: Limits = TEN, address: Address = ANY) -> StreamTransport:
+    if kind == "websocket":
+        return WebsocketTransport(address, events, limits, text=False, page=b"")  # type: ignore[arg-type]
+    return TcpTransport(address, events, limits, prefixed=kind == "packets")  # type: ignore[arg-type]
+
+
+def framed(kind: str, *messages: bytes) -> bytes:
+    """As a client sends them."""
+    frames = {
+        "packets": lambda message: struct.pack("<I", len(message)) + message,
+        "lines": lambda message: message + b"\n",
+        "websocket": websocket_frame,
+    }
+    return b"".join(map(frames[kind], messages))
+
+
+def websocket_frame(payload: bytes, opcode: int = 2, length: int | None = None, fin: bool = True) -> bytes:
+    """Part of a websocket message, as a client sends it; the payload may end before its length does."""
+    length = len(payload) if length is None else length
+    return struct.pack(">BBH", opcode | fin << 7, 0x80 | 126, length) + bytes(4) + payload
+
+
+class Peer:
+    """A client that keeps to the protocol. `join` makes it."""
+
+    def __init__(self, kind: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.writer = writer
+        self.label = "{}:{}".format(*writer.get_extra_info("sockname"))
+        self._kind = kind
+        self.reader = reader
+
+    async def say(self, *messages: bytes) -> None:
+        await self.send(framed(self._kind, *messages))
+
+    async def send(self, data: bytes) -> None:
+        self.writer.write(data)
+        await self.writer.drain()
+
+    async def hear(self) -> bytes:
+        """The next message. Raises IncompleteReadError at the end."""
+        if self._kind == "lines":
+            return (await self.reader.readuntil(b"\n"))[:-1]
+        if self._kind == "packets":
+            return await self.reader.readexactly(struct.unpack("<I", await self.reader.readexactly(4))[0])
+        message, is_whole = b"", False
+        while not is_whole:
+            first, length = await self.reader.readexactly(2)
+            if length > 125:
+                length = int.from_bytes(await self.reader.readexactly(2 if length == 126 else 8), "big")
+            message += await self.reader.readexactly(length)
+            is_whole = first >= 0x80
+            if first & 0xF == CLOSE:
+                raise asyncio.IncompleteReadError(message, None)
+        return message
+
+    async def is_closed(self) -> bool:
+        """Whether the other side closes the connection before long, whatever it says before."""
+
+        async def hear_all() -> None:
+            with suppress(ConnectionError, asyncio.IncompleteReadError):
+                while True:
+                    await self.hear()
+
+        try:
+            await asyncio.wait_for(hear_all(), 5.0)
+        except asyncio.TimeoutError:
+            return False
+        return True
+
+    def stand_still(self) -> None:
+        """Read nothing from now on."""
+        self.writer.transport.pause_reading()  # type: ignore[attr-defined]  # a stream's transport
+
+    def leave(self) -> None:
+        self.writer.transport.abort()
+
+
+async def join(kind: str, transport: StreamTransport, host: str = "127.0.0.1") -> Peer:
+    """Connect from a local address, with a small receive buffer, and shake hands."""
+    assert transport.address is not None
+    opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    opened.setblocking(False)
+    opened.bind((host, 0))
+    await asyncio.get_running_loop().sock_connect(opened, transport.address)
+    reader, writer = await asyncio.open_connection(sock=opened, limit=1 << 24)
+    if kind == "websocket":
+        writer.write(GREETING)
+        assert b" 101 " in await reader.readuntil(b"\r\n\r\n")
+    return Peer(kind, reader, writer)
