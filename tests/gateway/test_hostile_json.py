@@ -79,7 +79,7 @@ def test_mutated_messages_are_refused_or_sound(declared: MessageType, style: Sty
     chance = random.Random(f"{declared}{style}")
     decode = decoder(declared, style)
     outcomes: list[str] = []
-    for _ in range(2500):
+    for _ in range(1000):
         value = tree(declared, example(declared), is_wrapped=style is Style.WRAPPED)
         for _ in range(chance.randrange(3)):
             change(value, chance)
@@ -91,8 +91,8 @@ def test_mutated_messages_are_refused_or_sound(declared: MessageType, style: Sty
             outcomes.append("")
         except InvalidMessageError as error:
             outcomes.append(str(error))
-    assert outcomes.count("") > 100
-    assert len({*outcomes}) > 50
+    assert outcomes.count("") > 40
+    assert len({*outcomes}) > 40
     assert max(map(len, outcomes)) < 250
 
 

@@ -48,7 +48,7 @@ def known(name: str) -> MessageType:
 TWIST = known("geometry_msgs/msg/Twist")
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data(), st.sampled_from(Style), st.sampled_from(FORMS))
 def test_any_message_is_written_as_the_reference_does(data: st.DataObject, style: Style, form: dict[str, Any]) -> None:
     declared = data.draw(messages())
@@ -57,7 +57,7 @@ def test_any_message_is_written_as_the_reference_does(data: st.DataObject, style
     assert build(declared, text, style) == cdr(declared, value)
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data())
 def test_example_is_accepted_and_has_the_defaults(data: st.DataObject) -> None:
     made = data.draw(messages(depth=1))
@@ -328,7 +328,7 @@ def test_long_lists_are_written_as_short_ones() -> None:
         assert build(declared, json.dumps(value)) == cdr(declared, value)
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data(), st.sampled_from(Style))
 def test_what_a_gateway_sends_another_takes(data: st.DataObject, style: Style) -> None:
     declared = data.draw(messages())
