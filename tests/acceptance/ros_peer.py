@@ -1,12 +1,11 @@
 """ROS software in a process of its own: `RosPeer` starts it, and this file run as a script is it.
 
-It subscribes to topics, decodes what arrives with rclpy, and prints one JSON object a line: {"matched": topic}
-when a publisher is there, {"topic": ..., "message": {...}} for a message. It ends with its standard input.
+Commands come on standard input and lines go to standard output, each a JSON object: {"matched": topic} when a topic has
+a publisher, {"topic": ..., "message": {...}} for a message, {"result": ...} for a command. It ends with its input.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 import subprocess
 import sys
@@ -15,18 +14,20 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from queue import Queue
+from time import monotonic, sleep
 from typing import Any
 
 import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
 
+from tests.compiler.ros_objects import message_class, to_object, to_value
 from tests.ros_child import own_stdout, spin_until_stdin_ends
 
-PATIENCE = 20
+PATIENCE = 60
 """Seconds that something may take on a busy machine."""
 
 Arrival = tuple[str, dict[str, Any]]
@@ -34,19 +35,24 @@ Arrival = tuple[str, dict[str, Any]]
 
 
 class RosPeer:
-    """`with RosPeer({"imu_data": "comms/msg/ImuSensorInformation"}) as peer:`; each topic has its publisher by then."""
+    """`with RosPeer({"imu_data": "comms/msg/ImuSensorInformation"}) as peer:`; each topic has its publisher by then.
 
-    def __init__(self, topics: Mapping[str, str]) -> None:
-        command = [sys.executable, __file__, json.dumps(dict(topics))]
+    It publishes as well. A topic may have several publishers, each with a name; without one it is the topic's.
+    """
+
+    def __init__(self, topics: Mapping[str, str] | None = None) -> None:
+        command = [sys.executable, __file__, json.dumps(dict(topics or {}))]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self._lines: Queue[dict[str, Any]] = Queue()
+        self._arrivals: Queue[Arrival] = Queue()
+        self._results: Queue[Any] = Queue()
+        self._matches: Queue[str] = Queue()
         self._reader = threading.Thread(target=self._read)
-        self._unmatched = set(topics)
+        self._unmatched = set(topics or {})
 
     def __enter__(self) -> RosPeer:
         self._reader.start()
         while self._unmatched:
-            self._unmatched.discard(self._lines.get(timeout=PATIENCE)["matched"])
+            self._unmatched.discard(self._matches.get(timeout=PATIENCE))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -59,63 +65,106 @@ class RosPeer:
     def _read(self) -> None:
         assert self._process.stdout
         with self._process.stdout:
-            for line in self._process.stdout:
-                self._lines.put(json.loads(line))
+            for line in map(json.loads, self._process.stdout):
+                if "result" in line:
+                    self._results.put(line["result"])
+                elif "matched" in line:
+                    self._matches.put(line["matched"])
+                else:
+                    self._arrivals.put((line["topic"], line["message"]))
 
     def receive(self) -> Arrival:
-        """The next message, whatever its topic; waits for it. That a topic has another publisher is no message."""
-        while "matched" in (line := self._lines.get(timeout=PATIENCE)):
+        """The next message, whatever its topic; waits for it."""
+        return self._arrivals.get(timeout=PATIENCE)
+
+    def receive_on(self, topic: str) -> dict[str, Any]:
+        """The next message of a topic. Those of others that came before it are dropped."""
+        while (arrival := self.receive())[0] != topic:
             pass
-        return line["topic"], line["message"]
+        return arrival[1]
 
     def nothing_left(self) -> bool:
-        return self._lines.empty()
+        return self._arrivals.empty()
 
+    def open(self, topic: str, type_name: str, *, reliable: bool = True, keeps: bool = False, name: str = "") -> None:
+        self._ask("open", name or topic, topic=topic, type=type_name, reliable=reliable, keeps=keeps)
 
-def _plain(value: Any) -> Any:
-    """A message as what JSON can say; NaN and infinity in Python's way."""
-    if hasattr(value, "get_fields_and_field_types"):
-        return {name: _plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
-    if isinstance(value, list):
-        return [_plain(element) for element in value]
-    return value.tolist() if hasattr(value, "tolist") else value
+    def open_heard(self, topics: Mapping[str, str]) -> None:
+        """Opens reliable publishers, and waits until each has a subscriber."""
+        for topic, type_name in topics.items():
+            self.open(topic, type_name)
+        deadline = monotonic() + PATIENCE
+        while not all(map(self.heard_by, topics)):
+            assert monotonic() < deadline, "nobody subscribes"
+            sleep(0.01)
+        sleep(0.1)  # the subscriber learns of it later; what it misses until then takes DDS three seconds to repair
 
+    def say(self, name: str, *messages: Mapping[str, Any], times: int = 1) -> None:
+        """Publishes messages in this order, `times` times. A field that is left out has its default."""
+        self._ask("say", name, messages=messages * times)
 
-class _Lines:
-    """What the script says, a JSON object a line."""
+    def close(self, name: str) -> None:
+        self._ask("close", name)
 
-    def __init__(self) -> None:
-        self._out = own_stdout()
+    def heard_by(self, name: str) -> int:
+        """How many subscriptions it has."""
+        return int(self._ask("heard_by", name))
 
-    def say(self, **line: object) -> None:
-        print(json.dumps(line), file=self._out)
-
-
-def _subscribe(node: Node, topic: str, type_name: str, lines: _Lines) -> None:
-    package, _, name = type_name.split("/")
-    # Those topics of the rover that are not of `comms` are offered as sensors' are: best effort.
-    reliability = ReliabilityPolicy.RELIABLE if package == "comms" else ReliabilityPolicy.BEST_EFFORT
-    node.create_subscription(
-        getattr(importlib.import_module(f"{package}.msg"), name),
-        topic,
-        lambda message: lines.say(topic=topic, message=_plain(message)),
-        QoSProfile(depth=1000, reliability=reliability),
-        event_callbacks=SubscriptionEventCallbacks(matched=partial(_matched, topic, lines)),
-    )
-
-
-def _matched(topic: str, lines: _Lines, status: Any) -> None:
-    if status.current_count:
-        lines.say(matched=topic)
+    def _ask(self, command: str, name: str, **details: object) -> Any:
+        assert self._process.stdin
+        self._process.stdin.write(json.dumps({"command": command, "name": name, **details}) + "\n")
+        self._process.stdin.flush()
+        return self._results.get(timeout=PATIENCE)
 
 
 def main() -> None:
-    lines = _Lines()
+    out = own_stdout()
     rclpy.init(args=[])
     node = rclpy.create_node("acceptance_peer")
+    publishers: dict[str, Any] = {}
+
+    def tell(**line: object) -> None:
+        print(json.dumps(line), file=out)
+
+    def matched(topic: str, status: Any) -> None:
+        if status.current_count:
+            tell(matched=topic)
+
+    def obey(line: str) -> None:
+        asked = json.loads(line)
+        name, result = asked["name"], None
+        if asked["command"] == "open":
+            publishers[name] = _publisher(node, asked)
+        elif asked["command"] == "say":
+            for message in asked["messages"]:
+                publishers[name].publish(to_object(publishers[name].msg_type, message))
+        elif asked["command"] == "close":
+            node.destroy_publisher(publishers.pop(name))
+        else:
+            result = publishers[name].get_subscription_count()
+        tell(result=result)
+
     for topic, type_name in json.loads(sys.argv[1]).items():
-        _subscribe(node, topic, type_name, lines)
-    spin_until_stdin_ends(node)
+        # Those topics of the rover that are of sensor_msgs or TwistStamped are offered best effort.
+        reliable = not type_name.startswith("sensor_msgs/") and type_name != "geometry_msgs/msg/TwistStamped"
+        node.create_subscription(
+            message_class(type_name),
+            topic,
+            lambda message, topic=topic: tell(topic=topic, message=to_value(message)),
+            QoSProfile(depth=1000, reliability=_reliability(reliable)),
+            event_callbacks=SubscriptionEventCallbacks(matched=partial(matched, topic)),
+        )
+    spin_until_stdin_ends(node, obey)
+
+
+def _publisher(node: Node, asked: Mapping[str, Any]) -> Any:
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if asked["keeps"] else DurabilityPolicy.VOLATILE
+    qos = QoSProfile(depth=100, reliability=_reliability(asked["reliable"]), durability=durability)
+    return node.create_publisher(message_class(asked["type"]), asked["topic"], qos)
+
+
+def _reliability(reliable: bool) -> ReliabilityPolicy:
+    return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
 
 
 if __name__ == "__main__":

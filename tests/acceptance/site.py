@@ -94,6 +94,20 @@ class RouterProcess:
     def wait(self) -> int:
         return self.process.wait(PATIENCE)
 
+    @contextmanager
+    def standing_still(self) -> Iterator[None]:
+        """Stops all of its threads meanwhile."""
+        self.process.send_signal(signal.SIGSTOP)
+        try:
+            wait_until(self._is_stopped, "the stop")
+            yield
+        finally:
+            self.process.send_signal(signal.SIGCONT)
+
+    def _is_stopped(self) -> bool:
+        threads = Path(f"/proc/{self.process.pid}/task").glob("*/stat")
+        return all(thread.read_text().rpartition(")")[2].split()[0] == "T" for thread in threads)
+
     def text(self) -> str:
         """What it has written to stderr so far."""
         return self._log.read_text()

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.payloads import WIRE, sample
-from tests.acceptance.service_manager import ServiceManager
 from tests.acceptance.site import RouterProcess, Site, key, site, total, udp
 from tests.ports import free_port
 
@@ -83,9 +82,8 @@ def commands_that_flow(place: Site) -> Iterator[None]:
         thread.join()
 
 
-def kill_while_driving(place: Site, table: Path) -> None:
-    """Nothing waits at the boards afterwards."""
-    router = RouterProcess(place.folder, table)
+def kill(place: Site, router: RouterProcess) -> None:
+    """While it drives; nothing waits at the boards afterwards."""
     with commands_that_flow(place):
         while place.receive("driving_board") != DRIVE:
             pass
@@ -93,9 +91,9 @@ def kill_while_driving(place: Site, table: Path) -> None:
     place.waiting()
 
 
-def test_after_a_kill_while_driving_the_board_is_braked_though_no_command_comes(place: Site) -> None:
+def test_after_a_kill_while_driving_the_brake_is_the_first_that_the_board_gets(place: Site) -> None:
     table = place.table(TABLE)
-    kill_while_driving(place, table)
+    kill(place, RouterProcess(place.folder, table))
     with RouterProcess(place.folder, table) as router:
         assert place.receive("driving_board") == BRAKE
         samples, counts = place.samples(), place.scrape()
@@ -107,28 +105,9 @@ def test_after_a_kill_while_driving_the_board_is_braked_though_no_command_comes(
         assert counts[key("deadman_datagrams_sent", **labels)] == total(counts, "deadman_datagrams_sent") == 1
         assert counts[key("deadman_send_errors", **labels)] == total(counts, "deadman_trips") == 0
         assert samples[key("deadman_active", route="manual_drive")] == 0
-    assert place.waiting() == {}  # nor is anything sent at the end, for no command came
-
-
-def test_after_a_kill_while_commands_go_on_the_brake_is_the_first_that_the_board_gets(place: Site) -> None:
-    table = place.table(TABLE)
-    kill_while_driving(place, table)
+        kill(place, router)
     with commands_that_flow(place), RouterProcess(place.folder, table):
         assert [place.receive("driving_board") for _ in range(3)] == [BRAKE, DRIVE, DRIVE]
-
-
-def test_what_waited_in_an_inherited_socket_goes_behind_the_brake(place: Site) -> None:
-    table = place.table(TABLE)
-    with closing(ServiceManager(place.folder, table, ("127.0.0.5", place.listen))) as manager:
-        for _ in range(2):
-            place.send("basestation", *[DRIVE] * 20)
-            manager.start()
-            assert [place.receive("driving_board") for _ in range(21)] == [BRAKE, *[DRIVE] * 20]
-            manager.hear("READY=1")
-            place.send("basestation", DRIVE)
-            assert place.receive("driving_board") == DRIVE
-            assert manager.end(signal.SIGKILL) == -signal.SIGKILL
-    assert place.waiting() == {}
 
 
 def test_a_router_that_cannot_reach_the_board_starts_all_the_same(tmp_path: Path) -> None:

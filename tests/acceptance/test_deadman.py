@@ -15,7 +15,7 @@ import pytest
 
 from tests.acceptance.expected import from_board_units
 from tests.acceptance.payloads import WIRE, sample
-from tests.acceptance.ros_talker import RosTalker
+from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.rover_map import HOSTS, OUTFLOWS, ROUTER, TOPICS_FROM_ROS
 from tests.acceptance.site import IMPATIENT_ROVER, ROOT, RouterProcess, Site, balance, key, site, total, wait_until
 from tests.compiler.ros_objects import serialized
@@ -28,7 +28,7 @@ RELEASED = "commands come again: the deadman is released"
 LATE = 5
 """Commands that wait while the router is stopped: no more than its queues hold."""
 
-PAUSE = 2.0
+PAUSE = 0.6
 """Seconds. A command is stale after 0.2."""
 
 
@@ -56,7 +56,7 @@ BOARDS = {command.board for command in COMMANDS.values()}
 class Driver:
     """Gives one kind of command to a running router, and is the board that it is for."""
 
-    def __init__(self, route: str, place: Site, router: RouterProcess, talker: RosTalker | None) -> None:
+    def __init__(self, route: str, place: Site, router: RouterProcess, talker: RosPeer | None) -> None:
         self.route, self.place, self.router = route, place, router
         self.command = COMMANDS[route]
         self.datagram = from_board_units(route, self.command.values).datagram
@@ -66,7 +66,7 @@ class Driver:
     def give(self) -> None:
         self._given += 1
         if self._talker:
-            self._talker.publish(self.route, self.command.values)
+            self._talker.say(self.route, self.command.values)
         else:
             self.place.send("basestation", self.datagram)
 
@@ -117,7 +117,9 @@ class Driver:
         wait_until(told, "the last line")
 
 
-@pytest.fixture(scope="module", params=COMMANDS)
+@pytest.fixture(
+    scope="module", params=["manual_drive", pytest.param("manual_arm", marks=pytest.mark.slow), "drive_motor"]
+)
 def driver(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Driver]:
     """Of a router of its own, which ends with the last of these tests."""
     folder = tmp_path_factory.mktemp(request.param)
@@ -125,7 +127,9 @@ def driver(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         place = stack.enter_context(site(folder))
         router = stack.enter_context(RouterProcess(folder, place.table(IMPATIENT_ROVER)))
         topics = {topic: kind for topic, kind in TOPICS_FROM_ROS.items() if topic == request.param}
-        talker = stack.enter_context(RosTalker(topics)) if topics else None
+        talker = stack.enter_context(RosPeer()) if topics else None
+        if talker:
+            talker.open_heard(topics)
         yield Driver(request.param, place, router, talker)
 
 
@@ -147,24 +151,16 @@ def test_commands_that_waited_too_long_are_not_sent(driver: Driver) -> None:
     wait_until(driver.all_taken, "the last command")
     stale = key("messages_dropped", route=driver.route, target=driver.command.board, reason="stale")
     before = driver.place.scrape()[stale]
-    driver.router.process.send_signal(signal.SIGSTOP)
-    wait_until(lambda: is_stopped(driver.router), "the stop")
-    driver.place.waiting()
-    for _ in range(LATE):
-        driver.give()
-    sleep(PAUSE)
-    driver.router.process.send_signal(signal.SIGCONT)
+    with driver.router.standing_still():
+        driver.place.waiting()
+        for _ in range(LATE):
+            driver.give()
+        sleep(PAUSE)
     wait_until(driver.all_taken, "the last late command")
     assert driver.place.scrape()[stale] - before == LATE
     assert driver.place.receive(driver.command.board) == driver.command.halt
     driver.await_halt()
     driver.drive()
-
-
-def is_stopped(router: RouterProcess) -> bool:
-    """All of its threads."""
-    threads = Path(f"/proc/{router.process.pid}/task").glob("*/stat")
-    return all(thread.read_text().rpartition(")")[2].split()[0] == "T" for thread in threads)
 
 
 @contextmanager
@@ -189,6 +185,7 @@ def steady(driver: Driver) -> Iterator[subprocess.Popen[Any] | ForkedProcess]:
             process.kill()
 
 
+@pytest.mark.slow
 def test_a_source_that_is_stopped_or_killed_is_replaced(driver: Driver) -> None:
     driver.place.waiting()
     with steady(driver) as source:

@@ -10,11 +10,10 @@ import urllib.request
 from functools import partial
 from pathlib import Path
 
+from tests.acceptance.gateway_clients import Headset, lines, repeating
 from tests.acceptance.payloads import WIRE, sample
-from tests.acceptance.ros_peer import PATIENCE
-from tests.acceptance.ros_speaker import Speaker
+from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.site import ROOT, RouterProcess, key, site, total, udp, wait_until
-from tests.acceptance.test_gateway import Headset, data_of, lines, repeating
 from tests.ports import free_port
 from tests.tables import PROTOS
 
@@ -45,7 +44,7 @@ def asked(port: int, path: str, data: bytes | None = None) -> str:
 def test_the_table_of_who_moves_over_streams_topics(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "moving-over.md").read_text(encoding="utf-8")
     [text] = re.findall(r"^```yaml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    with site(tmp_path, {}) as place, udp("127.0.0.9") as opened, Speaker() as speaker:
+    with site(tmp_path, {}) as place, udp("127.0.0.9") as opened, RosPeer() as peer:
         text = text.replace("10.0.20.219:8502", f"127.0.0.9:{opened.getsockname()[1]}")
         text = text.replace("10.0.0.230:8500", f"127.0.0.5:{free_port('127.0.0.5')}").replace(
             "9108", str(place.metrics)
@@ -53,14 +52,14 @@ def test_the_table_of_who_moves_over_streams_topics(tmp_path: Path) -> None:
         assert {host.partition(".")[0] for host in re.findall(r"[\d.]+(?=:\d)", text)} == {"127"}
         table = tmp_path / "gateway.yaml"
         table.write_text(text)
-        speaker.open("/imu/rate", "geometry_msgs/msg/Vector3", keeps=True)
-        speaker.say("/imu/rate", {"x": 1.5})
-        speaker.open("/elsewhere", "std_msgs/msg/String")
+        peer.open("/imu/rate", "geometry_msgs/msg/Vector3", keeps=True)
+        peer.say("/imu/rate", {"x": 1.5})
+        peer.open("/elsewhere", "std_msgs/msg/String")
         with RouterProcess(tmp_path, table) as router:
             client = Headset(opened)
-            assert client.wait_for(data_of("/imu/rate")) == {"x": [1.5], "y": [0.0], "z": [0.0]}
+            assert client.wait_for("/imu/rate") == {"x": [1.5], "y": [0.0], "z": [0.0]}
             assert client.early == []
-            assert speaker.heard_by("/elsewhere") == 0
+            assert peer.heard_by("/elsewhere") == 0
             assert asked(place.metrics, "/ready").strip() == "ready"
             counts = place.scrape()
             assert total(counts, "messages_sent", route="vr_headset") > 0
@@ -72,7 +71,7 @@ def test_the_table_of_who_moves_over_streams_topics(tmp_path: Path) -> None:
 
 
 def test_a_reload_gives_it_its_first_routes_and_takes_them_away_again(tmp_path: Path) -> None:
-    with site(tmp_path, {}) as place, udp("127.0.0.30") as board, Speaker() as speaker:
+    with site(tmp_path, {}) as place, udp("127.0.0.30") as board, RosPeer() as peer:
         port = free_port("127.0.0.5", kind=socket.SOCK_STREAM)
         ports = {"METRICS": place.metrics, "FOXGLOVE": free_port(kind=socket.SOCK_STREAM), "PORT": port}
         only, routes = ONLY, ROUTES.replace("LISTEN", str(place.listen))
@@ -80,8 +79,8 @@ def test_a_reload_gives_it_its_first_routes_and_takes_them_away_again(tmp_path: 
             only = only.replace(word, str(number))
         table = tmp_path / "table.yaml"
         table.write_text(only)
-        speaker.open("/gw/word", "std_msgs/msg/String", keeps=True)
-        speaker.say("/gw/word", {"data": "before"})
+        peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
+        peer.say("/gw/word", {"data": "before"})
         with (
             RouterProcess(tmp_path, table) as router,
             socket.create_connection(("127.0.0.5", port), PATIENCE) as opened,
@@ -103,7 +102,7 @@ def test_a_reload_gives_it_its_first_routes_and_takes_them_away_again(tmp_path: 
                 pass  # nobody has it any more
             saved = Path(json.loads(asked(place.metrics, "/record/save", b""))["file"])
             assert saved.stat().st_size > 0
-            speaker.say("/gw/word", {"data": "after"})
+            peer.say("/gw/word", {"data": "after"})
             assert next(line for line in received if line["topic"] == "/gw/word")["data"] == {"data": "after"}
             accepted = key("messages_received", route="imu_info", source="unknown")
             wait_until(lambda: place.scrape()[accepted] == total(place.scrape(), "datagrams_received"), "the balance")

@@ -9,7 +9,7 @@ import pytest
 
 from tests.acceptance.expected import from_board_units, in_board_units
 from tests.acceptance.payloads import WIRE, generated, sample
-from tests.acceptance.ros_talker import RosTalker
+from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.rover_map import FLOWS, OUTFLOWS, TOPICS_FROM_ROS
 from tests.acceptance.site import RouterProcess, Site, site
 
@@ -44,12 +44,13 @@ def test_what_is_forwarded_and_what_comes_from_ros_is_trimmed(trimming: Running)
             place.send(flow.source, sent.datagram)
             for destination in flow.destinations:
                 assert place.receive(destination) == sent.datagram.rstrip(b"\0")
-    with RosTalker(TOPICS_FROM_ROS) as talker:
+    with RosPeer() as talker:
+        talker.open_heard(TOPICS_FROM_ROS)
         for case, outflow in OUTFLOWS.items():
             for said in generated(case):
                 message = in_board_units(said.payload)
                 whole = from_board_units(case, message).datagram
-                talker.publish(case, message)
+                talker.say(case, message)
                 arrived = place.receive(outflow.destination)
                 assert arrived == whole.rstrip(b"\0")
                 trimmed += arrived != whole

@@ -17,7 +17,6 @@ from websockets.sync.client import connect
 
 from router.ros.topics import TopicListener
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
-from tests.acceptance.ros_talker import RosTalker
 from tests.acceptance.site import ROOT, RouterProcess, Site, key, udp, wait_until
 from tests.engine.wire import rover_envelope
 from tests.ports import free_port
@@ -53,6 +52,8 @@ gateways:
     discovery_period: 200ms
     inbound: [{{topic: note, type: comms/msg/DrivingBoardMotorMessage}}]
 """
+
+pytestmark = pytest.mark.slow
 
 ONE = ("-r", "__ns:=/rover1", "-r", "__node:=one", "-r", "imu_data:=imu", "-r", "/heading:=/rover1/heading")
 TWO = ("-r", "__ns:=/rover2", "-r", "imu_data:=imu", "-p", "use_sim_time:=true")
@@ -137,9 +138,10 @@ def test_data_arrive_on_the_topics_of_their_rover_only(rovers: tuple[Rover, Rove
 
 def test_commands_reach_the_board_of_their_rover_only(rovers: tuple[Rover, Rover]) -> None:
     command = "comms/msg/DrivingBoardMotorMessage"
-    with RosTalker({"/rover1/drive": command, "/rover2/drive": command}) as talker:
+    with RosPeer() as talker:
+        talker.open_heard({"/rover1/drive": command, "/rover2/drive": command})
         for number, rover in enumerate(rovers, 1):
-            talker.publish(f"/rover{number}/drive", {"distance_to_go": float(number)})
+            talker.say(f"/rover{number}/drive", {"distance_to_go": float(number)})
             expected = enveloped(drive_motor={"distance_to_go": float(number)})
             assert rover.site.receive("driving_board") == expected
     for rover in rovers:

@@ -18,10 +18,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from tests.acceptance.gateway_clients import Scene, repeating, scene, twist
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.site import RouterProcess, key, wait_until
-from tests.acceptance.test_gateway import ZENOH, Scene, repeating, scene, twist
 from tests.ports import free_port
 from tests.tables import PROTOS
 from tests.test_docs import examples
@@ -29,6 +29,14 @@ from tests.test_docs import examples
 pytestmark = pytest.mark.slow  # discovery between three programs, with TLS
 
 KEY = "rovers/rover_1"
+ZENOH = """\
+  earth:
+    transport: {zenoh: {key: rovers/loki, listen: ["tcp/127.0.0.1:PORT"]}}
+    topics: {include: ["/gw/**"]}
+    publish_period: 50ms
+    discovery_period: 200ms
+    inbound: [{topic: /gw/set, type: std_msgs/msg/Int32}]
+"""
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +61,8 @@ def documented(language: str, certificates: Path) -> str:
 @contextmanager
 def station(now: Scene, certificates: Path, name: str = "station", others: str = "") -> Iterator[zenoh.Session]:
     """The base station of docs/gateway.md, with the certificate of `name`."""
-    text = documented("json5", certificates).replace("PORT", str(now.port)).replace("/station.", f"{others}/{name}.")
+    text = documented("json5", certificates).replace("PORT", str(now.ports["PORT"]))
+    text = text.replace("/station.", f"{others}/{name}.")
     config: zenoh.Config = zenoh.Config.from_json5(text)
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
@@ -81,10 +90,10 @@ def test_who_has_the_right_certificate_reads_and_who_is_allowed_to_drives(tmp_pa
         station(now, certificates) as driver,
         station(now, certificates, "guest") as guest,
     ):
-        now.speaker.open("/gw/word", "std_msgs/msg/String", keeps=True)
+        now.peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
         for session in (driver, guest):
             heard = Heard(session, f"{KEY}/data/gw/word")
-            with repeating(partial(now.speaker.say, "/gw/word", {"data": "x"})):
+            with repeating(partial(now.peer.say, "/gw/word", {"data": "x"})):
                 wait_until(heard.something, "a value")
             answers = [reply.ok for reply in session.get(f"{KEY}/**", timeout=10.0)]
             assert f"{KEY}/schema/std_msgs/msg/String" in [str(answer.key_expr) for answer in answers if answer]
@@ -113,7 +122,7 @@ def test_who_has_no_certificate_of_the_authority_does_not_get_in(
         config.insert_json5("mode", '"client"')
         config.insert_json5("scouting/multicast/enabled", "false")
         protocol = "tcp" if stranger == "by tcp" else "tls"
-        config.insert_json5("connect/endpoints", f'["{protocol}/127.0.0.1:{now.port}"]')
+        config.insert_json5("connect/endpoints", f'["{protocol}/127.0.0.1:{now.ports["PORT"]}"]')
         tls = "transport/link/tls"
         config.insert_json5(f"{tls}/root_ca_certificate", f'"{certificates}/ca.pem"')
         if stranger == "of another authority":
@@ -139,7 +148,7 @@ def test_a_password_from_the_environment_lets_in_and_is_printed_nowhere(tmp_path
         config = zenoh.Config()
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{now.port}"]')
+        config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{now.ports["PORT"]}"]')
         config.insert_json5("transport/auth/usrpwd", f'{{user: "rover", password: "{PASSWORD}x"}}')
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             zenoh.open(config)
@@ -174,7 +183,7 @@ def test_the_second_router_routes_while_its_gateway_waits_for_the_key(tmp_path: 
         folder.mkdir()
     with ExitStack() as opened:
         first = opened.enter_context(scene(folders[0], ZENOH))
-        place = f'mode: client, connect: ["tcp/127.0.0.1:{first.port}"]'
+        place = f'mode: client, connect: ["tcp/127.0.0.1:{first.ports["PORT"]}"]'
         there = ZENOH.replace('listen: ["tcp/127.0.0.1:PORT"]', place)
         second = opened.enter_context(scene(folders[1], there))
         conflicts = key("gateway_key_conflicts", route="earth")
