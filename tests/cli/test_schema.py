@@ -63,22 +63,6 @@ def test_additions_are_recorded(proto: Path, capsys: pytest.CaptureFixture[str])
     assert locked["messages"]["Motor"]["fields"] == {"1": "float rpm", "2": "bool on"}
 
 
-def test_conflict_is_refused_and_nothing_written(proto: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lock("--message", "Envelope")
-    path = proto.with_name("envelope.lock.json")
-    before = path.read_text()
-    proto.write_text(PROTO.replace("float rpm = 1;", "float rpm = 3;\n  bool on = 2;"))
-    capsys.readouterr()
-    assert lock() == 78
-    assert capsys.readouterr().out == (
-        "motor.proto:3:15: error[wire-number-conflict]: Motor.rpm has number 3 instead of 1; "
-        "the lock says `float rpm = 1`; if it is intended, `router schema lock --protos . --accept Motor.rpm`\n"
-        "    3 |   float rpm = 3;\n"
-        "      |               ^\n"
-    )
-    assert path.read_text() == before
-
-
 def test_broken_lock_is_refused(proto: Path, capsys: pytest.CaptureFixture[str]) -> None:
     proto.with_name("envelope.lock.json").write_text("{")
     assert lock("--message", "Envelope") == 78

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from router.errors import Code, Diagnostic
 from router.table import load_table
 from router.table.keys import flat
 from router.table.model import RouteTable
+from router.table.schema import table_schema
 
 GOOD = """\
 version: 1
@@ -136,3 +138,21 @@ def shown(part: object) -> dict[str, str]:
 def places(findings: list[Diagnostic]) -> list[tuple[Code, int, int]]:
     """Code, line and column of each finding."""
     return [(finding.code, finding.span.line, finding.span.column) for finding in findings]
+
+
+def references(schema: Any, here: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Where a table's schema refers to a definition: keys from the root, `*` for any name; and the definition."""
+    if isinstance(schema, list):
+        for member in schema:
+            yield from references(member, here)
+    elif isinstance(schema, dict):
+        if name := schema.get("$ref", "").rpartition("/")[2]:
+            yield here, name
+            if name not in ("field_value", "nested_fields"):  # which hold themselves
+                yield from references(table_schema()["definitions"][name], here)
+        for key, inner in schema.get("properties", {}).items():
+            yield from references(inner, (*here, key))
+        for key, inner in schema.items():
+            if key not in ("definitions", "default", "examples", "properties"):
+                below = (*here, "*") if key == "additionalProperties" and isinstance(inner, dict) else here
+                yield from references(inner, below)

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import re
 import socket
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.assets import asset
 from router.errors import Code
 from router.table.addresses import ADDRESSES, Address, BadAddressError, parse_address
-from router.table.schema import SCHEMA, table_schema
-from tests.table.tables import load
+from router.table.schema import table_schema
+from tests.table.tables import load, references
 
-PATTERN = json.loads(asset(SCHEMA).read_text(encoding="utf-8"))["definitions"]["address"]["pattern"]
+PATTERN = table_schema()["definitions"]["address"]["pattern"]
 
 octets = st.one_of(st.integers(0, 400).map(str), st.sampled_from(["01", "", "0", "255", "256", "x"]))
 ports = st.one_of(st.integers(0, 70000).map(str), st.sampled_from(["", "08", "65535", "65536", "8 ", "x"]))
@@ -118,28 +114,8 @@ def test_every_address_has_to_lie_in_them(tmp_path: Path, address: str, moved: s
     assert outside(tmp_path, LOCAL.replace(address, moved).replace("networks: [127.0.0.0/8]\n", "")) == []
 
 
-def _keys_of_addresses(schema: Any, definitions: dict[str, Any], here: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    if isinstance(schema, list):
-        for member in schema:
-            yield from _keys_of_addresses(member, definitions, here)
-    elif isinstance(schema, dict):
-        reference = schema.get("$ref", "").rpartition("/")[2]
-        if reference == "address":
-            yield here
-        elif reference and reference not in ("field_value", "nested_fields"):  # which hold themselves
-            yield from _keys_of_addresses(definitions[reference], definitions, here)
-        for key, member in schema.items():
-            if key == "properties":
-                for name, inner in member.items():
-                    yield from _keys_of_addresses(inner, definitions, (*here, name))
-            elif key not in ("definitions", "default", "examples"):
-                below = (*here, "*") if key == "additionalProperties" and isinstance(member, dict) else here
-                yield from _keys_of_addresses(member, definitions, below)
-
-
 def test_no_address_of_the_schema_is_left_out() -> None:
-    schema = table_schema()
-    found = set(_keys_of_addresses(schema, schema["definitions"], ()))
+    found = {path for path, definition in references(table_schema()) if definition == "address"}
     assert found == {pattern for pattern in ADDRESSES if "zenoh" not in pattern}
 
 

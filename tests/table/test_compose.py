@@ -145,12 +145,6 @@ def test_an_alias_bomb_is_one_finding(tmp_path: Path) -> None:
     assert "more than 20000 values" in finding.message
 
 
-def test_findings_of_one_text_are_collected(tmp_path: Path) -> None:
-    _, findings = composed(tmp_path, "a: yes\nb: {c: 0777, c: 1}\nd: ${Y}\n")
-    codes = [Code.AMBIGUOUS_SCALAR, Code.AMBIGUOUS_SCALAR, Code.DUPLICATE_KEY, Code.UNDEFINED_VARIABLE]
-    assert [finding.code for finding in findings] == codes
-
-
 def test_spans_name_the_file_as_findings_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert scalar(tmp_path, "k: v\n").span == SourceSpan("t.yaml", 1, 4, 5)

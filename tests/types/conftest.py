@@ -13,6 +13,8 @@ from tests.tables import PROTOS
 
 ONEOF = Located("payload", SourceSpan("table.yaml", 4, 10))
 Write = Callable[[Mapping[str, str]], Path]
+Load = Callable[[Mapping[str, str]], ProtoSchema]
+Refused = Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]
 
 
 @pytest.fixture
@@ -31,21 +33,21 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
 
 
 @pytest.fixture
-def load(write: Write) -> Callable[[Mapping[str, str]], ProtoSchema]:
+def load(write: Write) -> Load:
     return lambda files: load_protos(*settings(with_envelope(write(files))))
 
 
 @pytest.fixture
-def refused(write: Write) -> Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]:
+def refused(write: Write) -> Refused:
     """The findings of a folder that cannot be loaded."""
+    return lambda files: refusal(with_envelope(write(files)))
 
-    def findings(files: Mapping[str, str]) -> tuple[Diagnostic, ...]:
-        root = with_envelope(write(files))
-        with pytest.raises(TableError) as caught:
-            load_protos(*settings(root))
-        return caught.value.diagnostics
 
-    return findings
+def refusal(root: Path, message: str = "Envelope") -> tuple[Diagnostic, ...]:
+    """The findings of a folder that cannot be loaded."""
+    with pytest.raises(TableError) as caught:
+        load_protos(*settings(root, message))
+    return caught.value.diagnostics
 
 
 def with_envelope(root: Path) -> Path:

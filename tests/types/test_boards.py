@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from router.errors import Code, SourceSpan
 from router.types.boards import NO_OPTIONS, BoardOptions, board_findings, largest_encoding, read_options
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
 from tests.tables import PROTOS
-from tests.types.conftest import ONEOF, settings, with_envelope
+from tests.types.conftest import ONEOF, Load, Write, settings, with_envelope
 
 
 def test_later_lines_win_and_a_field_wins_over_its_message(tmp_path: Path) -> None:
@@ -62,8 +61,6 @@ def test_file_that_is_no_text_is_a_finding(tmp_path: Path) -> None:
     _, (found,) = read_options(path)
     assert found.code is Code.BAD_FILE
 
-
-Write = Callable[[Mapping[str, str]], Path]
 
 _SIZE = re.compile(r"^#define (\w+)_size\s+(\d+)$", re.MULTILINE)
 
@@ -140,12 +137,10 @@ def test_every_kind_of_field_is_as_large_as_nanopb_says(write: Write, tmp_path: 
     assert our_sizes(load_protos(*settings(with_envelope(root)))) == nanopb_sizes(root, tmp_path / "out")
 
 
-def test_message_inside_itself_has_no_largest_encoding(load: Callable[[Mapping[str, str]], ProtoSchema]) -> None:
+def test_message_inside_itself_has_no_largest_encoding(load: Load) -> None:
     schema = load({"a.proto": 'syntax = "proto3";\nmessage A { B b = 1; }\nmessage B { A a = 1; }'})
     assert largest_encoding(schema.descriptor("A"), schema.board_options) is None
 
-
-Load = Callable[[Mapping[str, str]], ProtoSchema]
 
 PROTO = """\
 syntax = "proto3";

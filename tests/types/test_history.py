@@ -6,7 +6,7 @@ What breaks the wire is accepted by name afterwards, as a team does that flashes
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,8 @@ from router.cli import BAD_TABLE, OK, main
 from router.errors import TableError
 from router.types.lock import LockComparison
 from router.types.protobuf import find_envelope, load_protos
-from tests.types.conftest import ONEOF, settings
+from tests.types.conftest import ONEOF, Write, settings
 
-Write = Callable[[Mapping[str, str]], Path]
 Change = Mapping[str, Any]
 
 HISTORY = yaml.safe_load((Path(__file__).parent / "history.yaml").read_text(encoding="utf-8"))

@@ -14,9 +14,8 @@ from router.errors import Code, Diagnostic, SourceSpan, TableError
 from router.types.lock import LockComparison
 from router.types.lock_file import LOCK_NAME, Declaration, Entry, Lock, read_lock, write_lock
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
-from tests.types.conftest import ONEOF, settings
+from tests.types.conftest import ONEOF, Write, settings
 
-Write = Callable[[Mapping[str, str]], Path]
 Compare = Callable[..., LockComparison]
 Record = Callable[..., None]
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError
+from router.errors import Code, Located, SourceSpan, TableError
 from router.types.protobuf import load_protos
-from tests.types.conftest import settings
-
-Write = Callable[[Mapping[str, str]], Path]
-Refused = Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]
+from tests.types.conftest import Refused, Write, refusal, settings
 
 
 def test_missing_folder_is_blamed_on_whoever_names_it(tmp_path: Path) -> None:
@@ -31,19 +27,13 @@ def test_folder_without_protos_is_a_finding(write: Write) -> None:
 def test_unreadable_proto_that_is_imported_is_a_finding_at_that_file(write: Write) -> None:
     root = write({"a.proto": 'syntax = "proto3"; import "b.proto"; message Envelope {}'})
     (root / "b.proto").symlink_to("nowhere.proto")
-    with pytest.raises(TableError) as caught:
-        load_protos(*settings(root))
-    assert [(finding.code, finding.span.file) for finding in caught.value.diagnostics] == [(Code.BAD_FILE, "b.proto")]
+    assert [(finding.code, finding.span.file) for finding in refusal(root)] == [(Code.BAD_FILE, "b.proto")]
 
 
 def test_proto_that_is_not_utf8_is_a_finding_at_that_line(write: Write) -> None:
     root = write({"a.proto": ""})
     (root / "a.proto").write_bytes(b'syntax = "proto3";\n// gr\xf6sse\nmessage Envelope {}')
-    with pytest.raises(TableError) as caught:
-        load_protos(*settings(root))
-    assert [str(finding) for finding in caught.value.diagnostics] == [
-        "a.proto:2:1: error[bad-file]: the file is not UTF-8"
-    ]
+    assert [str(finding) for finding in refusal(root)] == ["a.proto:2:1: error[bad-file]: the file is not UTF-8"]
 
 
 def test_hidden_files_of_editors_and_archives_are_left_alone(write: Write) -> None:

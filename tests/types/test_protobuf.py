@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.errors import Code, SourceSpan, TableError
 from router.types.lock import LockComparison
 from router.types.lock_file import LOCK_NAME, Declaration, Lock, write_lock
 from router.types.model import Bytes, Enum, Float, Int, List, MessageType, String
-from router.types.protobuf import Envelope, ProtoSchema, find_envelope, load_protos
-from tests.types.conftest import ONEOF, settings
-
-Write = Callable[[Mapping[str, str]], Path]
-Load = Callable[[Mapping[str, str]], ProtoSchema]
-Refused = Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]
+from router.types.protobuf import Envelope, find_envelope, load_protos
+from tests.types.conftest import ONEOF, Load, Refused, Write, refusal, settings
 
 ENVELOPE = """\
 syntax = "proto3";
@@ -182,9 +177,8 @@ def test_enum_of_the_envelopes_name_is_none(write: Write) -> None:
     enum = 'syntax = "proto3";\nenum Envelope {\n  E_NONE = 0;\n}\n'
     schema = load_protos(*settings(write({"a.proto": ENVELOPE, "b.proto": enum})))
     assert [(found.span.file, found.code) for found in schema.warnings] == [("b.proto", Code.UNUSED_PROTO)]
-    with pytest.raises(TableError) as caught:
-        load_protos(*settings(write({"a.proto": enum, "b.proto": 'syntax = "proto3"; message Imu {}'})))
-    assert caught.value.diagnostics[0].message == "no .proto file declares a message 'Envelope'"
+    (finding, *_) = refusal(write({"a.proto": enum, "b.proto": 'syntax = "proto3"; message Imu {}'}))
+    assert finding.message == "no .proto file declares a message 'Envelope'"
 
 
 def test_file_name_that_is_not_utf8_is_a_warning(write: Write) -> None:
@@ -224,14 +218,11 @@ def test_merge_of_two_envelopes_in_one_file_is_said_to_be_one(refused: Refused) 
 
 def test_enum_values_that_are_named_as_messages_are_blamed(write: Write) -> None:
     root = write({"z.proto": ENVELOPE})
-    named = settings(root)
-    schema = load_protos(*named)
+    schema = load_protos(*settings(root))
     write_lock(root / LOCK_NAME, LockComparison(schema, find_envelope(schema, ONEOF)).extended())
     types = 'syntax = "proto3";\nenum Types {\n  NONE = 0;\n  Imu = 1;\n}\n'
     write({"a.proto": types, "z.proto": ENVELOPE.replace("message Imu", 'import "a.proto";\nmessage Imu')})
-    with pytest.raises(TableError) as caught:
-        load_protos(*named)
-    assert [(found.span.file, found.span.line) for found in caught.value.diagnostics] == [("a.proto", 4)]
+    assert [(found.span.file, found.span.line) for found in refusal(root)] == [("a.proto", 4)]
 
 
 def test_stray_file_without_a_fault_can_be_compiled_too(write: Write) -> None:
@@ -267,9 +258,7 @@ def test_of_two_files_that_declare_the_envelope_the_locked_one_counts(
         schema = load_protos(*settings(root, message))
         assert schema.sources.file(schema.envelope) == chosen
         return
-    with pytest.raises(TableError) as caught:
-        load_protos(*settings(root, message))
-    (finding,) = caught.value.diagnostics
+    (finding,) = refusal(root, message)
     assert str(finding) == (
         "table.yaml:3:12: error[duplicate-message]: several files declare a message 'Envelope': a.proto and b.proto; "
         "remove all but one, or give its full name if they have packages"
@@ -293,9 +282,7 @@ DEEP = {
 )
 def test_wrong_folder_of_protos_is_said_to_be_it(write: Write, folder: str, said: str) -> None:
     root = write({f"protos/{name}": text for name, text in DEEP.items()})
-    with pytest.raises(TableError) as caught:
-        load_protos(*settings(root / folder))
-    (finding,) = caught.value.diagnostics
+    (finding,) = refusal(root / folder)
     assert (finding.code, finding.span.line) == (Code.BAD_VALUE, 2)
     assert f"{finding.message}; {finding.hint}".startswith(f"{said} protos, to which imports are relative")
     load_protos(*settings(root / "protos"))

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
-
 import pytest
 
-from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.errors import Code, SourceSpan, TableError
 from router.types.protobuf import load_protos
-from tests.types.conftest import proto, settings, with_envelope
-
-Write = Callable[[Mapping[str, str]], Path]
+from tests.types.conftest import Refused, Write, proto, settings, with_envelope
 
 
 def test_nothing_is_printed(write: Write, capfd: pytest.CaptureFixture[str]) -> None:
@@ -34,9 +29,6 @@ def test_files_that_change_while_they_are_compiled_are_a_finding(write: Write, m
     monkeypatch.setattr("router.types.protoc._protoc_compiler.get_protos", break_off)  # the first look
     with pytest.raises(TableError, match=r"perhaps they changed meanwhile: try again"):
         load_protos(*settings(root))
-
-
-Refused = Callable[[Mapping[str, str]], tuple[Diagnostic, ...]]
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ from router.types.ros import (
     msg_files,
     ros_interfaces,
 )
+from tests.types.conftest import Write
 
-Write = Callable[[Mapping[str, str]], Path]
 Interfaces = Callable[[Mapping[str, str]], RosInterfaces]
 
 INSTALLED = sorted(set(msg_files().names()))
