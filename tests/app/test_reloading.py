@@ -9,12 +9,9 @@ import random
 import re
 import shutil
 import socket
-import struct
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from pathlib import Path
+from contextlib import contextmanager
 from time import time
 from unittest.mock import ANY
 
@@ -30,18 +27,10 @@ from router.compiler.metrics import Counters
 from router.net.receiver import ReceiveThread
 from router.observe.snapshot import Snapshot, snapshot
 from tests.acceptance.site import wait_until
+from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, numbered, udp
 from tests.ports import free_port
 from tests.tables import PROTOS
 
-TABLE = """\
-version: 1
-envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
-listen:
-{listen}
-endpoints:
-  sensor_board: {{address: 127.0.0.30:8, kind: board}}
-  basestation: {{address: "127.0.0.1:{basestation}", kind: basestation}}
-{more}"""
 PH = "  ph_info: {source: sensor_board, destinations: [basestation]}\n"
 TOPIC = """\
   ph_info:
@@ -56,7 +45,6 @@ FROM_ROS = """\
     fields: auto
     destinations: [basestation]
 """
-DRIVE, BRAKE = bytes.fromhex("c201021005"), bytes.fromhex("ca01020801")
 
 
 def turns(timeout: str, at_start: str = "silent") -> str:
@@ -83,16 +71,6 @@ gateways:
 """
 
 
-def numbered(number: int) -> bytes:
-    """A `ph_info` with a number in it."""
-    return bytes.fromhex("0a050d") + struct.pack("<f", number)
-
-
-def let_rest(path: Path) -> None:
-    """As if it had been written a minute ago: a reload waits for what is being written."""
-    os.utime(path, (time() - 60,) * 2)
-
-
 @contextmanager
 def later(write: Callable[[], object]) -> Iterator[None]:
     """Writes a moment after this was entered, as a slow copy goes on."""
@@ -100,80 +78,6 @@ def later(write: Callable[[], object]) -> Iterator[None]:
     timer.start()
     yield
     timer.join()
-
-
-def udp(host: str) -> socket.socket:
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-    opened.bind((host, 0))
-    opened.settimeout(10)
-    return opened
-
-
-@dataclass
-class Site:
-    """A folder for the table, a board that sends and a basestation that receives."""
-
-    folder: Path
-    board: socket.socket
-    basestation: socket.socket
-    listen: int
-    sent: list[int] = field(default_factory=list)
-    received: list[int] = field(default_factory=list)
-    """The numbers of what has arrived at the basestation, by `take`."""
-
-    def write(self, routes: str, *, listen: str | None = None, endpoints: str = "") -> Path:
-        path = self.folder / "table.yaml"
-        listeners = listen or f'  rover: {{address: "127.0.0.1:{self.listen}"}}'
-        destination = self.basestation.getsockname()[1]
-        path.write_text(
-            TABLE.format(protos=PROTOS, listen=listeners, basestation=destination, more=f"{endpoints}routes:\n{routes}")
-        )
-        let_rest(path)
-        return path
-
-    @contextmanager
-    def router(self, routes: str) -> Iterator[Router]:
-        program = check_table(self.write(routes)).program
-        assert program is not None
-        with Router(program) as router:
-            yield router
-
-    def send(self, *datagrams: bytes, port: int | None = None) -> None:
-        for datagram in datagrams:
-            self.board.sendto(datagram, ("127.0.0.1", port or self.listen))
-
-    @contextmanager
-    def under_load(self) -> Iterator[None]:
-        """Numbered datagrams come all the time, 2,000 per second."""
-        ended = threading.Event()
-
-        def load() -> None:
-            while not ended.wait(0.0005):
-                self.send(numbered(len(self.sent)))
-                self.sent.append(len(self.sent))
-                self.take()
-
-        thread = threading.Thread(target=load)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
-
-    def take(self) -> None:
-        """What has arrived by now."""
-        self.basestation.setblocking(False)
-        with suppress(BlockingIOError):
-            while datagram := self.basestation.recv(1000):
-                self.received.append(int(struct.unpack("<f", datagram[3:])[0]))
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    with udp("127.0.0.30") as board, udp("127.0.0.1") as basestation:
-        yield Site(tmp_path, board, basestation, free_port())
 
 
 def numbers(router: Router) -> Snapshot:
@@ -219,18 +123,6 @@ def test_a_table_with_errors_changes_nothing_and_is_told(site: Site) -> None:
         site.write(PH)
         assert router.reload().text == "nothing changed"
         assert numbers(router).total("config_last_reload_successful") == 1
-
-
-def test_an_address_outside_of_the_networks_changes_nothing(site: Site) -> None:
-    with site.router(PH) as router:
-        before = router.program
-        here = "networks: [127.0.0.0/8]\n"
-        site.write(PH, endpoints=f"  camera: {{address: 192.168.0.60:8, kind: tool}}\n{here}")
-        result = router.reload()
-        assert (result.ok, router.program is before) == (False, True)
-        assert "error[outside-networks]" in str(result.findings[0])
-        site.write(PH, endpoints=f"  camera: {{address: 127.0.0.60:8, kind: tool}}\n{here}")
-        assert router.reload().ok
 
 
 def test_what_cannot_be_opened_changes_nothing(site: Site) -> None:
@@ -354,7 +246,10 @@ def test_reloads_leave_nothing_behind(site: Site) -> None:
     assert site.received == site.sent
 
 
-def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(site: Site) -> None:
+def test_a_changed_file_is_taken_over_where_the_table_asks_for_that(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching, "PERIOD", 0.1)
     path = site.write(PH)
     path.write_text("reload: {on_change: true}\n" + path.read_text())
     program = check_table(path).program
@@ -509,9 +404,7 @@ def test_what_waits_for_a_budget_is_counted_when_its_route_goes(site: Site) -> N
     board = f'  slow: {{address: "127.0.0.1:{site.basestation.getsockname()[1]}", kind: tool, budget: 1 kB/s}}\n'
     others = "  pump_info: {source: sensor_board, destinations: [slow]}\n"
     slow = PH.replace("basestation", "slow") + others
-    program = check_table(site.write(slow, endpoints=board)).program
-    assert program is not None
-    with Router(program) as router:
+    with Router(site.program(slow, board)) as router:
         site.send(*map(numbered, range(200)))
         wait_until(lambda: router.total("datagrams_received") >= 200)
         site.write(others, endpoints=board)

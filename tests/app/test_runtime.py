@@ -9,9 +9,8 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -20,31 +19,20 @@ from prometheus_client.parser import text_string_to_metric_families
 from structlog.testing import capture_logs
 
 from router.app import Router
-from router.compiler import check_table
-from router.compiler.program import Program
 from router.engine.dispatch import Receive
 from router.errors import StartError
 from router.net.receiver import ReceiveThread
 from router.net.udp import Listener
 from router.recording.recorder import Recorder, RecordError
 from tests.acceptance.site import wait_until
+from tests.app.conftest import BRAKE, DRIVE, Site, udp
 from tests.recording.recorder_rig import read
-from tests.tables import PROTOS
 
-ROOT = Path(__file__).parent.parent
-BOARD = "127.0.0.30"
+ROOT = Path(__file__).parents[2]
 PH = bytes.fromhex("0a11 0d713dda40 1560e52040 1d33334541 2001".replace(" ", ""))  # 6.82, 2.51, 12.3, operating
 NAN_PH = bytes.fromhex("0a05 0d0000c07f".replace(" ", ""))
 
-TABLE = """\
-version: 1
-envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
-listen:
-  rover: {{address: "127.0.0.1:{listen}"}}
-endpoints:
-  sensor_board: {{address: 127.0.0.30:8, kind: board}}
-  basestation: {{address: "127.0.0.1:{destination}", kind: basestation}}
-routes:
+ROUTE = """\
   ph_info:
     source: sensor_board
     destinations: [basestation]
@@ -56,62 +44,17 @@ TURNS = """\
     deadman:
       {timeout: 20ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 10ms, hands_over_to: [ph_info]}
 """
-DRIVE = bytes.fromhex("c201021005")  # turn 5
-BRAKE = bytes.fromhex("ca01020801")
 TOPIC = """\
     topics:
       - {topic: ph, type: comms/msg/SensorBoardPHInfo, queue_depth: 10, fields: auto}
 """
 
 
-@dataclass
-class Site:
-    """What is around a router: a folder for its table, a board that sends and a basestation that receives."""
-
-    folder: Path
-    board: socket.socket
-    basestation: socket.socket
-    listen: int
-
-    def program(self, more: str = "") -> Program:
-        path = self.folder / "table.yaml"
-        ports = {"listen": self.listen, "destination": self.basestation.getsockname()[1]}
-        path.write_text(TABLE.format(protos=PROTOS, **ports) + more)
-        checked = check_table(path)
-        assert checked.program, "\n".join(map(str, checked.diagnostics))
-        return checked.program
-
-    def send(self, *datagrams: bytes) -> None:
-        for datagram in datagrams:
-            self.board.sendto(datagram, ("127.0.0.1", self.listen))
-
-
-def udp(host: str) -> socket.socket:
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.bind((host, 0))
-    opened.settimeout(10)
-    return opened
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    with udp("127.0.0.1") as unused:
-        listen = unused.getsockname()[1]
-    with udp(BOARD) as board, udp("127.0.0.1") as basestation:
-        yield Site(tmp_path, board, basestation, listen)
-
-
-def test_a_datagram_is_forwarded_unchanged(site: Site) -> None:
-    with Router(site.program()):
-        site.send(PH)
-        assert site.basestation.recv(1000) == PH
-
-
 def test_a_message_reaches_the_topic_and_every_step_is_counted(site: Site) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
     from tests.ros.subscriber import Subscriber
 
-    program = site.program(TOPIC)
+    program = site.program(ROUTE + TOPIC)
     with Router(program) as router, closing(Subscriber("ph", "comms/msg/SensorBoardPHInfo")) as subscriber:
         assert subscriber.line() == "matched"
         while not router.totals()["messages_published"]:  # the router learns of the subscriber when it does
@@ -135,14 +78,14 @@ def test_a_message_reaches_the_topic_and_every_step_is_counted(site: Site) -> No
 
 
 def test_what_has_arrived_is_routed_before_the_router_stops(site: Site) -> None:
-    with Router(site.program()) as router:
+    with Router(site.program(ROUTE)) as router:
         site.send(*[PH] * 100)
     assert router.totals()["datagrams_sent"] == 100
     assert [site.basestation.recv(1000) for _ in range(100)] == [PH] * 100
 
 
 def test_who_takes_over_silences_the_deadman_of_who_has_stopped(site: Site) -> None:
-    with capture_logs() as logged, Router(site.program(TURNS)) as router:
+    with capture_logs() as logged, Router(site.program(ROUTE + TURNS)) as router:
         assert site.basestation.recv(1000) == BRAKE  # since the router starts
         site.send(DRIVE)
         assert site.basestation.recv(1000) == DRIVE
@@ -173,7 +116,7 @@ def test_a_last_word_waits_for_no_recorder_which_still_gets_all_that_came(
         close(recorder)
 
     monkeypatch.setattr(Recorder, "close", close_late)
-    with Router(site.program(TURNS.replace("20ms", "1h") + "record: {directory: recordings}\n")):
+    with Router(site.program(ROUTE + TURNS.replace("20ms", "1h") + "record: {directory: recordings}\n")):
         site.send(*[DRIVE] * 100)
     assert said == [BRAKE, *[DRIVE] * 100, BRAKE]
     [recording] = (site.folder / "recordings").iterdir()
@@ -189,7 +132,10 @@ def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeyp
         raise RecordError("the disk is full")
 
     monkeypatch.setattr(Recorder, "save", save)
-    with capture_logs() as logged, Router(site.program("record: {directory: recordings, last: 60s}\n")) as router:
+    with (
+        capture_logs() as logged,
+        Router(site.program(ROUTE + "record: {directory: recordings, last: 60s}\n")) as router,
+    ):
         router.save_recording("first")
         assert saved.get(timeout=10) == "first"
         for reason in ("second", "third"):  # which the second one saves, as it has not begun
@@ -201,7 +147,7 @@ def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeyp
 
 
 def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    router = Router(site.program())
+    router = Router(site.program(ROUTE))
     seen: list[bytes] = []
     serve = ReceiveThread.serve
 
@@ -220,7 +166,7 @@ def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkey
 def test_metrics_are_served_while_it_runs(site: Site) -> None:
     with udp("127.0.0.1") as unused:
         address = f"127.0.0.1:{unused.getsockname()[1]}"
-    with Router(site.program(f'metrics: {{address: "{address}"}}\n')) as router:
+    with Router(site.program(ROUTE + f'metrics: {{address: "{address}"}}\n')) as router:
         site.send(PH, b"\x00\x01")
         assert site.basestation.recv(1000) == PH
         while router.totals()["datagrams_received"] < 2:
@@ -248,7 +194,7 @@ def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -
         fields:
           state: clamp(round(ph_value), 0, 255)
 """
-    program = site.program(failing)
+    program = site.program(ROUTE + failing)
     with capture_logs() as logged, Router(program) as router:
         site.send(NAN_PH, NAN_PH, NAN_PH)
     lines = [entry for entry in logged if entry["event"] == "message dropped"]
@@ -263,7 +209,7 @@ def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -
 
 
 def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) -> None:
-    with capture_logs() as logged, Router(site.program()):
+    with capture_logs() as logged, Router(site.program(ROUTE)):
         pass
     started, stopping, stopped = logged
     assert started["event"] == "router started"
@@ -276,7 +222,7 @@ def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) 
 
 def test_what_cannot_be_opened_is_told_with_its_line_and_leaves_nothing_open(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        program = site.program(f'metrics: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}\n')
+        program = site.program(ROUTE + f'metrics: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}\n')
         with pytest.raises(StartError, match=r"table.yaml:12:\d+: metrics cannot be served"), Router(program):
             pass
     with Router(program):  # the listener's port is free again
@@ -284,7 +230,7 @@ def test_what_cannot_be_opened_is_told_with_its_line_and_leaves_nothing_open(sit
 
 
 def test_a_table_without_topics_runs_without_ros(site: Site) -> None:
-    path = site.program().table.path
+    path = site.program(ROUTE).table.path
     script = (
         "import sys; from pathlib import Path\n"
         "from router.compiler import check_table; from router.app import Router\n"

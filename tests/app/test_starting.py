@@ -1,4 +1,4 @@
-"""Starts of `router run` as a process, where something is wrong around it or signals come before it routes."""
+"""`router run` as a process: exit codes, signals, ROS arguments, what it writes, and what may be wrong around it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import os
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -18,12 +20,12 @@ from router.ros.environment import SHM, obstacles, uses_shared_memory
 from tests.ports import free_port
 from tests.tables import PROTOS, ROUTES
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 TABLE = """\
 version: 1
 envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
 listen:
-  rover: {{address: "127.0.0.1:{listen}"}}
+  rover: {{address: "127.0.0.1:${{LISTEN_PORT}}"}}
 record: {{last: 10s, directory: {folder}}}
 endpoints:
   basestation: {{address: "127.0.0.1:{destination}", kind: basestation}}
@@ -56,10 +58,10 @@ SCRIPT = ["-c", "import sys; from router import main; sys.exit(main())"]
 
 
 @pytest.fixture
-def table(tmp_path: Path) -> Path:
+def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("LISTEN_PORT", str(free_port()))
     path = tmp_path / "table.yaml"
-    ports = {"listen": free_port(), "destination": free_port()}
-    path.write_text(TABLE.format(protos=PROTOS, folder=tmp_path / "recordings", **ports))
+    path.write_text(TABLE.format(protos=PROTOS, folder=tmp_path / "recordings", destination=free_port()))
     return path
 
 
@@ -70,6 +72,22 @@ def start(how: Sequence[str], *arguments: str | Path, path: str = "", **options:
     return subprocess.Popen(  # type: ignore[call-overload, no-any-return]
         [sys.executable, *how, *arguments], text=True, env=environment, **pipes, **options
     )
+
+
+def wait_for_start(process: subprocess.Popen[str]) -> dict[str, object]:
+    assert process.stderr
+    for line in process.stderr:
+        if line.startswith("{") and (entry := json.loads(line))["event"] == "router started":
+            return dict(entry)
+    raise AssertionError("it did not start")
+
+
+def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> list[str]:
+    """The events that are logged until it has ended, as it should."""
+    process.send_signal(number)
+    _, log = process.communicate(timeout=20)
+    assert process.returncode == 0
+    return [json.loads(line)["event"] for line in log.splitlines()]
 
 
 def halted(how: Sequence[str], tmp_path: Path, *arguments: str | Path) -> subprocess.Popen[str]:
@@ -91,6 +109,99 @@ def ended(*arguments: str | Path, **options: object) -> tuple[int, list[str]]:
     finally:
         process.kill()
     return process.returncode, [line for line in said.splitlines() if line.startswith("router ")]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_gracefully(table: Path, number: signal.Signals) -> None:
+    process = start(MODULE, "run", table)
+    wait_for_start(process)
+    assert end(process, number) == ["router stopping", "router stopped"]
+
+
+def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table: Path) -> None:
+    port = free_port()
+    process = start(MODULE, "run", table, "--ros-args", "-p", f"listen_port:={port}")
+    assert wait_for_start(process)["listening"] == {"rover": f"127.0.0.1:{port}"}
+    end(process)
+
+
+def test_a_machine_without_ros_is_told_what_to_do(table: Path, tmp_path: Path) -> None:
+    without = tmp_path / "without_ros"
+    without.mkdir()
+    (without / "rclpy.py").write_text("raise ModuleNotFoundError(\"No module named 'rclpy'\", name='rclpy')\n")
+    table.write_text(table.read_text() + TOPIC)
+    code, [said] = ended("run", table, path=str(without))
+    assert code == 78
+    assert said == (
+        f"router run: {table} has topics, and ROS 2 cannot be loaded: No module named 'rclpy'; "
+        "run 'make setup', or source the setup.sh of an installed ROS 2 Jazzy"
+    )
+
+
+def test_a_table_with_errors_is_told_and_ends_with_78(table: Path) -> None:
+    table.write_text(table.read_text().replace("destinations: [basestation]", "destinations: [nobody]"))
+    process = start(MODULE, "run", table)
+    _, text = process.communicate(timeout=20)
+    assert process.returncode == 78
+    assert f"{table}:11:20: error[unknown-endpoint]" in text
+
+
+def test_a_port_in_use_is_told_and_ends_with_78(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        monkeypatch.setenv("LISTEN_PORT", str(taken.getsockname()[1]))
+        code, [said] = ended("run", table)
+    assert code == 78
+    assert said.startswith(f"router run: {table}:4:20: listener 'rover' cannot use")
+    assert f"(pid {os.getpid()}) has the port" in said
+
+
+def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
+    metrics = free_port(kind=socket.SOCK_STREAM)
+    table.write_text(f'metrics: {{address: "127.0.0.1:{metrics}"}}\n' + table.read_text())
+    process = start(MODULE, "run", table)
+    wait_for_start(process)
+    good = table.read_text()
+    asking = [sys.executable, "-m", "router", "reload", str(table)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+
+    table.write_text(good + "  gps_info: {source: any, destinations: [basestation]}\n")
+    answer = subprocess.run(asking, env=environment, capture_output=True, text=True, check=False)
+    assert (answer.returncode, answer.stdout) == (0, "route gps_info added\n")
+
+    table.write_text(good + "  gps_infos: {source: any, destinations: [basestation]}\n")
+    answer = subprocess.run(asking, env=environment, capture_output=True, text=True, check=False)
+    assert answer.returncode == 78
+    assert "unknown-payload-case" in answer.stderr
+    assert "nothing has changed: the table has 1 error" in answer.stderr
+
+    table.write_text(good)
+    process.send_signal(signal.SIGHUP)
+    assert process.stderr
+    told = next(entry for entry in map(json.loads, process.stderr) if entry.get("result") == "route gps_info removed")
+    assert told["event"] == "table reloaded"
+    end(process)
+
+
+def test_it_stops_however_many_reloads_are_asked_for(table: Path) -> None:
+    process = start(MODULE, "run", table)
+    wait_for_start(process)
+    stopped = threading.Event()
+
+    def storm() -> None:
+        while not stopped.wait(0.001):
+            process.send_signal(signal.SIGHUP)
+
+    thread = threading.Thread(target=storm)
+    thread.start()
+    try:
+        assert process.stderr
+        assert any('"table reloaded"' in line for line in process.stderr)
+        end(process)
+    finally:
+        stopped.set()
+        thread.join()
+        process.kill()
 
 
 @pytest.mark.parametrize("how", [MODULE, SCRIPT], ids=["module", "script"])

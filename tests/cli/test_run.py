@@ -11,7 +11,7 @@ import pytest
 from router.cli import BAD_TABLE, BAD_USAGE
 from router.cli.run import ros_parameters, table_variables
 from router.errors import StartError
-from tests.app.test_runtime_process import ROOT
+from tests.app.test_starting import ROOT
 
 BROKEN = "version: 1\nnobody: knows\n"
 

@@ -1,0 +1,120 @@
+"""A router in this process, or one that is started, between a board that sends and a basestation that receives."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import time
+
+import pytest
+
+from router.app import Router
+from router.compiler import check_table
+from router.compiler.program import Program
+from tests.ports import free_port
+from tests.tables import PROTOS
+
+TABLE = """\
+version: 1
+envelope: {{protos: {protos}, message: PBEnvelope, oneof: payload}}
+listen:
+{listen}
+endpoints:
+  sensor_board: {{address: 127.0.0.30:8, kind: board}}
+  basestation: {{address: "127.0.0.1:{basestation}", kind: basestation}}
+{more}"""
+DRIVE, BRAKE = bytes.fromhex("c201021005"), bytes.fromhex("ca01020801")
+
+
+def numbered(number: int) -> bytes:
+    """A `ph_info` with a number in it."""
+    return bytes.fromhex("0a050d") + struct.pack("<f", number)
+
+
+def let_rest(path: Path) -> None:
+    """As if it had been written a minute ago: a reload waits for what is being written."""
+    os.utime(path, (time() - 60,) * 2)
+
+
+def udp(host: str) -> socket.socket:
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    opened.bind((host, 0))
+    opened.settimeout(10)
+    return opened
+
+
+@dataclass
+class Site:
+    """A folder for the table, a board that sends and a basestation that receives."""
+
+    folder: Path
+    board: socket.socket
+    basestation: socket.socket
+    listen: int
+    sent: list[int] = field(default_factory=list)
+    received: list[int] = field(default_factory=list)
+    """The numbers of what has arrived at the basestation, by `take`."""
+
+    def write(self, routes: str, *, listen: str | None = None, endpoints: str = "") -> Path:
+        """A table; behind its routes there may be other keys."""
+        path = self.folder / "table.yaml"
+        listeners = listen or f'  rover: {{address: "127.0.0.1:{self.listen}"}}'
+        destination = self.basestation.getsockname()[1]
+        path.write_text(
+            TABLE.format(protos=PROTOS, listen=listeners, basestation=destination, more=f"{endpoints}routes:\n{routes}")
+        )
+        let_rest(path)
+        return path
+
+    def program(self, routes: str, endpoints: str = "") -> Program:
+        checked = check_table(self.write(routes, endpoints=endpoints))
+        assert checked.program, "\n".join(map(str, checked.diagnostics))
+        return checked.program
+
+    @contextmanager
+    def router(self, routes: str) -> Iterator[Router]:
+        with Router(self.program(routes)) as router:
+            yield router
+
+    def send(self, *datagrams: bytes, port: int | None = None) -> None:
+        for datagram in datagrams:
+            self.board.sendto(datagram, ("127.0.0.1", port or self.listen))
+
+    @contextmanager
+    def under_load(self) -> Iterator[None]:
+        """Numbered datagrams come all the time, 2,000 per second."""
+        ended = threading.Event()
+
+        def load() -> None:
+            while not ended.wait(0.0005):
+                self.send(numbered(len(self.sent)))
+                self.sent.append(len(self.sent))
+                self.take()
+
+        thread = threading.Thread(target=load)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def take(self) -> None:
+        """What has arrived by now."""
+        self.basestation.setblocking(False)
+        with suppress(BlockingIOError):
+            while datagram := self.basestation.recv(1000):
+                self.received.append(int(struct.unpack("<f", datagram[3:])[0]))
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    with udp("127.0.0.30") as board, udp("127.0.0.1") as basestation:
+        yield Site(tmp_path, board, basestation, free_port())
