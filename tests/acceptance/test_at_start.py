@@ -148,7 +148,7 @@ def test_that_nobody_listens_yet_is_no_loss_of_the_first_command(place: Site) ->
 def test_who_listens_to_a_topic_with_a_deadman_is_stopped_when_it_is_met(place: Site, qos: str) -> None:
     """Until a client has sent something."""
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    from tests.ros.subscriber import Subscriber
+    from tests.ros.peers import Subscriber
 
     def subscriber() -> closing[Subscriber]:
         return closing(Subscriber("word", "std_msgs/msg/Int32", *["--best-effort"] * (qos == "best_effort")))

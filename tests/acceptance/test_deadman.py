@@ -19,7 +19,7 @@ from tests.acceptance.ros_peer import RosPeer
 from tests.acceptance.rover_map import HOSTS, OUTFLOWS, ROUTER, TOPICS_FROM_ROS
 from tests.acceptance.site import IMPATIENT_ROVER, ROOT, RouterProcess, Site, balance, key, site, total, wait_until
 from tests.compiler.ros_objects import serialized
-from tests.ros.publisher import Publisher
+from tests.ros.peers import Publisher
 from tests.ros_child import ForkedProcess
 
 TRIPPED = "commands stopped coming: the deadman sends in their place"

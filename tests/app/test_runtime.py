@@ -52,7 +52,7 @@ TOPIC = """\
 
 def test_a_message_reaches_the_topic_and_every_step_is_counted(site: Site) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    from tests.ros.subscriber import Subscriber
+    from tests.ros.peers import Subscriber
 
     program = site.program(ROUTE + TOPIC)
     with Router(program) as router, closing(Subscriber("ph", "comms/msg/SensorBoardPHInfo")) as subscriber:

@@ -279,7 +279,7 @@ def test_live_shows_topics_of_the_network_with_who_publishes_them(
     gateways: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
-    from tests.ros.publisher import Publisher
+    from tests.ros.peers import Publisher
 
     with closing(Publisher("greeting", "std_msgs/msg/String")):
         while "~" not in (told := explained(capsys, gateways, "net", "--live", "0.5")):

@@ -344,19 +344,6 @@ def test_the_latest_of_what_a_rate_holds_back_goes_when_it_may(rig: Rig) -> None
     rig.assert_counters_balance()
 
 
-def test_a_budget_holds_back_and_in_the_end_drops(rig: Rig) -> None:
-    datagram = framed(1, bytes.fromhex("9a3e") + b"\x83\x01" + bytes(131))[:0] or enveloped(ph_info={"ph_value": 7.0})
-    for _ in range(100_000):
-        rig.receive(datagram)
-    assert 0 < len(rig.sent) < 100
-    rig.pass_time(2 * SECOND)
-
-    assert len(rig.sent) * len(datagram) == pytest.approx(2000, rel=0.1)
-    assert set(rig.dropped("ph_info", "slow")) == {"queue_full"}
-    rig.pass_time(HOUR)
-    rig.assert_counters_balance()
-
-
 def test_a_command_that_reaches_only_others_than_the_deadman_stops_does_not_feed_it(tmp_path: Path) -> None:
     routes = """\
   manual_drive:

@@ -138,11 +138,11 @@ def test_every_case_from_every_sender_is_taken_as_the_names_of_endpoints_say(
 
 
 def test_short_datagrams_agree_with_the_protobuf_library(made: Program) -> None:
-    """Everything of two bytes, and of three what begins like an envelope or an overlong one."""
+    """Two bytes, all of the first with a fifth of the second; and three that begin like an envelope."""
     both = Both(made)
     firsts = [0x00, 0x08, 0x6A, 0x42, 0xC2, 0xEA, 0x82, 0xFF]
-    short = [bytes(pair) for pair in itertools.product(range(256), repeat=2)]
-    short += [bytes((first, *pair)) for first in firsts for pair in itertools.product(range(0, 256, 5), repeat=2)]
+    short = [bytes(pair) for pair in itertools.product(range(256), range(0, 256, 5))]
+    short += [bytes((first, *pair)) for first in firsts for pair in itertools.product(range(0, 256, 15), repeat=2)]
     for data in short:
         both.receive(data, SENSOR_BOARD, "exact")
 
@@ -312,8 +312,8 @@ def test_an_endpoint_is_seen_whatever_it_sent(rig: Rig) -> None:
 
 
 def test_damaged_datagrams_are_counted_and_nothing_else() -> None:
-    outcome = fuzz(50_000, seed=7)
+    outcome = fuzz(30_000, seed=7)
     assert outcome.findings == []
-    assert outcome.fates["accepted"] > 5_000
+    assert outcome.fates["accepted"] > 3_000
     unheard_of = [reason for reason in REJECT_REASONS if not outcome.fates[f"rejected {reason}"]]
     assert unheard_of == ["ignored"], "the rover ignores nothing; all else should have happened"

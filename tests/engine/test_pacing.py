@@ -83,10 +83,18 @@ def measured(budget: int, size: int, hertz: float, priority: Priority, late: int
     return sent
 
 
-@pytest.mark.parametrize("budget", [2_000, 50_000, 500_000])
-@pytest.mark.parametrize("size", [40, 1000])
-@pytest.mark.parametrize("load", [0.5, 0.99, 1.01, 2])
 @pytest.mark.parametrize("priority", Priority)
+@pytest.mark.parametrize(
+    ("budget", "size", "load"),
+    [
+        (2_000, 40, 0.99),
+        (2_000, 1000, 2),
+        (50_000, 40, 2),
+        (50_000, 1000, 1.01),
+        (500_000, 1000, 0.5),
+        (500_000, 400, 2),
+    ],
+)
 def test_over_ten_seconds_the_budget_is_kept_and_used_up(
     budget: int, size: int, load: float, priority: Priority
 ) -> None:

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from router.engine.wire import Wire, framed, wire_of_protos
-from router.errors import DecodeError, TableError, UsageError
-from router.table import read_table
+from router.errors import DecodeError, UsageError
 from router.values import payload
 
 
@@ -64,10 +63,3 @@ def test_what_cannot_be_decoded_says_why(wire: Wire, datagram: str, problem: str
 def test_a_datagram_that_the_router_would_not_take_is_not_decoded(wire: Wire) -> None:
     with pytest.raises(DecodeError, match="truncated: 20000 bytes"):
         wire.decode(b"\x12\x00" * 10_000)
-
-
-def test_a_table_with_errors_is_refused(tmp_path: Path) -> None:
-    table = tmp_path / "bad.yaml"
-    table.write_text("version: 1\nendpoint: {}\n")
-    with pytest.raises(TableError):
-        read_table(table)

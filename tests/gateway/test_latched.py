@@ -14,7 +14,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 from tests.gateway.asynchronous import asynchronous, until
 from tests.gateway.stage import Played, Stage, program
 from tests.ros.opening import STRING, cdr, open_ros
-from tests.ros.publisher import Publisher
+from tests.ros.peers import Publisher
 
 GATEWAY = (
     "{{transport: {{tcp: 127.0.0.1:{port}}}, format: json_lines, publish_period: {period}, "

@@ -27,7 +27,7 @@ from router.gateway.subscriptions import READ_PER_TURN, Subscriptions, TopicSubs
 from router.types.ros import MsgFiles, RosbagsDefinitions, RosInterfaces, ros_interfaces
 from tests.gateway.asynchronous import asynchronous, until
 from tests.ros.opening import HELLO, STRING, cdr, open_ros, padded, string_topic
-from tests.ros.publisher import Publisher
+from tests.ros.peers import Publisher
 
 INT32 = "std_msgs/msg/Int32"
 FIVE = bytes.fromhex("0001000005000000")

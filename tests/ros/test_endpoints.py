@@ -16,17 +16,11 @@ from router.errors import StartError
 from router.ros.receiving import RawSubscription
 from router.ros.router_node import RouterNode
 from tests.ros.opening import RELIABLE, SPAN, cdr, open_ros, string_topic
+from tests.ros.peers import wait_until
 
 DEEP = replace(RELIABLE, depth=1000)
 SPANS = {"greeting": SPAN, "farewell": SPAN}
 Take = Callable[[bytes, int], None]
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
 
 
 @pytest.fixture

@@ -24,8 +24,7 @@ from router.ros.events import WaitSet
 from router.ros.node import close_node, open_node
 from router.ros.receiving import TURN, RawSubscription
 from tests.ros.opening import HELLO, RELIABLE, STRING, cdr, open_ros, string_topic
-from tests.ros.publisher import Publisher
-from tests.ros.subscriber import wait_until
+from tests.ros.peers import Publisher, wait_until
 
 BEST_EFFORT = QosPlan("best_effort", "volatile", "keep_last", 1000)
 DEEP = QosPlan("reliable", "volatile", "keep_last", 1000)

@@ -28,8 +28,7 @@ from router.ros.qos import ActualQos, incompatible_policies
 from router.ros.router_node import RouterNode
 from router.types.ros import definition, ros_interfaces
 from tests.ros.opening import HELLO, RELIABLE, SPAN, STRING, open_ros, string_topic
-from tests.ros.publisher import Publisher
-from tests.ros.subscriber import Subscriber, wait_until
+from tests.ros.peers import Publisher, Subscriber, wait_until
 
 
 @pytest.fixture(autouse=True)

@@ -19,8 +19,7 @@ from router.errors import StartError
 from router.ros.router_node import RouterNode
 from router.ros.topics import DiscoveredPublisher, TopicListener, TopicTap
 from tests.ros.opening import HELLO, STRING, cdr, open_ros, string_topic
-from tests.ros.publisher import Publisher
-from tests.ros.subscriber import wait_until
+from tests.ros.peers import Publisher, wait_until
 
 INT32 = "std_msgs/msg/Int32"
 FIVE = bytes.fromhex("0001000005000000")

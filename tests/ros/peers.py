@@ -1,7 +1,8 @@
-"""A ROS publisher in a process of its own: `Publisher` starts it, and this file run as a script is it.
+"""A ROS publisher or subscriber in a process of its own: `Publisher` and `Subscriber` start it, this file is it.
 
-It prints "matched" once a subscriber is there, publishes each line of its standard input (a message's bytes in hex),
-prints "acknowledged" at an empty line when subscribers have all of it, and ends with its standard input.
+The publisher prints "matched" once a subscriber is there, publishes each line of its standard input (a message's bytes
+in hex), prints "acknowledged" at an empty line when subscribers have all of it. The subscriber prints "matched" once a
+publisher is there, then each message's bytes in hex. Both end with their standard input.
 """
 
 from __future__ import annotations
@@ -9,17 +10,17 @@ from __future__ import annotations
 import argparse
 import select
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from time import sleep
+from time import monotonic, sleep
 from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
+sys.path.insert(0, str(Path(__file__).parents[2]))  # a script is not started from the repository's root
 
 from router.ros.types import installed_class
 from tests.ros_child import RosProcess, own_stdout, spin_until_stdin_ends
@@ -32,11 +33,10 @@ class Publisher(RosProcess):
     """
 
     def __init__(self, topic: str, type_name: str, *options: str) -> None:
-        super().__init__(__file__, topic, type_name, *options)
+        super().__init__(__file__, "publish", topic, type_name, *options)
 
     def publish(self, messages: Iterable[bytes]) -> None:
         """CDR bytes, in this order."""
-        assert self.process.stdin
         self.process.stdin.writelines(f"{cdr.hex()}\n" for cdr in messages)
         self.process.stdin.flush()
 
@@ -46,8 +46,23 @@ class Publisher(RosProcess):
         assert self.line() == "acknowledged"
 
 
+class Subscriber(RosProcess):
+    """`Subscriber("imu_data", "comms/msg/ImuSensorInformation", "--transient-local")`; close it."""
+
+    def __init__(self, topic: str, type_name: str, *options: str) -> None:
+        super().__init__(__file__, "subscribe", topic, type_name, *options)
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    deadline = monotonic() + 20
+    while not condition():
+        assert monotonic() < deadline, "it never happened"
+        sleep(0.01)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
+    parser.add_argument("role", choices=("publish", "subscribe"))
     parser.add_argument("topic")
     parser.add_argument("type")
     parser.add_argument("--transient-local", action="store_true")
@@ -64,10 +79,22 @@ def main() -> None:
     node = rclpy.create_node("peer")
 
     def on_matched(status: Any) -> None:
-        if status.current_count_change > 0:
-            sleep(0.1)  # the subscriber learns of it later; what it misses until then takes DDS three seconds to repair
+        if status.current_count_change > 0:  # not where a peer of an earlier test is found to be gone
+            # A subscriber learns of a publisher later; what it misses until then has to be repaired.
+            sleep(0.1 if arguments.role == "publish" else 0)
             print("matched", file=lines)
 
+    if arguments.role == "subscribe":
+        node.create_subscription(
+            installed_class(arguments.type),
+            arguments.topic,
+            lambda data: print(data.hex(), file=lines),
+            qos,
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(matched=on_matched),
+        )
+        spin_until_stdin_ends(node)
+        return
     publisher = node.create_publisher(
         installed_class(arguments.type),
         arguments.topic,
