@@ -1,25 +1,18 @@
-"""What the service manager is told, and which of its sockets a listener takes."""
+"""Notifications to the service manager."""
 
 from __future__ import annotations
 
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
-from dataclasses import replace
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
 
 from router.app.process import Watchdog, notify, reloading, supervised
-from router.clock import wall_ns
-from router.errors import Located, SourceSpan
-from router.net import udp
-from router.net.udp import Inherited, Listener
-from router.table import model
-from router.table.addresses import Address
-from router.table.model import Framing
+from router.errors import SourceSpan
 
 SPAN = SourceSpan("routes/rover.yaml", 12, 20, 34)
 SO_TIMESTAMPNS = 35
@@ -124,88 +117,3 @@ def test_the_watchdog_of_another_process_is_not_ours(manager: socket.socket, mon
     with supervised(lambda: 1):
         assert said(manager) == ["READY=1"]
     assert said(manager)[0] == "STOPPING=1"
-
-
-# -- inherited sockets ---------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def held(stack: ExitStack) -> socket.socket:
-    """The service manager's."""
-    held = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-    held.bind(("127.0.0.1", 0))
-    return held
-
-
-def plan(held: socket.socket) -> model.Listener:
-    return model.Listener(
-        "rover", SPAN, Located(Address(*held.getsockname()), SPAN), Framing.EXACT, receive_buffer=65536, coalesce=0
-    )
-
-
-@pytest.fixture
-def listener(held: socket.socket, stack: ExitStack, monkeypatch: pytest.MonkeyPatch) -> Listener:
-    ours = Inherited([held.dup()])
-    monkeypatch.setattr(udp, "inherited", lambda: ours)
-    return stack.enter_context(closing(Listener(plan(held))))
-
-
-def test_a_listener_takes_the_socket_that_has_its_address(held: socket.socket, listener: Listener) -> None:
-    assert listener.is_inherited
-    before = wall_ns()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
-        board.sendto(b"hello", held.getsockname())
-    assert listener.socket.recvfrom(100)[0] == b"hello"
-    assert before <= listener.arrived_at() <= wall_ns()
-
-
-def test_the_next_one_finds_what_the_last_one_left(held: socket.socket, listener: Listener) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
-        for word in (b"first", b"second"):
-            board.sendto(word, held.getsockname())
-    assert listener.socket.recv(100) == b"first"
-    listener.end_input()
-    listener.close()
-    with closing(Listener(plan(held))) as successor:
-        assert successor.socket.recv(100) == b"second"
-
-
-def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listener) -> None:
-    before = held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    assert before > 2 * 65536
-    assert listener.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
-    listener.follow(replace(plan(held), receive_buffer=32768))  # as a reload asks for
-    assert held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
-
-
-def test_a_socket_is_taken_for_its_interface_only(stack: ExitStack) -> None:
-    bound = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
-    bound.bind(("127.0.0.1", 0))
-    address = Address(*bound.getsockname())
-    ours = Inherited([bound.dup()])
-    assert ours.take(str(address)) is None
-    assert ours.take(f"{address} on eth0") is None
-    assert ours.unclaimed() == [f"{address} on lo"]
-    stack.enter_context(ours.take(f"{address} on lo") or pytest.fail("it is there"))
-    assert ours.unclaimed() == []
-
-
-def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
-    stream = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
-    stream.bind(("127.0.0.1", 0))
-    address = Address(*held.getsockname())
-    ours = Inherited([held.dup(), stream.dup()])
-    assert len(ours.unclaimed()) == 2
-    stack.enter_context(ours.take(str(address)) or pytest.fail("it is there"))
-    [left] = ours.unclaimed()
-    assert left.endswith("which is no IPv4 UDP socket")
-    assert ours.take(str(address._replace(port=1))) is None
-    assert ours.take(f"{address} on lo") is None
-
-
-def test_what_is_meant_for_another_process_is_left_alone() -> None:
-    environment = {"LISTEN_PID": "1", "LISTEN_FDS": "3", "LISTEN_FDNAMES": "a:b:c"}
-    assert udp._inherited_descriptors(environment) == []
-    assert environment == {}

@@ -76,15 +76,6 @@ def test_damaged_bytes_are_read_or_refused_as_the_reference_does(data: st.DataOb
         outcome(lambda: compiled(declared, damaged, some))
 
 
-@MANY
-@given(st.data(), st.binary(max_size=200))
-def test_noise_is_read_or_refused_as_the_reference_does(data: st.DataObject, noise: bytes) -> None:
-    declared = data.draw(messages(depth=1))
-    serialized = b"\0\1\0\0" + noise
-    ours = outcome(lambda: compiled(declared, serialized, [WHOLE]))
-    assert same(ours, outcome(lambda: parsed(declared, serialized, [WHOLE])))
-
-
 NOTHING = message()
 HOSTILE: dict[str, Type] = {
     "string": String(), "wstring": String(wide=True), "bytes": List(Int(8, signed=False)), "doubles": List(Float(64)),

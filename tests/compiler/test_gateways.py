@@ -21,9 +21,7 @@ from router.compiler.metrics import (
 )
 from router.errors import Code, Diagnostic, Severity
 from router.gateway.transport.zenoh_session import session_config
-from router.observe.route_map import route_map
 from router.recording.mirror import Classifier
-from router.tools.explain import diff
 from tests.compiler.conftest import CheckText
 from tests.tables import PROTOS
 
@@ -384,13 +382,6 @@ def test_it_compiles_and_nothing_is_to_be_said_of_it(tmp_path: Path, monkeypatch
     assert watched_files(program.table) == [tmp_path / "table.yaml"]
 
 
-def test_what_its_clients_may_publish_is_checked_as_anywhere(tmp_path: Path) -> None:
-    inbound = "receive: 127.0.0.1:8500, inbound: [{topic: /cmd_vel, type: geometry_msgs/msg/%s}]"
-    assert said(check_file(tmp_path, ONLY.replace("8502}", "8502}, " + inbound % "Twist"))) == []
-    [finding] = check_file(tmp_path, ONLY.replace("8502}", "8502}, " + inbound % "Twirl")).diagnostics
-    assert finding.code is Code.UNKNOWN_ROS_TYPE
-
-
 def test_a_type_whose_source_is_here_but_not_built_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     source = Path("schemas", "ours", "msg", "Lamp.msg")
@@ -438,13 +429,6 @@ def test_what_is_needed_is_asked_of_the_whole_table(tmp_path: Path) -> None:
     assert [each.message for each in errors(found)] == ["the table lacks the key 'listen'"]
 
 
-def test_a_mistake_in_it_is_found_all_the_same(tmp_path: Path) -> None:
-    found = check_file(tmp_path, ONLY.replace("udp", "upd") + "envelop: {protos: nowhere}\n")
-    assert all(each.severity is Severity.ERROR for each in found.diagnostics)
-    assert {each.code for each in found.diagnostics} >= {Code.UNKNOWN_KEY}
-    assert found.program is None
-
-
 def test_a_reload_reads_no_protos_for_it_and_those_of_the_next_table(tmp_path: Path) -> None:
     only = check_file(tmp_path, ONLY).program
     assert only is not None
@@ -460,18 +444,3 @@ def test_a_datagram_from_before_the_reload_has_no_payload(tmp_path: Path) -> Non
     program = check_file(tmp_path, ONLY).program
     assert program is not None
     assert Classifier(program.envelope, program.table).payload("rover", b"\xca\x01\x02\x08\x01") is None
-
-
-def test_what_it_does_otherwise_than_another_is_told(tmp_path: Path) -> None:
-    only = check_file(tmp_path, ONLY, "only.yaml")
-    routed = check_file(tmp_path, ONLY + ENVELOPE + LISTEN + ROUTES, "routed.yaml")
-    told = "\n".join(diff(only, routed))
-    assert "@@ listener rover\n+" in told
-    assert "@@ route ph_info\n+ph_info: " in told
-    assert "gateway headset\n-" not in told
-
-
-def test_it_is_drawn(tmp_path: Path) -> None:
-    table = check_file(tmp_path, ONLY).table
-    assert table is not None
-    assert [box.node.name for box in route_map(table).boxes] == ["ROS topics", "headset", "clients of headset"]

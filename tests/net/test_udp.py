@@ -19,10 +19,10 @@ from structlog.testing import capture_logs
 
 from router.clock import wall_ns
 from router.errors import Located, SourceSpan, StartError
-from router.net import receiver
-from router.net.kernel import SO_RCVBUFFORCE
+from router.net import receiver, udp
+from router.net.kernel import SO_RCVBUFFORCE, SO_TIMESTAMPNS
 from router.net.receiver import FOR_SOCKETS, SAMPLE, Coalescing, ReceiveThread
-from router.net.udp import Listener, Sender
+from router.net.udp import Inherited, Listener, Sender
 from router.table import model
 from router.table.addresses import Address
 from router.table.model import EndpointKind, Framing
@@ -419,12 +419,6 @@ def send_to(stack: ExitStack, address: Address) -> Sender:
     return stack.enter_context(closing(Sender(endpoint("basestation", address))))
 
 
-def test_a_sender_sends_bytes_unchanged(stack: ExitStack, peer: socket.socket) -> None:
-    sender = send_to(stack, Address(*peer.getsockname()))
-    assert sender.send(b"\x0a\x00\x00") == 3
-    assert peer.recv(LIMIT) == b"\x0a\x00\x00"
-
-
 def test_news_of_an_old_loss_does_not_cost_a_healthy_datagram(stack: ExitStack) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as absent:
         absent.bind(("127.0.0.1", 0))
@@ -502,3 +496,86 @@ def test_a_datagram_too_long_to_send_is_an_error_of_its_own(stack: ExitStack, pe
 def test_a_broadcast_destination_is_refused_at_the_start() -> None:
     with pytest.raises(StartError, match=r"rover.yaml:12:20: cannot send .* 'basestation' at 127.255.255.255:9"):
         Sender(endpoint("basestation", Address("127.255.255.255", 9)))
+
+
+# sockets of a service manager
+
+
+@pytest.fixture
+def held(stack: ExitStack) -> socket.socket:
+    """The service manager's."""
+    held = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    held.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    held.bind(("127.0.0.1", 0))
+    return held
+
+
+def plan_of(held: socket.socket) -> model.Listener:
+    return plan(port=held.getsockname()[1])
+
+
+@pytest.fixture
+def listener(held: socket.socket, stack: ExitStack, monkeypatch: pytest.MonkeyPatch) -> Listener:
+    ours = Inherited([held.dup()])
+    monkeypatch.setattr(udp, "inherited", lambda: ours)
+    return stack.enter_context(closing(Listener(plan_of(held))))
+
+
+def test_a_listener_takes_the_socket_that_has_its_address(held: socket.socket, listener: Listener) -> None:
+    assert listener.is_inherited
+    before = wall_ns()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
+        board.sendto(b"hello", held.getsockname())
+    assert listener.socket.recvfrom(100)[0] == b"hello"
+    assert before <= listener.arrived_at() <= wall_ns()
+
+
+def test_the_next_one_finds_what_the_last_one_left(held: socket.socket, listener: Listener) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board:
+        for word in (b"first", b"second"):
+            board.sendto(word, held.getsockname())
+    assert listener.socket.recv(100) == b"first"
+    listener.end_input()
+    listener.close()
+    with closing(Listener(plan_of(held))) as successor:
+        assert successor.socket.recv(100) == b"second"
+
+
+def test_its_buffer_is_never_made_smaller(held: socket.socket, listener: Listener) -> None:
+    before = held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    assert before > 2 * 65536
+    assert listener.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
+    listener.follow(replace(plan_of(held), receive_buffer=32768))  # as a reload asks for
+    assert held.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == before
+
+
+def test_a_socket_is_taken_for_its_interface_only(stack: ExitStack) -> None:
+    bound = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+    bound.bind(("127.0.0.1", 0))
+    address = Address(*bound.getsockname())
+    ours = Inherited([bound.dup()])
+    assert ours.take(str(address)) is None
+    assert ours.take(f"{address} on eth0") is None
+    assert ours.unclaimed() == [f"{address} on lo"]
+    stack.enter_context(ours.take(f"{address} on lo") or pytest.fail("it is there"))
+    assert ours.unclaimed() == []
+
+
+def test_what_nobody_takes_is_told(held: socket.socket, monkeypatch: pytest.MonkeyPatch, stack: ExitStack) -> None:
+    stream = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+    stream.bind(("127.0.0.1", 0))
+    address = Address(*held.getsockname())
+    ours = Inherited([held.dup(), stream.dup()])
+    assert len(ours.unclaimed()) == 2
+    stack.enter_context(ours.take(str(address)) or pytest.fail("it is there"))
+    [left] = ours.unclaimed()
+    assert left.endswith("which is no IPv4 UDP socket")
+    assert ours.take(str(address._replace(port=1))) is None
+    assert ours.take(f"{address} on lo") is None
+
+
+def test_what_is_meant_for_another_process_is_left_alone() -> None:
+    environment = {"LISTEN_PID": "1", "LISTEN_FDS": "3", "LISTEN_FDNAMES": "a:b:c"}
+    assert udp._inherited_descriptors(environment) == []
+    assert environment == {}
