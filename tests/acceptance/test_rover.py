@@ -53,8 +53,7 @@ from tests.acceptance.site import (
     wait_until,
 )
 from tests.ports import free_port
-from tests.ros.publisher import Publisher
-from tests.ros.subscriber import Subscriber
+from tests.ros.peers import Publisher, Subscriber
 from tests.tables import ROUTES
 from tests.wire.test_golden_envelopes import GOLDEN, native, values_of
 

@@ -1,4 +1,4 @@
-"""Which table `router run` takes, and what ROS parameters are for; test_runtime_process.py has the running process."""
+"""Which table `router run` takes, and what ROS parameters are for; test_starting.py has the running process."""
 
 from __future__ import annotations
 
