@@ -58,8 +58,7 @@ def run(args: argparse.Namespace) -> int:
     schema = load_protos(settings.protos, settings.message, settings.lock)
     lock = LockComparison(schema, find_envelope(schema, settings.oneof))
     found = lock.conflicts
-    if problem := _unknown(args.accept, found):
-        raise UsageError(f"{problem}; nothing was written")
+    _refuse_unknown(args.accept, found)
     accepted = [each for each in found if each.name in args.accept or each.owner in args.accept]
     if refused := [each for each in found if each not in accepted]:
         print_findings(sorted((each.finding for each in refused), key=lambda finding: finding.span), sys.stdout)
@@ -106,14 +105,13 @@ def _with_names(settings: EnvelopeSettings, args: argparse.Namespace, lock: Lock
     return replace(settings, message=Located(message, span), oneof=Located(oneof, span))
 
 
-def _unknown(names: Sequence[str], found: Sequence[Conflict]) -> str:
-    """What is wrong with the names to accept; empty when each is that of a conflict."""
+def _refuse_unknown(names: Sequence[str], found: Sequence[Conflict]) -> None:
+    """Raises UsageError for a name to accept that no conflict has."""
     known = {name for each in found for name in (each.name, each.owner)}
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known) or "nothing conflicts with the lock"
-            return f"'{name}' has nothing to accept; {hint}"
-    return ""
+            raise UsageError(f"'{name}' has nothing to accept; {hint}; nothing was written")
 
 
 def _summary(old: Lock | None, new: Lock) -> str:

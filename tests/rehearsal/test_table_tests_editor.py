@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 
 import pytest
 
-from tests.table.language_server import LanguageServer
-from tests.table.test_editor import REPOSITORY, installed_server
+from tests.table.language_server import REPOSITORY, LanguageServer, started
 
 HEAD = "# yaml-language-server: $schema=../schemas/table-test.schema.json\n"
 
 
 @pytest.fixture(scope="module")
 def editor() -> Iterator[LanguageServer]:
-    if not shutil.which("node") or not shutil.which("npm"):
-        pytest.skip("needs node and npm")
-    with LanguageServer(installed_server(), REPOSITORY) as server:
-        yield server
+    yield from started()
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,22 @@
-"""A small client of the YAML language server that editors use: LSP over stdio, one request at a time.
-
-Knows the protocol only as far as the tests of the schema need it.
-"""
+"""A small client of the YAML language server that editors use: LSP over stdio, one request at a time."""
 
 from __future__ import annotations
 
 import itertools
 import json
+import os
+import shutil
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, final
 
+import pytest
+
+REPOSITORY = Path(__file__).parents[2]
+SERVER = "yaml-language-server"
+VERSION = "1.19.2"
 SETTINGS = {
     "yaml": {
         "validate": True,
@@ -21,6 +25,25 @@ SETTINGS = {
         "schemaStore": {"enable": False, "url": ""},  # schemas come from the modeline alone, nothing from the network
     }
 }
+
+
+def _installed() -> Path:
+    """The server's entry point, installed into the user's cache the first time."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rover-router" / f"{SERVER}-{VERSION}"
+    module = cache / "node_modules" / SERVER / "bin" / SERVER
+    if not module.exists():
+        cache.mkdir(parents=True, exist_ok=True)
+        options = ["--prefix", str(cache), "--no-save", "--no-audit", "--no-fund", "--ignore-scripts"]
+        subprocess.run(["npm", "install", *options, f"{SERVER}@{VERSION}"], check=True, capture_output=True)  # noqa: S607
+    return module
+
+
+def started() -> Iterator[LanguageServer]:
+    """A running server; skips the test where there is no Node.js."""
+    if not shutil.which("node") or not shutil.which("npm"):
+        pytest.skip("needs node and npm")
+    with LanguageServer(_installed(), REPOSITORY) as server:
+        yield server
 
 
 @final
@@ -102,17 +125,13 @@ class LanguageServer:
 
     def _send(self, message: Mapping[str, Any]) -> None:
         body = json.dumps({"jsonrpc": "2.0", **message}).encode()
-        stdin = self._process.stdin
-        if stdin is None:
-            raise AssertionError("the server was started with a pipe")
-        stdin.write(b"Content-Length: %d\r\n\r\n" % len(body) + body)
-        stdin.flush()
+        assert self._process.stdin
+        self._process.stdin.write(b"Content-Length: %d\r\n\r\n" % len(body) + body)
+        self._process.stdin.flush()
 
     def _receive(self) -> dict[str, Any]:
-        stdout = self._process.stdout
-        if stdout is None:
-            raise AssertionError("the server was started with a pipe")
-        length = 0
+        stdout, length = self._process.stdout, 0
+        assert stdout
         while (header := stdout.readline().strip()) or not length:
             if not header:
                 raise AssertionError(f"the language server ended with {self._process.poll()}")

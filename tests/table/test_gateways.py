@@ -139,7 +139,7 @@ def test_what_means_nothing_is_one_finding(tmp_path: Path, settings: str, code: 
     assert "gateways/it" in table.broken
 
 
-def test_the_sound_part_of_a_gateway_is_there_for_further_checks(tmp_path: Path) -> None:
+def test_the_valid_part_of_a_gateway_is_there_for_further_checks(tmp_path: Path) -> None:
     settings = f"{TCP}, max_message: 1B, inbound: [{{topic: /a, type: x/msg/Y, ttl: 5}}, {{topic: /b}}]"
     table, findings = parts(tmp_path, f"{HEAD}  it: {{{settings}}}\n")
     assert sorted(finding.code.value for finding in findings) == ["bad-value", "missing-key", "wrong-type"]
@@ -153,7 +153,7 @@ def test_a_misspelt_transport_is_read_as_the_one_that_was_meant(tmp_path: Path) 
     assert table.gateways["it"].transport.value is Transport.WEBSOCKET
 
 
-def test_a_gateway_without_a_sound_transport_is_left_out(tmp_path: Path) -> None:
+def test_a_gateway_without_a_valid_transport_is_left_out(tmp_path: Path) -> None:
     table, _ = parts(tmp_path, f"{HEAD}  it: {{transport: {{udp: 1.2.3.4}}}}\n  other: {{{TCP}}}\n")
     assert list(table.gateways) == ["other"]
 

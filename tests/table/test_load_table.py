@@ -205,7 +205,7 @@ def test_what_has_a_finding_is_left_out_and_named(tmp_path: Path) -> None:
     assert imu_info.topics[0].fields  # the rest of the route is checked in the same run
 
 
-def test_a_route_without_a_sound_source_is_left_out(tmp_path: Path) -> None:
+def test_a_route_without_a_valid_source_is_left_out(tmp_path: Path) -> None:
     table, [finding] = parts(tmp_path, GOOD.replace("source: sensor_board", "source: 5"))
     assert finding.code is Code.WRONG_TYPE
     assert "imu_info" not in [route.case.value for route in table.routes]
@@ -265,7 +265,7 @@ def test_of_a_deadman_with_a_broken_repeat_the_rest_is_left(tmp_path: Path) -> N
     assert route(table, "manual_drive").deadman
 
 
-def test_of_several_routes_the_sound_ones_and_the_sound_parts_are_left(tmp_path: Path) -> None:
+def test_of_several_routes_the_valid_ones_and_the_valid_parts_are_left(tmp_path: Path) -> None:
     text = GOOD.replace("[basestation, sensor_board]", "[5]").replace(
         "[basestation]\n      deadman", "5\n      deadman"
     )
