@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from time import monotonic, sleep
 
+import pytest
+
 from tests.acceptance.payloads import WIRE, sample
 from tests.acceptance.site import RouterProcess, key, site, total, wait_until
 from tests.engine.wire import LEN, tag, varint
@@ -37,6 +39,7 @@ def large(case: str, size: int) -> bytes:
     return sample(case, message).datagram
 
 
+@pytest.mark.slow
 def test_bulk_holds_up_no_command_and_commands_that_never_leave_feed_no_deadman(tmp_path: Path) -> None:
     with site(tmp_path, HOSTS) as place:
         table = place.table(TABLE)

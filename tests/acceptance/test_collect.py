@@ -27,7 +27,7 @@ endpoints:
 {endpoints}routes:
   detected_object:
     source: [left, right]
-    collect: {{by: frame_id, count: total_count, order: index, timeout: 2s}}
+    collect: {{by: frame_id, count: total_count, order: index, timeout: 1s}}
     topics:
       - topic: objects
         type: comms/msg/DetectedObjectArray
@@ -37,7 +37,7 @@ endpoints:
 TOPICS = {"objects": "comms/msg/DetectedObjectArray"}
 CAMERAS = {"left": "127.0.0.31", "right": "127.0.0.32"}
 
-FRAMES = 50
+FRAMES = 40
 """Of each camera."""
 
 WAVE = 4
@@ -178,6 +178,7 @@ HOSTILE_NUMBERS: dict[str, Callable[[int], Part]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hostile", HOSTILE_NUMBERS.values(), ids=HOSTILE_NUMBERS)
 def test_memory_stays_flat_however_hostile_the_numbers_are(place: Running, hostile: Callable[[int], Part]) -> None:
     opened, router = place

@@ -15,7 +15,7 @@ from tests.acceptance.site import ROVER, RouterProcess, Site, balance, site, tot
 from tests.observe.foxglove_client import PATIENCE, FoxgloveClient
 from tests.ports import free_port
 
-MANY = 500
+MANY = 200
 
 
 def wait_until_watching(place: Site, client: FoxgloveClient) -> int:

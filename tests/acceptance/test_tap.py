@@ -42,23 +42,17 @@ def shown(process: subprocess.Popen[str]) -> list[dict[str, Any]]:
 
 
 def test_a_tap_shows_what_the_router_receives_and_from_whom(rover: Rover) -> None:
+    before = rover.site.scrape()
     with tapping(rover, "--json", "--hex", "--count", "3") as process:
         rover.site.send("sensor_board", IMU, GPS)
         rover.site.send("arm_board", b"junk")
         lines = shown(process)
+    assert total(rover.site.settle(before, 3), "datagrams_sent") == 2  # the tap takes nothing away
     assert [(line.get("case"), line["peer"], line["hex"]) for line in lines] == [
         ("imu_info", "sensor_board", IMU.hex()),
         ("gps_info", "sensor_board", GPS.hex()),
         (None, "arm_board", b"junk".hex()),
     ]
-
-
-def test_a_tap_takes_nothing_away_from_the_router(rover: Rover) -> None:
-    before = rover.site.scrape()
-    with tapping(rover, "--json", "--count", "20") as process:
-        rover.site.send("sensor_board", *[IMU] * 20)
-        assert len(shown(process)) == 20
-    assert total(rover.site.settle(before, 20), "datagrams_sent", route="imu_info") == 20
 
 
 def test_a_tap_shows_some_cases_senders_and_values_only(rover: Rover) -> None:
