@@ -154,7 +154,7 @@ def test_a_password_from_the_environment_lets_in_and_is_printed_nowhere(tmp_path
             zenoh.open(config)
         second = now.site.folder / "second.yaml"
         login = 'transport: {auth: {usrpwd: {user: rover, password: "${ZENOH_PASSWORD}"}}}'
-        second.write_text(connecting(now.port, login))
+        second.write_text(connecting(now.ports["PORT"], login))
         folder = tmp_path / "second"
         folder.mkdir()
         with RouterProcess(folder, second, **ENVIRONMENT) as router:
