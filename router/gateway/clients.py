@@ -80,11 +80,15 @@ class ClientQueue:
 
 
 class Clients:
-    """All clients of a gateway. `clock_ns` is monotonic, `wall_s` gives the wall clock in seconds."""
+    """All clients of a gateway. `clock_ns` is monotonic, `wall_s` gives the wall clock in seconds.
+
+    `log` is to be flushed regularly.
+    """
 
     def __init__(
         self,
         gateway: str,
+        transport: Transport,
         encoding: Encoding,
         counters: GatewayCounters,
         clock_ns: Callable[[], int],
@@ -92,17 +96,18 @@ class Clients:
     ) -> None:
         self.queues: dict[Client, ClientQueue] = {}
         self._gateway = gateway
+        self._transport = transport
         self._encoding = encoding
         self._counters = counters
         self._clock_ns = clock_ns
         self._wall_s = wall_s
-        self._log = FloodLog()
+        self.log = FloodLog()
 
     def __bool__(self) -> bool:
         """Whether there are any."""
         return bool(self.queues)
 
-    def send(self, frames: Sequence[Frame], transport: Transport) -> None:
+    def send(self, frames: Sequence[Frame]) -> None:
         """Write frames to every client that keeps up, and queue them for the others."""
         if not frames or not self.queues:
             return
@@ -113,7 +118,7 @@ class Clients:
         if behind:
             self._queue(behind, frames)
         if len(ready) > 1:
-            transport.write_all([each.client for each in ready], self._on_wire(frames, len(ready)))
+            self._transport.write_all([each.client for each in ready], self._on_wire(frames, len(ready)))
             for each in ready:
                 each.sent += len(frames)
         elif ready:
@@ -127,9 +132,6 @@ class Clients:
             queue.write(frames)
         else:
             self._queue([queue], frames)
-
-    async def flush_log(self) -> None:
-        self._log.flush()
 
     def joined(self, client: Client) -> ClientQueue:
         taken = {each.number for each in self.queues.values()}
@@ -149,9 +151,6 @@ class Clients:
         if (queue := self.queues.get(client)) is not None:
             queue.drained()
 
-    def close(self) -> None:
-        self._log.flush(final=True)
-
     def _queue(self, queues: Sequence[ClientQueue], frames: Sequence[Frame]) -> None:
         schemas: dict[Hashable, Frame] = {(each.topic, each.type_name): each for each in frames if each.is_schema}
         values: dict[Hashable, Frame] = {each.topic: each for each in frames if not each.is_schema}
@@ -162,7 +161,7 @@ class Clients:
         """Log who came or went; repetitions from one host are summed up."""
         address = queue.client.label
         key = event, address.rpartition(":")[0]
-        self._log.note(key, logger.info, event, gateway=self._gateway, client=queue.number, address=address)
+        self.log.note(key, logger.info, event, gateway=self._gateway, client=queue.number, address=address)
 
     def _on_wire(self, frames: Sequence[Frame], clients: int = 1) -> Sequence[Frame]:
         wire = self._encoding.on_wire(frames, self._wall_s())

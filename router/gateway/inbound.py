@@ -64,6 +64,7 @@ class InboundPublisher:
     """Reads the requests of one gateway's clients and publishes their messages.
 
     For the thread that owns `counts`. Requests are short (`max_inbound`), so they are read at once.
+    `log` is to be flushed regularly.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class InboundPublisher:
         self._counts = counts
         self._outputs = outputs
         self._freshness = Freshness()
-        self._log = FloodLog()
+        self.log = FloodLog()
         self._accepted = counters.index("messages_received", name, CLIENTS)
         self._last = counters.index("route_last_message_timestamp_seconds", name)
         self._clock_ahead = counters.index("gateway_client_clock_ahead", name)
@@ -160,7 +161,7 @@ class InboundPublisher:
             raise self._dropped(topic, "stale", detail)
         if (ahead := sent - arrived_ns / 1e9) * 1e9 > CLOCK_TOLERANCE_NS:
             self._counts[self._clock_ahead] += 1
-            self._log.note(
+            self.log.note(
                 topic.plan.label,
                 logger.warning,
                 "a client's clock is ahead: its messages are published for longer than ttl",

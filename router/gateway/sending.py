@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, field
 
+from router.gateway.clients import Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import LARGE, Encoding, Sample
@@ -61,7 +62,7 @@ class ServedTopic:
 
 
 class TopicSender:
-    """Makes frames of messages. `has_clients` tells whether anybody gets what goes to `deliver`."""
+    """Makes frames of messages."""
 
     def __init__(
         self,
@@ -70,15 +71,13 @@ class TopicSender:
         encoding: Encoding,
         counters: GatewayCounters,
         tasks: Tasks,
-        has_clients: Callable[[], bool],
-        deliver: Callable[[Sequence[Frame]], None],
+        clients: Clients,
     ) -> None:
         self._context = context
         self._encoding = encoding
         self._counters = counters
         self._tasks = tasks
-        self.has_clients = has_clients
-        self._deliver = deliver
+        self._clients = clients
         self._introduced: set[Hashable] = set()
         self._pending: list[Frame] = []
         # Datagrams get lost, and the existing gateway's clients expect values to be repeated.
@@ -92,7 +91,7 @@ class TopicSender:
             return
         new = served.uncounted()
         self._counters.received(new)
-        if not self.has_clients():  # the middleware keeps the newest message for the next client
+        if not self._clients:  # the middleware keeps the newest message for the next client
             self._counters.filtered(new)
             return
         sample = served.subscription.latest() if new or served.sample is None else served.sample
@@ -108,7 +107,7 @@ class TopicSender:
         """Send a message of a topic of which every one is sent."""
         served.sample = sample
         self._counters.received(1)
-        if not self.has_clients():
+        if not self._clients:
             self._counters.filtered(1)
         elif not served.is_busy:
             self._offer(served, sample, self._queue(), is_new=True)
@@ -140,7 +139,7 @@ class TopicSender:
 
     def _flush(self) -> None:
         frames, self._pending = self._pending, []
-        self._deliver(frames)
+        self._clients.send(frames)
 
     def _offer(self, served: ServedTopic, sample: Sample, frames: list[Frame], *, is_new: bool) -> None:
         if self._is_quick(sample):

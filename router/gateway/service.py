@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AsyncExitStack
 
 from router.compiler.program import GatewayPlan
@@ -43,13 +43,11 @@ class GatewayService:
         self._inbound = inbound
         self._encoding = ENCODINGS[settings.format](settings)
         self._tasks = Tasks(context.failed)
-        self.clients = Clients(self.name, self._encoding, counters, context.clock_ns, context.wall_s)
-        sender = TopicSender(
-            settings, context, self._encoding, counters, self._tasks, lambda: bool(self.clients), self._deliver
-        )
-        self._topics = Topics(plan, context, sender, counters, self._tasks, self._deliver)
         self._new_transport = transport
         self._transport = transport(self)
+        self.clients = Clients(self.name, self._transport, self._encoding, counters, context.clock_ns, context.wall_s)
+        sender = TopicSender(settings, context, self._encoding, counters, self._tasks, self.clients)
+        self._topics = Topics(plan, context, sender, counters, self._tasks, self.clients)
         self._answered = -_ANSWER_NS
         self._has_page = settings.transport.value is Way.WEBSOCKET and self._encoding.style is Style.PLAIN
         self._explains = settings.transport.value is not Way.ZENOH and self._encoding.style is Style.PLAIN
@@ -65,7 +63,7 @@ class GatewayService:
     def start(self) -> None:
         """Look for topics and serve them from now on."""
         self._topics.start()
-        self._tasks.each(_LOG_S, self.clients.flush_log)
+        self._tasks.each(_LOG_S, self._flush_logs)
         if self._has_page:
             self._tasks.each(_TOPICS_S, self._send_topics)
 
@@ -75,13 +73,15 @@ class GatewayService:
             return
         self.is_closed = True
         async with AsyncExitStack() as closing:  # in reverse order: clients that come or send something start tasks
-            closing.callback(self.clients.close)
+            closing.callback(self.clients.log.flush, final=True)
+            closing.callback(self._inbound.log.flush, final=True)
             closing.push_async_callback(self._tasks.close)
             closing.callback(self._topics.close)
             closing.push_async_callback(self._transport.close)
 
-    def _deliver(self, frames: Sequence[Frame]) -> None:
-        self.clients.send(frames, self._transport)
+    async def _flush_logs(self) -> None:
+        self.clients.log.flush()
+        self._inbound.log.flush()
 
     # -- Events --------------------------------------------------------------------------------------------------
 
@@ -148,7 +148,7 @@ class GatewayService:
 
     async def _send_topics(self) -> None:
         document = topics_document(self._context.wall_s(), self._topics.rates(_TOPICS_S))
-        self._deliver([self._document("topics", document)])
+        self.clients.send([self._document("topics", document)])
 
     def _document(self, kind: str, data: bytes) -> Frame:
         """Make a frame of a document of no topic; for a slow client, a newer one of its `kind` replaces it."""

@@ -11,6 +11,7 @@ from itertools import chain, count, repeat
 from router.compiler.program import GatewayPlan
 from router.compiler.selection import TopicSelector
 from router.errors import StartError
+from router.gateway.clients import Clients
 from router.gateway.context import GatewayContext, Tasks
 from router.gateway.counters import GatewayCounters
 from router.gateway.encoding import Sample
@@ -49,7 +50,7 @@ class Topics:
         sender: TopicSender,
         counters: GatewayCounters,
         tasks: Tasks,
-        deliver: Callable[[Sequence[Frame]], None],
+        clients: Clients,
     ) -> None:
         self._name = plan.settings.name
         self._plan = plan
@@ -58,7 +59,7 @@ class Topics:
         self._sender = sender
         self._counters = counters
         self._tasks = tasks
-        self._deliver = deliver
+        self._clients = clients
         self._inbound = context.subscriptions.resolved(
             each.settings.topic.topic.value for each in plan.inbound.values()
         )
@@ -102,7 +103,7 @@ class Topics:
     async def _update(self) -> None:
         """Serve topics that appeared, forget those that went, and follow changes of types and QoS."""
         found = await self._subscriptions.discover(self._inbound, self._selector.selects)
-        if not self._sender.has_clients():
+        if not self._clients:
             # The router fills topics that only itself publishes while they have subscribers: not without clients.
             found = {topic: selection for topic, selection in found.items() if not selection.is_ours}
         self._not_installed &= found.keys()
@@ -188,17 +189,17 @@ class Topics:
             except Exception as error:  # noqa: BLE001 reported; other topics are served all the same
                 self._failed(error)
             if number % SERVED_PER_TURN == 0:
-                self._deliver(frames)
+                self._clients.send(frames)
                 frames = []
                 await asyncio.sleep(0)
-        self._deliver(frames)
+        self._clients.send(frames)
 
     def _on_sample(self, subscription: TopicSubscription, sample: Sample) -> None:
         if (served := self._served.get(subscription.topic)) and served.subscription is subscription:
             self._sender.send(served, sample)
 
     async def _repeat_schemas(self, due: Sequence[ServedTopic]) -> None:
-        self._deliver([self._sender.schema(served) for served in due if served.readable is not None])
+        self._clients.send([self._sender.schema(served) for served in due if served.readable is not None])
 
     # -- answers -----------------------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from typing import NamedTuple, Union
+from typing import Union
 
 import zenoh
 
@@ -387,25 +387,18 @@ class ZenohClient:
         putting = asyncio.wrap_future(self._putter.put(frames))
         putting.add_done_callback(lambda done: self._on_put(done, size))
 
-    def _on_put(self, putting: asyncio.Future[list[Lost]], size: int) -> None:
+    def _on_put(self, putting: asyncio.Future[list[Exception]], size: int) -> None:
         self._is_putting = False
         self._backlog -= size
         if not self._is_open:
             return
-        for error, lost in putting.result():
-            self._events.failed(self, error, lost)
+        for error in putting.result():
+            self._events.failed(self, error, 1)
         if self._waiting:
             self._put()
         if self._was_high and self._backlog < LOW_WATER:
             self._was_high = False
             self._events.drained(self)
-
-
-class Lost(NamedTuple):
-    """Frames that were not put, and why."""
-
-    error: Exception
-    frames: int
 
 
 class Putter:
@@ -426,8 +419,8 @@ class Putter:
         self._failed_large: list[Exception] = []
         self._lock = threading.Lock()
 
-    def put(self, frames: Sequence[Frame]) -> Future[list[Lost]]:
-        """Complete when Zenoh has the small frames and the large ones are queued. Gives what was lost until then."""
+    def put(self, frames: Sequence[Frame]) -> Future[list[Exception]]:
+        """Complete when Zenoh has the small frames and the large ones are queued. Gives an error per lost frame."""
         return self._small.submit(self._put_all, frames)
 
     def close(self) -> None:
@@ -435,8 +428,8 @@ class Putter:
         for executor in (self._small, self._large):
             executor.shutdown()
 
-    def _put_all(self, frames: Sequence[Frame]) -> list[Lost]:
-        lost = []
+    def _put_all(self, frames: Sequence[Frame]) -> list[Exception]:
+        errors: list[Exception] = []
         for frame in frames:
             key = key_of(self._key, frame)
             if len(frame.data) > LARGE:
@@ -447,10 +440,10 @@ class Putter:
                 else:
                     self._put(key, frame.data, is_large=False)
             except (zenoh.ZError, TransportError) as error:
-                lost.append(Lost(error, 1))
+                errors.append(error)
         with self._lock:
             failed, self._failed_large = self._failed_large, []
-        return lost + [Lost(error, 1) for error in failed]
+        return errors + failed
 
     def _queue_large(self, key: str, data: bytes) -> None:
         """Raises TransportError for the value that this one replaces."""
