@@ -131,35 +131,34 @@ def test_a_recording_that_was_cut_is_sent_as_far_as_it_goes(
     assert "was not finished" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("rate", [1.0, 10.0, None])
-def test_datagrams_are_due_when_they_came(path: Path, rate: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Its only element is what `time.monotonic` says, which moves while somebody sleeps."""
     now = [1000.0]
-
-    def sleep(seconds: float) -> None:
-        now[0] += seconds
-
-    monkeypatch.setattr(time, "sleep", sleep)
+    monkeypatch.setattr(time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    sent = [now[0] - 1000 for _ in on_time(Recording(path), rate)]
+    return now
+
+
+@pytest.mark.parametrize("rate", [1.0, 10.0, None])
+def test_datagrams_are_due_when_they_came(path: Path, clock: list[float], rate: float | None) -> None:
+    sent = [clock[0] - 1000 for _ in on_time(Recording(path), rate)]
     steps = [0, 0.001, 0.002, 0.05, 0.051, 0.052]
     assert sent == pytest.approx([step / rate if rate else 0 for step in steps])
 
 
 def test_a_recording_that_is_slow_to_open_does_not_hurry_what_comes_first(
-    path: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, clock: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = [1000.0]
     recording = Recording(path)
     datagrams = list(recording.datagrams())
 
     def slowly() -> Iterator[Recorded]:
-        now[0] += 5
+        clock[0] += 5
         yield from datagrams
 
     monkeypatch.setattr(recording, "datagrams", slowly)
-    monkeypatch.setattr(time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    assert [now[0] for _ in on_time(recording, 1.0)][:3] == pytest.approx([1005, 1005.001, 1005.002])
+    assert [clock[0] for _ in on_time(recording, 1.0)][:3] == pytest.approx([1005, 1005.001, 1005.002])
 
 
 @pytest.mark.parametrize(("text", "rate"), [("2x", 2), ("2", 2), ("0.5x", 0.5), (".5x", 0.5), ("max", None)])

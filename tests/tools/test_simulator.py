@@ -5,9 +5,10 @@ import json
 import math
 import socket
 import threading
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -37,10 +38,14 @@ def simulate(simulator: Simulator, until: Callable[[], bool]) -> None:
     assert until()
 
 
-@pytest.fixture
-def router(table: RouteTable) -> socket.socket:
-    """The address that the simulated endpoints send to."""
-    return open_udp(reachable(table.listeners["rover"].address.value), "router")
+@contextmanager
+def played(wire: Wire, table: RouteTable, **options: Any) -> Iterator[tuple[Simulator, socket.socket]]:
+    """A fast simulator, and the socket that its endpoints send to."""
+    with (
+        open_udp(reachable(table.listeners["rover"].address.value), "router") as router,
+        closing(Simulator(wire, table, seed=1, rate_scale=FAST, **options)) as simulator,
+    ):
+        yield simulator, router
 
 
 def received(router: socket.socket, wire: Wire) -> dict[str, set[str]]:
@@ -54,27 +59,23 @@ def received(router: socket.socket, wire: Wire) -> dict[str, set[str]]:
         cases.setdefault(peer[0], set()).add(wire.decode(data).case.name)
 
 
+@pytest.mark.parametrize("source", ["board", "any"])
 def test_each_endpoint_sends_its_cases_from_its_own_address(
-    wire: Wire, table: RouteTable, router: socket.socket
+    wire: Wire, table_path: Callable[..., Path], source: str
 ) -> None:
-    with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
+    with played(wire, read_table(table_path(source=source))) as (simulator, router):
         simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
-        assert received(router, wire) == {"127.0.6.30": {"every_kind"}, "127.0.6.10": {"plain"}}
+        sender = "127.0.6.30" if source == "board" else LOOPBACK
+        assert received(router, wire) == {sender: {"every_kind"}, "127.0.6.10": {"plain"}}
 
 
-def test_an_endpoint_sends_to_the_listener_that_believes_it(
-    wire: Wire, table_path: Callable[..., Path], router: socket.socket
-) -> None:
+def test_an_endpoint_sends_to_the_listener_that_believes_it(wire: Wire, table_path: Callable[..., Path]) -> None:
     path = table_path()
     radio = open_udp(Address(LOOPBACK, 0), "radio")
     listen = f"  radio: {{address: '{Address(*radio.getsockname())}', interface: lo}}\nendpoints:"
-    text = (
-        path.read_text()
-        .replace("endpoints:", listen)
-        .replace("kind: basestation", "kind: basestation, listener: radio")
-    )
-    path.write_text(text)
-    with router, radio, closing(Simulator(wire, read_table(path), seed=1, rate_scale=FAST)) as simulator:
+    text = path.read_text().replace("endpoints:", listen)
+    path.write_text(text.replace("kind: basestation", "kind: basestation, listener: radio"))
+    with radio, played(wire, read_table(path)) as (simulator, _):
         simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
         assert received(radio, wire) == {"127.0.6.10": {"plain"}}
 
@@ -101,20 +102,11 @@ def test_an_endpoint_with_a_source_port_sends_from_it(wire: Wire, table_path: Ca
     table = read_table(table_path(source_port=True))
     station = table.endpoints["station"]
     assert station.source_port is not None
-    router = open_udp(reachable(table.listeners["rover"].address.value), "router")
-    with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
+    with played(wire, table) as (simulator, router):
         simulate(simulator, lambda: simulator.statistics.sent["station"]["plain"] > 0)
         peers = set()
         while ("127.0.6.10", station.source_port.value) not in peers:
             peers.add(router.recvfrom(2000)[1])
-
-
-def test_a_case_of_any_source_comes_from_a_stranger(wire: Wire, table_path: Callable[..., Path]) -> None:
-    table = read_table(table_path(source="any"))
-    router = open_udp(reachable(table.listeners["rover"].address.value), "router")
-    with router, closing(Simulator(wire, table, seed=1, rate_scale=FAST)) as simulator:
-        simulate(simulator, lambda: len(simulator.statistics.sent) == 2)
-        assert received(router, wire)[LOOPBACK] == {"every_kind"}
 
 
 def test_rates_and_offsets_follow_from_seed_and_scale(wire: Wire, table: RouteTable) -> None:
@@ -126,14 +118,9 @@ def test_rates_and_offsets_follow_from_seed_and_scale(wire: Wire, table: RouteTa
 
 def test_a_silent_endpoint_sends_nothing_and_others_go_on(wire: Wire, table: RouteTable) -> None:
     silences = [Silence("station", 0.0, math.inf)]
-    with closing(Simulator(wire, table, seed=1, rate_scale=FAST, silences=silences)) as simulator:
+    with played(wire, table, silences=silences) as (simulator, _):
         simulate(simulator, lambda: simulator.statistics.sent["board"]["every_kind"] > 5)
         assert simulator.statistics.sent["station"]["plain"] == 0
-
-
-def test_a_silence_of_nobody_is_named(wire: Wire, table: RouteTable) -> None:
-    with pytest.raises(UsageError, match=r"nothing is sent that 'statoin' could silence; did you mean 'station'\?"):
-        Simulator(wire, table, seed=1, silences=[Silence("statoin", 0.0, 1.0)])
 
 
 def test_a_board_tells_of_a_router_that_died(wire: Wire, table: RouteTable) -> None:
@@ -148,10 +135,11 @@ def test_a_board_tells_of_a_router_that_died(wire: Wire, table: RouteTable) -> N
         assert [change.state for change in changes] == [State.OBEYING, State.STOPPED]
 
 
-def test_an_unknown_source_is_named(wire: Wire, table_path: Callable[..., Path]) -> None:
-    table = read_table(table_path(source="bord"))
+def test_names_of_nobody_are_told(wire: Wire, table_path: Callable[..., Path]) -> None:
+    with pytest.raises(UsageError, match=r"nothing is sent that 'statoin' could silence; did you mean 'station'\?"):
+        Simulator(wire, read_table(table_path()), seed=1, silences=[Silence("statoin", 0.0, 1.0)])
     with pytest.raises(UsageError, match=r"table.yaml:\d+:\d+: there is no endpoint 'bord'; did you mean 'board'\?"):
-        Simulator(wire, table, seed=1)
+        Simulator(wire, read_table(table_path(source="bord")), seed=1)
 
 
 def test_a_taken_address_is_named_and_leaves_nothing_open(wire: Wire, table: RouteTable) -> None:
@@ -173,15 +161,9 @@ def test_stop_ends_a_run_from_another_thread(wire: Wire, table: RouteTable) -> N
         assert not running.is_alive()
 
 
-@pytest.mark.parametrize(
-    ("text", "silence"),
-    [
-        ("basestation:5-8", Silence("basestation", 5.0, 8.0)),
-        ("manual_drive:0.5-", Silence("manual_drive", 0.5, math.inf)),
-    ],
-)
-def test_a_silence_is_a_name_and_a_time(text: str, silence: Silence) -> None:
-    assert parse_silence(text) == silence
+def test_a_silence_is_a_name_and_a_time() -> None:
+    assert parse_silence("basestation:5-8") == Silence("basestation", 5.0, 8.0)
+    assert parse_silence("manual_drive:0.5-") == Silence("manual_drive", 0.5, math.inf)
 
 
 @pytest.mark.parametrize("text", ["basestation", "basestation:5", ":5-8", "a:5-8-9", "a:b-c"])
@@ -215,8 +197,12 @@ def shown(table: Table) -> list[str]:
     return [" ".join(line.split()) for line in out.getvalue().splitlines()]
 
 
-def test_each_endpoint_and_case_has_a_line_with_its_last_value(wire: Wire) -> None:
-    view = SimView(wire, some_statistics(wire))
+def test_each_endpoint_and_case_has_a_line_with_its_last_value_and_boards_and_frames_one_more(wire: Wire) -> None:
+    statistics = some_statistics(wire)
+    frames = statistics.inboxes["station"].frames["every_kind"] = Frames()
+    frames.complete, frames.incomplete = 3, 1
+    statistics.inboxes["board"].undecodable = 2
+    view = SimView(wire, statistics)
     view.update(2.0)
     assert shown(view.table(10)) == [
         "endpoint received count /s age last value",
@@ -224,6 +210,11 @@ def test_each_endpoint_and_case_has_a_line_with_its_last_value(wire: Wire) -> No
         "station every_kind 4 2.0 0.5 i32=5",
     ]
     assert shown(view.table(2))[1:] == ["and 2 more"]
+    assert shown(view.statuses()) == [
+        "station every_kind: 3 frames complete, 1 incomplete",
+        "board no commands yet",
+        "board 2 undecodable datagrams",
+    ]
 
 
 def test_rates_are_those_of_the_last_seconds(wire: Wire) -> None:
@@ -234,20 +225,6 @@ def test_rates_are_those_of_the_last_seconds(wire: Wire) -> None:
     statistics.inboxes["board"].arrivals["plain"].count += 6
     view.update(10.0)
     assert view.line() == ("10 s: sent 7, received 12; board 8 (2.0/s), station 4 (0/s), board no commands yet")
-
-
-def test_boards_frames_and_undecodable_datagrams_have_a_line_each(wire: Wire) -> None:
-    statistics = some_statistics(wire)
-    frames = statistics.inboxes["station"].frames["every_kind"] = Frames()
-    frames.complete, frames.incomplete = 3, 1
-    statistics.inboxes["board"].undecodable = 2
-    view = SimView(wire, statistics)
-    view.update(2.0)
-    assert shown(view.statuses()) == [
-        "station every_kind: 3 frames complete, 1 incomplete",
-        "board no commands yet",
-        "board 2 undecodable datagrams",
-    ]
 
 
 def test_changes_are_told_since_a_time(wire: Wire) -> None:
