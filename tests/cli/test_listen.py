@@ -70,11 +70,16 @@ def test_what_arrives_is_printed_one_line_each(gateway: socket.socket) -> None:
     assert process.returncode == 0
 
 
-def test_json_lines_are_printed_and_appended_to_a_file(gateway: socket.socket, tmp_path: Path) -> None:
+def test_it_asks_for_schemas_and_json_lines_are_printed_and_appended_to_a_file(
+    gateway: socket.socket, tmp_path: Path
+) -> None:
     path = tmp_path / "record.jsonl"
     path.write_text("what was there\n")
+    host, port = gateway.getsockname()
     options = ["--json", "--record", str(path), "--topic", "/a/*", "--topic", "/b", "--count", "2"]
-    with listening(*options) as (process, address):
+    with listening(*options, "--ask", f"{host}:{port}") as (process, address):
+        request, peer = gateway.recvfrom(100)
+        assert (peer, unpack(request).payload) == (address, b"")
         for data in (packet(SCHEMA), packet({"x": [1]}, "/c"), packet({"x": [1]}), packet({"x": [2]}, "/b")):
             gateway.sendto(data, address)
         out, err = process.communicate(timeout=30)
@@ -93,15 +98,6 @@ def test_a_file_that_takes_no_more_ends_it(gateway: socket.socket) -> None:
         _, err = process.communicate(timeout=30)
     assert err.splitlines()[-1] == "router listen: --record /dev/full: No space left on device"
     assert process.returncode == 1
-
-
-def test_schemas_are_asked_for_from_the_port_on_which_it_listens(gateway: socket.socket) -> None:
-    host, port = gateway.getsockname()
-    with listening("--ask", f"{host}:{port}", "--count", "1") as (process, address):
-        data, peer = gateway.recvfrom(100)
-        assert (peer, unpack(data).payload) == (address, b"")
-        gateway.sendto(packet({"x": [1]}), peer)
-        process.communicate(timeout=30)
 
 
 def test_it_ends_after_its_time(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from router.cli import BAD_TABLE, BAD_USAGE, BROKEN_PIPE, INTERRUPTED, VERBS, main, validate
-from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError
+from router.cli import BAD_TABLE, BAD_USAGE, BROKEN_PIPE, INTERRUPTED, NETWORK_FAULT, VERBS, main, validate
+from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError, TransportError, UsageError
 from tests.tables import ROUTES
 
 REPOSITORY = Path(__file__).parents[2]
@@ -64,6 +64,8 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     [
         (TableError([Diagnostic(SourceSpan("t.yaml", 3, 4), Code.BAD_YAML, "what")]), BAD_TABLE, "t.yaml:3:4: error"),
         (StartError("port 5000 is taken"), BAD_TABLE, "router validate: port 5000 is taken"),
+        (UsageError("there is no x"), BAD_USAGE, "router validate: there is no x"),
+        (TransportError("nobody answers"), NETWORK_FAULT, "router validate: nobody answers"),
         (KeyboardInterrupt(), INTERRUPTED, ""),
     ],
 )

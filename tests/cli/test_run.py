@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from router.cli import BAD_TABLE, BAD_USAGE
+from router.cli import BAD_TABLE, BAD_USAGE, main
 from router.cli.run import ros_parameters, table_variables
 from router.errors import StartError
-from tests.app.test_starting import ROOT
 
+Run = Callable[..., tuple[int, str]]
 BROKEN = "version: 1\nnobody: knows\n"
 
 
@@ -25,13 +25,17 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(folder: Path, *arguments: str) -> tuple[int, str]:
-    """Exit code and the first line of what `router run` says in that folder."""
-    ended = subprocess.run(
-        [sys.executable, "-m", "router", "run", *arguments],
-        cwd=folder, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=30, check=False,
-    )  # fmt: skip
-    return ended.returncode, ended.stderr.partition("\n")[0]
+@pytest.fixture
+def run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """`router run` in that folder: its exit code, and the first line of what it says."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(signal, "pthread_sigmask", lambda *_: None)  # which would hold for the tests behind this one
+    monkeypatch.setattr("router.cli.run.configure_log", lambda *_, **__: None)
+
+    def run(*arguments: str) -> tuple[int, str]:
+        return main(["run", *arguments]), capsys.readouterr().err.partition("\n")[0]
+
+    return run
 
 
 @pytest.mark.parametrize(
@@ -47,15 +51,15 @@ def run(folder: Path, *arguments: str) -> tuple[int, str]:
     ],
 )
 def test_the_table_is_an_argument_or_the_parameter_routes_path(
-    folder: Path, arguments: tuple[str, ...], table: str
+    run: Run, arguments: tuple[str, ...], table: str
 ) -> None:
-    (folder / "parameters.yaml").write_text("/**:\n  ros__parameters:\n    routes_path: routes/legacy.yaml\n")
-    code, line = run(folder, *arguments)
+    Path("parameters.yaml").write_text("/**:\n  ros__parameters:\n    routes_path: routes/legacy.yaml\n")
+    code, line = run(*arguments)
     assert (code, line.partition(":")[0]) == (BAD_TABLE, table)
 
 
-def test_two_different_tables_are_wrong_usage(folder: Path) -> None:
-    assert run(folder, "routes/rover.yaml", "--ros-args", "-p", "routes_path:=routes/legacy.yaml") == (
+def test_two_different_tables_are_wrong_usage(run: Run) -> None:
+    assert run("routes/rover.yaml", "--ros-args", "-p", "routes_path:=routes/legacy.yaml") == (
         BAD_USAGE,
         "router run: TABLE is routes/rover.yaml, routes_path is routes/legacy.yaml; name one table",
     )
