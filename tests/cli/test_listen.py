@@ -70,9 +70,7 @@ def test_what_arrives_is_printed_one_line_each(gateway: socket.socket) -> None:
     assert process.returncode == 0
 
 
-def test_it_asks_for_schemas_and_json_lines_are_printed_and_appended_to_a_file(
-    gateway: socket.socket, tmp_path: Path
-) -> None:
+def test_it_asks_for_schemas_and_json_lines_go_to_a_file_as_well(gateway: socket.socket, tmp_path: Path) -> None:
     path = tmp_path / "record.jsonl"
     path.write_text("what was there\n")
     host, port = gateway.getsockname()

@@ -130,13 +130,15 @@ def test_payloads_come_with_their_arrival_and_are_read_by_the_schema_alone(
     assert told.message.DESCRIPTOR.full_name == client.channels["imu_info"]["schemaName"]
 
 
-def test_every_schema_is_whole(program: Program, router: Showing, client: FoxgloveClient) -> None:
-    """Those of messages in other files are there as well."""
-    client.subscribe(*program.envelope.cases)
+def test_every_schema_is_whole_and_only_what_was_subscribed_to_is_sent(
+    program: Program, router: Showing, client: FoxgloveClient
+) -> None:
+    """Schemas of messages in other files are there as well."""
+    client.subscribe(*(case for case in program.envelope.cases if case != "imu_info"))
     router.wait_for(1)
     for case in program.envelope.cases:
-        router.show(envelope(program, case))
-        assert client.receive().topic == case
+        router.show(envelope(program, "imu_info"), envelope(program, case))
+        assert case == "imu_info" or client.receive().topic == case
 
 
 def test_router_is_watched_only_while_somebody_has_subscribed(router: Showing, server: FoxgloveServer) -> None:
@@ -153,13 +155,6 @@ def test_router_is_watched_only_while_somebody_has_subscribed(router: Showing, s
         first.subscribe("gps_info")
         router.wait_for(1)
     router.wait_for(0)  # a client that leaves has not unsubscribed
-
-
-def test_only_what_was_subscribed_to_is_sent(program: Program, router: Showing, client: FoxgloveClient) -> None:
-    client.subscribe("gps_info")
-    router.wait_for(1)
-    router.show(envelope(program, "imu_info"), envelope(program, "gps_info", latitude=1.0))
-    assert client.receive().topic == "gps_info"
 
 
 def test_trimmed_and_padded_datagrams_are_shown_and_what_is_no_payload_is_not(
@@ -253,18 +248,13 @@ def test_router_that_is_started_again_gets_its_port_back(router: Showing) -> Non
         router.wait_for(0)
 
 
-def test_port_that_somebody_has_is_said_with_its_holder() -> None:
-    router = Showing(compiled(ROUTES / "rover.yaml"))
+def test_an_address_that_cannot_be_had_is_told(router: Showing) -> None:
     with socket.create_server(("127.0.0.1", 0)) as holder:
         address = Located(Address("127.0.0.1", holder.getsockname()[1]), SPAN)
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: .*{address.value}: .*\(pid \d+\) has the port"):
             FoxgloveServer(address, cast("Running", router))
-
-
-def test_address_that_this_computer_does_not_have_is_refused(router: Showing) -> None:
-    address = Located(Address("203.0.113.1", 1), SPAN)
     with pytest.raises(StartError, match="no network interface of this computer has that address"):
-        FoxgloveServer(address, cast("Running", router))
+        FoxgloveServer(Located(Address("203.0.113.1", 1), SPAN), cast("Running", router))
 
 
 def test_who_speaks_another_protocol_is_turned_away_without_a_word_in_the_log(

@@ -44,7 +44,7 @@ BUILD = {"version": "1", "table_sha256": "aa", "protos_sha256": "bb"}
 class Scraped:
     """Counters with one series per metric, two threads' counts, and what a scrape shows of them."""
 
-    slots: dict[str, int]
+    indexes: dict[str, int]
     threads: list[list[int]]
     drops: int
     address: Address
@@ -67,11 +67,11 @@ class Scraped:
 def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     monkeypatch.setattr("router.observe.responses.KEPT_SECONDS", 0)
     counters = Counters()
-    slots = {
+    indexes = {
         metric.name: counters.index(metric.name, *(LABELS[label] for label in metric.labels)) for metric in METRICS
     }
     threads = [counters.fresh_counts(), counters.fresh_counts()]
-    result = Scraped(slots, threads, 0, LOOPBACK)
+    result = Scraped(indexes, threads, 0, LOOPBACK)
     collector = CountersCollector(counters, threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD)
     with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), None)) as server:
         result.address = server.address
@@ -86,32 +86,21 @@ def test_every_metric_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
         assert values[f"router_{metric.name}{suffix}", labels] == 0, metric.name
 
 
-def test_build_info_says_what_runs(scraped: Scraped) -> None:
-    assert scraped.values()["router_build_info", frozenset(BUILD.items())] == 1
-
-
-def test_a_counter_is_the_sum_over_threads(scraped: Scraped) -> None:
-    for counts, value in zip(scraped.threads, (3, 4), strict=True):
-        counts[scraped.slots["datagrams_sent"]] = value
+def test_a_counter_is_the_sum_over_threads_and_a_gauge_the_latest_of_them(scraped: Scraped) -> None:
+    first, second = scraped.threads
+    first[scraped.indexes["datagrams_sent"]], second[scraped.indexes["datagrams_sent"]] = 3, 4
+    seen = scraped.indexes["endpoint_last_seen_timestamp_seconds"]
+    first[seen], second[seen] = 1_500_000_000, 2_500_000_000
+    second[scraped.indexes["qos_incompatible"]] = first[scraped.indexes["deadman_active"]] = 2
     assert scraped.value("router_datagrams_sent_total") == 7
-
-
-def test_a_gauge_is_the_latest_of_all_threads_in_seconds(scraped: Scraped) -> None:
-    for counts, value in zip(scraped.threads, (1_500_000_000, 2_500_000_000), strict=True):
-        counts[scraped.slots["endpoint_last_seen_timestamp_seconds"]] = value
     assert scraped.value("router_endpoint_last_seen_timestamp_seconds") == 2.5
-
-
-def test_a_number_is_exported_as_the_thread_that_knows_it_left_it(scraped: Scraped) -> None:
-    scraped.threads[1][scraped.slots["qos_incompatible"]] = 2
     assert scraped.value("router_qos_incompatible") == 2
-    scraped.threads[0][scraped.slots["deadman_active"]] = 1
-    assert scraped.value("router_deadman_active") == 1
-    scraped.threads[0][scraped.slots["deadman_active"]] = 0
+    assert scraped.value("router_deadman_active") == 2
+    first[scraped.indexes["deadman_active"]] = 0
     assert scraped.value("router_deadman_active") == 0
 
 
-def test_what_is_in_no_slot_is_asked_for_at_each_scrape(scraped: Scraped) -> None:
+def test_what_is_not_counted_is_asked_for_at_each_scrape(scraped: Scraped) -> None:
     scraped.drops = 12
     assert scraped.value("router_kernel_drops_total") == 12
     scraped.drops = 13
@@ -119,7 +108,7 @@ def test_what_is_in_no_slot_is_asked_for_at_each_scrape(scraped: Scraped) -> Non
 
 
 def test_histogram_buckets_are_cumulative_and_in_seconds(scraped: Scraped) -> None:
-    first = scraped.slots["route_duration_seconds"]
+    first = scraped.indexes["route_duration_seconds"]
     for counts, elapsed_ns in ((scraped.threads[0], 9_000), (scraped.threads[1], 9_000), (scraped.threads[0], 10**9)):
         counts[first + bisect_left(HISTOGRAM_BOUNDS_NS, elapsed_ns)] += 1
         counts[first + len(HISTOGRAM_BOUNDS_NS) + 1] += elapsed_ns
@@ -130,8 +119,10 @@ def test_histogram_buckets_are_cumulative_and_in_seconds(scraped: Scraped) -> No
     assert scraped.value("router_route_duration_seconds_sum") == pytest.approx(1.000018)
 
 
-def test_the_process_is_described_and_python_is_not(scraped: Scraped) -> None:
-    names = {name for name, _ in scraped.values()}
+def test_the_process_and_what_it_runs_are_described_and_python_is_not(scraped: Scraped) -> None:
+    values = scraped.values()
+    assert values["router_build_info", frozenset(BUILD.items())] == 1
+    names = {name for name, _ in values}
     assert "process_cpu_seconds_total" in names
     assert not {name for name in names if name.startswith("python_")}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -12,55 +13,31 @@ from hypothesis import strategies as st
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.observe.route_map import NARROW, WIDE, Measures, NodeKind, nodes_and_edges, route_map, shortened, spread
-from router.table.model import ANY, RouteTable
-from tests.tables import PROTOS, ROUTES
+from router.table.model import ANY
+from tests.tables import ROUTES
 
 TABLES = ("rover.yaml", "legacy.yaml", "sim.yaml")
 
 
-def table_of(path: Path) -> RouteTable:
-    table = check_table(path).table
-    assert table is not None
-    return table
-
-
+@cache
 def program_of(name: str) -> Program:
     program = check_table(ROUTES / name).program
     assert program is not None
     return program
 
 
-def hostile(tmp_path: Path) -> RouteTable:
-    path = tmp_path / "hostile.yaml"
-    path.write_text(f"""\
-version: 1
-envelope: {{protos: {PROTOS}, message: PBEnvelope, oneof: payload}}
-listen: {{all: {{address: "127.0.0.1:5000"}}}}
-endpoints: {{a: {{address: "127.0.0.1:6000", kind: tool}}}}
-routes:
-  imu_info:
-    source: any
-    destinations: [{{endpoint: a, when: "accel_x < 3 and str(state) != '\\"<b>&'", max_rate: 5 Hz}}]
-  gps_info: {{ignore: 'because "x" < y & so'}}
-""")
-    return table_of(path)
-
-
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("measures", [WIDE, NARROW], ids=["wide", "narrow"])
-def test_no_box_overlaps_another_and_all_are_in_the_picture(name: str, measures: Measures) -> None:
-    drawing = route_map(table_of(ROUTES / name), measures)
+def test_no_box_overlaps_another_and_links_run_from_the_right_of_a_box_to_the_left_of_another(
+    name: str, measures: Measures
+) -> None:
+    drawing = route_map(program_of(name).table, measures)
     for box in drawing.boxes:
         assert 0 <= box.x < box.x + box.width <= drawing.width
         assert 0 <= box.y < box.y + box.height <= drawing.height
     for one, other in itertools.combinations(drawing.boxes, 2):
         apart = one.y + one.height <= other.y or other.y + other.height <= one.y
         assert apart or one.node.column != other.node.column, (one, other)
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_links_run_from_the_right_of_a_box_to_the_left_of_another(name: str) -> None:
-    drawing = route_map(table_of(ROUTES / name))
     boxes = {box.node.key: box for box in drawing.boxes}
     assert len(boxes) == len(drawing.boxes)
     for curve in drawing.curves:
@@ -97,9 +74,13 @@ def test_every_delivery_of_the_books_has_a_link() -> None:
 
 
 def test_an_ignored_case_stands_there_with_its_reason(tmp_path: Path) -> None:
-    nodes, edges = nodes_and_edges(hostile(tmp_path))
-    ignored = next(node for node in nodes if node.kind is NodeKind.IGNORED)
-    assert ignored.about == 'ignored: because "x" < y & so'
+    path = tmp_path / "table.yaml"
+    path.write_text(f"extends: {ROUTES}/rover.yaml\nroutes: {{gps_info: {{ignore: 'because \"x\" < y & so'}}}}\n")
+    table = check_table(path).table
+    assert table is not None
+    nodes, edges = nodes_and_edges(table)
+    ignored = next(node for node in nodes if node.name == "gps_info")
+    assert (ignored.kind, ignored.about) == (NodeKind.IGNORED, 'ignored: because "x" < y & so')
     assert all(ignored.key not in (edge.start, edge.end) for edge in edges)
 
 
