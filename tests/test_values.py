@@ -62,32 +62,20 @@ def test_a_word_sets_its_field(every_kind: PayloadCase, word: str, field: str, v
     assert getattr(build(every_kind, word), field) == value
 
 
-def test_nan_is_a_float(every_kind: PayloadCase) -> None:
-    assert math.isnan(build(every_kind, "single=nan").single)
-
-
 def test_nested_fields_are_reached_by_dots_and_make_the_message_present(every_kind: PayloadCase) -> None:
     message = build(every_kind, "point.x=3", "point.y=0")
     assert (message.point.x, message.HasField("point")) == (3, True)
-
-
-def test_an_empty_value_makes_an_empty_message_present(every_kind: PayloadCase) -> None:
     assert build(every_kind, "point=").HasField("point")
 
 
-def test_repeating_a_word_appends_to_a_list(every_kind: PayloadCase) -> None:
+def test_lists_are_appended_to_or_set_by_index_and_later_words_win(every_kind: PayloadCase) -> None:
     assert list(build(every_kind, "numbers=1", "numbers=2.5").numbers) == [1, 2.5]
-
-
-def test_an_index_sets_one_element_and_fills_what_is_before_it(every_kind: PayloadCase) -> None:
-    message = build(every_kind, "numbers[2]=7", "numbers[0]=1", "modes[1]=MODE_ON", "points[1].y=4")
+    message = build(every_kind, "numbers[2]=7", "numbers[0]=1", "modes[1]=MODE_ON", "points[1].y=4", "i32=1", "i32=2")
     assert list(message.numbers) == [1, 0, 7]
     assert list(message.modes) == [0, 1]
     assert [point.y for point in message.points] == [0, 4]
-
-
-def test_later_words_win(every_kind: PayloadCase) -> None:
-    assert build(every_kind, "i32=1", "i32=2").i32 == 2
+    assert message.i32 == 2
+    assert math.isnan(build(every_kind, "single=nan").single)
 
 
 @pytest.mark.parametrize(

@@ -24,20 +24,16 @@ def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_validate_counts_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbs_about_the_table_show_the_gateway_and_nothing_that_it_does_not_have(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["validate", "--strict", "only.yaml"]) == OK
     assert capsys.readouterr().out == "only.yaml: ok (1 gateway)\n"
-
-
-def test_explain_and_graph_show_the_gateway(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["explain", "--table", "only.yaml"]) == OK
     assert capsys.readouterr().out.startswith("headset: gateway, udp to 127.0.0.9:8502")
     for name in ("map.svg", "map.mmd", "map.dot"):
         assert main(["graph", "only.yaml", "-o", name]) == OK
         assert "headset" in Path(name).read_text()
-
-
-def test_the_doctor_says_nothing_of_what_it_does_not_have(capsys: pytest.CaptureFixture[str]) -> None:
     main(["doctor", "only.yaml"])
     said = capsys.readouterr().out
     assert "only.yaml: 1 gateway\n" in said
@@ -46,29 +42,23 @@ def test_the_doctor_says_nothing_of_what_it_does_not_have(capsys: pytest.Capture
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("arguments", "complaint"),
     [
-        ["send", "imu_info", "--to", "127.0.0.1:5000", "--table", "only.yaml"],
-        ["tap", "--table", "only.yaml", "--url", "http://127.0.0.1:9"],
-        ["tap", "5000", "--table", "only.yaml"],
+        (["send", "imu_info", "--to", "127.0.0.1:5000", "--table", "only.yaml"], NO_ENVELOPE),
+        (["tap", "--table", "only.yaml", "--url", "http://127.0.0.1:9"], NO_ENVELOPE),
+        (["tap", "5000", "--table", "only.yaml"], NO_ENVELOPE),
+        (["sim", "only.yaml", "--duration", "1"], "only.yaml has no listeners"),
+        (
+            ["new", "SensorBoardDose", "--number", "99", "--board", "s", "--table", "only.yaml"],
+            "only.yaml has no 'enve",
+        ),
     ],
-    ids=" ".join,
 )
 def test_what_is_about_datagrams_says_that_there_are_none(
-    arguments: list[str], capsys: pytest.CaptureFixture[str]
+    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments) == BAD_USAGE
-    assert capsys.readouterr().err == f"router {arguments[0]}: {NO_ENVELOPE}"
-
-
-def test_the_simulator_has_nobody_to_send_to(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sim", "only.yaml", "--duration", "1"]) == BAD_USAGE
-    assert "only.yaml has no listeners" in capsys.readouterr().err
-
-
-def test_no_message_can_be_added_to_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["new", "SensorBoardDose", "--number", "99", "--board", "sensor", "--table", "only.yaml"]) == BAD_USAGE
-    assert "only.yaml has no 'envelope'" in capsys.readouterr().err
+    assert complaint in capsys.readouterr().err
 
 
 def test_there_is_nothing_to_test(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
