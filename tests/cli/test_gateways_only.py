@@ -50,7 +50,7 @@ def test_verbs_about_the_table_show_the_gateway_and_nothing_that_it_does_not_hav
         (["sim", "only.yaml", "--duration", "1"], "only.yaml has no listeners"),
         (
             ["new", "SensorBoardDose", "--number", "99", "--board", "s", "--table", "only.yaml"],
-            "only.yaml has no 'enve",
+            "only.yaml has no 'envelope' that a message could be added to",
         ),
     ],
 )

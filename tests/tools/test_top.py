@@ -14,7 +14,6 @@ from router.tools.top import WINDOW, Order, Window, ordered, quantile, view
 from router.tools.top_view import age_text, latency_text, page, reasons_text, screen
 
 BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
-DURATIONS = "route_duration_seconds_bucket"
 NOW = 1_000_000.0
 
 
@@ -40,7 +39,7 @@ def snapshot(at: float, imu: int, gps: int = 0, **more: Counts) -> Snapshot:
         "route_last_message_timestamp_seconds": {("imu_info",): NOW - 5, ("gps_info",): 0},
         "endpoint_last_seen_timestamp_seconds": {("sensor_board",): NOW - 1, ("arm_board",): 0},
         "deadman_active": {("imu_info",): 1},
-        DURATIONS: {**buckets("imu_info", 0, imu), **buckets("gps_info", 0, 0, 0, 0, gps)},
+        "route_duration_seconds_bucket": {**buckets("imu_info", 0, imu), **buckets("gps_info", 0, 0, 0, 0, gps)},
     }
     return Snapshot(at, values | more)
 
@@ -100,12 +99,12 @@ def test_the_largest_comes_first_and_what_never_was_last() -> None:
 
 def test_a_router_that_was_started_anew_has_neither_negative_rates_nor_latencies_of_the_one_before() -> None:
     assert view(snapshot(0, 1000), snapshot(2, 10)).routes[0].rate == 5.0
-    after = snapshot(12, 0, 0, **{DURATIONS: buckets("gps_info", 0, 0, 2, 2, 4)})
+    after = snapshot(12, 0, route_duration_seconds_bucket=buckets("gps_info", 0, 0, 2, 2, 4))
     slowest = view(snapshot(10, 0, 3), after, NOW).routes[1].slowest
     assert slowest is not None
     assert slowest > 0
-    shrunk = snapshot(10, 0, **{DURATIONS: buckets("gps_info", 5, 5, 5, 5, 5)})
-    grown = snapshot(12, 0, **{DURATIONS: buckets("gps_info", 0, 0, 0, 6, 6)})
+    shrunk = snapshot(10, 0, route_duration_seconds_bucket=buckets("gps_info", 5, 5, 5, 5, 5))
+    grown = snapshot(12, 0, route_duration_seconds_bucket=buckets("gps_info", 0, 0, 0, 6, 6))
     assert view(shrunk, grown, NOW).routes[1].median == pytest.approx(75e-6)
 
 
@@ -178,7 +177,7 @@ router_build_info{version="1.0",table_sha256="abc",protos_sha256="def"} 1
 
 
 def test_what_the_table_wants_gone_is_not_lost() -> None:
-    dropped = {("imu_info", "imu_data", "rate_limited"): 8.0, ("imu_info", "imu_data", "stale"): 2.0}
+    dropped: Counts = {("imu_info", "imu_data", "rate_limited"): 8.0, ("imu_info", "imu_data", "stale"): 2.0}
     seen = view(snapshot(0, 1), snapshot(1, 1, messages_dropped=dropped), NOW)
     row = seen.routes[0]
     assert (row.dropped, row.lost, row.targets[1].lost) == ({"stale": 2, "rate_limited": 8}, {"stale": 2}, {"stale": 2})
