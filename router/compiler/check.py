@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from router.compiler.checked import CheckedGateway, CheckedRoute
+from router.compiler.checked import CheckedRoute
 from router.compiler.gateways import check_gateways
 from router.compiler.lookup import Definitions, Lookup
 from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
-from router.compiler.program import Program
+from router.compiler.program import GatewayPlan, Program
 from router.compiler.routes import check_routes, clash_findings
 from router.compiler.topics import diagnostics_topic, topic_findings
 from router.errors import Diagnostic, Severity, TableError
@@ -36,7 +36,7 @@ class Checked:
     schema: ProtoSchema | None = None
     envelope: Envelope | None = None
     routes: Sequence[CheckedRoute] = ()
-    gateways: Sequence[CheckedGateway] = ()
+    gateways: Sequence[GatewayPlan] = ()
     own_topics: Sequence[tuple[Topic, MessageType]] = ()
 
     @property

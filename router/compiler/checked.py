@@ -1,4 +1,4 @@
-"""Routes and gateways after their checks: plain data from which code is generated and `explain` prints."""
+"""Routes after their checks: plain data from which code is generated and `explain` prints."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.errors import SourceSpan
-from router.table.model import Deadman, Destination, Endpoint, Gateway, Inbound, Keep, Priority, Route, Topic
+from router.table.model import Deadman, Destination, Endpoint, Keep, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -108,24 +108,3 @@ class CheckedRoute:
     subscriptions: tuple[CheckedSubscription, ...] = ()
     collect: CheckedCollect | None = None
     deadman: CheckedDeadman | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class CheckedInbound:
-    """A topic that clients may publish on; `label` is its absolute name.
-
-    `stop` are the CDR bytes of the message that its deadman sends.
-    """
-
-    settings: Inbound
-    label: str
-    type: MessageType
-    stop: bytes | None
-
-
-@dataclass(frozen=True, slots=True)
-class CheckedGateway:
-    """A gateway, with those of its inbound topics whose types exist."""
-
-    settings: Gateway
-    inbound: tuple[CheckedInbound, ...]

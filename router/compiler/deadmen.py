@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman
@@ -15,6 +15,7 @@ from router.compiler.lookup import Lookup
 from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
+from router.compiler.program import DeadmanPlan
 from router.errors import Code, Diagnostic, MappingError, SourceSpan
 from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, Keep, Route, RouteTable
 from router.types.model import MessageType
@@ -124,6 +125,12 @@ def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | No
     except (MappingError, ValueError) as error:
         lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None
+
+
+def deadman_plan(name: str, settings: Deadman | InboundDeadman, datagrams: Iterable[tuple[str, bytes]]) -> DeadmanPlan:
+    return DeadmanPlan(
+        name, settings.timeout.value, settings.repeat.value, tuple(datagrams), at_start=settings.at_start
+    )
 
 
 def constant_plan(

@@ -9,18 +9,18 @@ import struct
 from collections.abc import Iterator
 
 from router.compiler.cdr import write_message
-from router.compiler.checked import CheckedGateway, CheckedInbound
-from router.compiler.deadmen import constant_plan, timing_findings
+from router.compiler.deadmen import constant_plan, deadman_plan, timing_findings
 from router.compiler.lookup import Lookup
 from router.compiler.namespace import constant_bytes
+from router.compiler.program import DeadmanPlan, GatewayPlan, InboundPlan
 from router.compiler.selection import pattern_problem
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, MappingError
-from router.table.model import Gateway, Inbound, InboundDeadman, RouteTable
+from router.table.model import Gateway, Inbound, RouteTable
 from router.types.model import MessageType
 
 
-def check_gateways(lookup: Lookup) -> tuple[CheckedGateway, ...]:
+def check_gateways(lookup: Lookup) -> tuple[GatewayPlan, ...]:
     """The gateways of the table; findings go to `lookup`."""
     checked = []
     for gateway in lookup.table.gateways.values():
@@ -33,7 +33,7 @@ def check_gateways(lookup: Lookup) -> tuple[CheckedGateway, ...]:
             from router.compiler.zenoh_config import scouting_findings
 
             lookup.findings += scouting_findings(gateway, lookup.table.networks)
-        checked.append(CheckedGateway(gateway, check_client_topics(lookup, gateway)))
+        checked.append(GatewayPlan(gateway, _client_topics(lookup, gateway)))
     return tuple(checked)
 
 
@@ -55,38 +55,43 @@ def _pattern_findings(gateway: Gateway) -> Iterator[Diagnostic]:
             yield Diagnostic(pattern.span, Code.BAD_VALUE, problem.what, problem.hint)
 
 
-def check_client_topics(lookup: Lookup, gateway: Gateway) -> tuple[CheckedInbound, ...]:
+def _client_topics(lookup: Lookup, gateway: Gateway) -> dict[str, InboundPlan]:
     """The topics that clients of a gateway may publish on, without those whose types do not exist."""
-    found: dict[str, CheckedInbound | None] = {}
+    found: dict[str, InboundPlan | None] = {}
     for inbound in gateway.inbound:
         name = resolved(inbound.topic.topic.value, lookup.table.node)
         if name in found:
             message = f"'{name}' is let in twice"
             lookup.report(inbound.topic.topic.span, Code.BAD_VALUE, message, "name it once")
-        found[name] = _checked(lookup, inbound, name)
-    return tuple(checked for checked in found.values() if checked)
+        found[name] = _inbound(lookup, gateway, inbound, name)
+    return {name: plan for name, plan in found.items() if plan}
 
 
-def _checked(lookup: Lookup, inbound: Inbound, name: str) -> CheckedInbound | None:
+def _inbound(lookup: Lookup, gateway: Gateway, inbound: Inbound, name: str) -> InboundPlan | None:
     findings = (topic_name_finding(inbound.topic), *qos_findings(inbound.topic, publishes=True))
     lookup.findings += [finding for finding in findings if finding]
     ros_type = lookup.ros_type(inbound.topic)
-    deadman = inbound.deadman
-    if deadman is not None:
-        lookup.findings += timing_findings(deadman, inbound.topic.max_rate, "messages")
+    if inbound.deadman is not None:
+        lookup.findings += timing_findings(inbound.deadman, inbound.topic.max_rate, "messages")
     if ros_type is None:
         return None
-    return CheckedInbound(inbound, name, ros_type, _stop(lookup, deadman, ros_type) if deadman else None)
+    return InboundPlan(inbound, name, ros_type, _deadman(lookup, gateway, inbound, name, ros_type))
 
 
-def _stop(lookup: Lookup, deadman: InboundDeadman, ros_type: MessageType) -> bytes | None:
-    """The message that the deadman publishes, as CDR bytes."""
+def _deadman(
+    lookup: Lookup, gateway: Gateway, inbound: Inbound, name: str, ros_type: MessageType
+) -> DeadmanPlan | None:
+    """The deadman of a topic, with the CDR bytes that it publishes; None if there is none, or with a finding."""
+    deadman = inbound.deadman
+    if deadman is None:
+        return None
     span = deadman.fields.span
     plan = constant_plan(lookup, deadman.fields, ros_type, span, ros_type)
     if plan is None:
         return None
     try:
-        return constant_bytes(lambda out: write_message(out, plan, "constant"), span)
+        message = constant_bytes(lambda out: write_message(out, plan, "constant"), span)
     except (MappingError, ValueError, struct.error) as error:
         lookup.report(span, Code.BAD_VALUE, f"this message cannot be built: {error}")
         return None
+    return deadman_plan(f"{gateway.name}:{name}", deadman, [(name, message)])

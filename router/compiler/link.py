@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from router.compiler.checked import CheckedDeadman, CheckedGateway, CheckedInbound, CheckedRoute
+from router.compiler.checked import CheckedDeadman, CheckedRoute
+from router.compiler.deadmen import deadman_plan
 from router.compiler.handlers import HandlerSource
 from router.compiler.lookup import layout
 from router.compiler.metrics import (
@@ -30,13 +31,12 @@ from router.compiler.program import (
     DeadmanPlan,
     GatewayPlan,
     Handler,
-    InboundPlan,
     Program,
     TopicPlan,
     source_label,
 )
 from router.compiler.topics import qos_of
-from router.table.model import ANY, ROS, Deadman, Gateway, InboundDeadman, RouteTable, Topic
+from router.table.model import ANY, ROS, RouteTable, Topic
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -46,9 +46,9 @@ def link(
     schema: ProtoSchema,
     envelope: Envelope,
     routes: Sequence[CheckedRoute],
-    gateways: Sequence[CheckedGateway] = (),
-    own_topics: Sequence[tuple[Topic, MessageType]] = (),
-    counters: Counters | None = None,
+    gateways: Sequence[GatewayPlan],
+    own_topics: Sequence[tuple[Topic, MessageType]],
+    counters: Counters | None,
 ) -> Program:
     """Make the program of a checked table.
 
@@ -68,9 +68,11 @@ def link(
                 inbound[number] = (*inbound.get(number, ()), handler)
             else:
                 outbound[handler.topic] = (*outbound.get(handler.topic, ()), handler)
-    deadmen = tuple(
-        _route_deadman(checked.route.name, checked.deadman, table, counters) for checked in served if checked.deadman
-    )
+    deadmen = tuple(_route_deadman(checked.route.name, checked.deadman, table) for checked in served if checked.deadman)
+    for deadman in deadmen:
+        _open_deadman_counters(counters, deadman)
+    for gateway in gateways:
+        _open_gateway_counters(counters, gateway)
     destinations = {to.endpoint.value for checked in served for to in checked.route.destinations}
     destinations |= {endpoint for plan in deadmen for endpoint, _ in plan.datagrams}
     return Program(
@@ -85,7 +87,7 @@ def link(
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos=schema,
-        gateways=tuple(link_gateway(checked, counters) for checked in gateways),
+        gateways=tuple(gateways),
     )
 
 
@@ -97,10 +99,10 @@ def _published(routes: Iterable[CheckedRoute]) -> Iterator[tuple[Topic, MessageT
                 yield used.topic, used.type
 
 
-def _published_by_clients(gateways: Iterable[CheckedGateway]) -> Iterator[TopicPlan]:
+def _published_by_clients(gateways: Iterable[GatewayPlan]) -> Iterator[TopicPlan]:
     """The topics that clients of gateways publish on, under absolute names."""
     for gateway in gateways:
-        for entry in gateway.inbound:
+        for entry in gateway.inbound.values():
             yield _topic(entry.settings.topic, entry.type, entry.label)
 
 
@@ -116,29 +118,32 @@ def _topic(topic: Topic, declared: MessageType, label: str) -> TopicPlan:
     return TopicPlan(label, topic.topic.value, declared.name, qos_of(topic), layout(declared))
 
 
+def _open(counters: Counters, metrics: Iterable[str], *labels: str) -> None:
+    for metric in metrics:
+        counters.index(metric, *labels)
+
+
+def _open_each(counters: Counters, metric: str, *labels: str, last: Iterable[str]) -> None:
+    """Open a series for each value of the last label."""
+    for value in last:
+        counters.index(metric, *labels, value)
+
+
 def _open_counters(counters: Counters, table: RouteTable, envelope: Envelope) -> None:
     for listener in table.listeners:
-        for name in ("datagrams_received", "received_bytes", "kernel_drops", "datagrams_padded"):
-            counters.index(name, listener)
-        for reason in REJECT_REASONS:
-            counters.index("datagrams_rejected", listener, reason)
-    for case in (*envelope.cases, UNKNOWN_CASE):
-        counters.index("unhandled", case)
-    for endpoint in table.endpoints:
-        counters.index("endpoint_last_seen_timestamp_seconds", endpoint)
+        _open(counters, ("datagrams_received", "received_bytes", "kernel_drops", "datagrams_padded"), listener)
+        _open_each(counters, "datagrams_rejected", listener, last=REJECT_REASONS)
+    _open_each(counters, "unhandled", last=(*envelope.cases, UNKNOWN_CASE))
+    _open_each(counters, "endpoint_last_seen_timestamp_seconds", last=table.endpoints)
 
 
 def _open_own_counters(counters: Counters, table: RouteTable) -> None:
     """The series of mirror, recorder and reloads."""
-    for name in ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"):
-        counters.index(name)
-    for result in RELOAD_RESULTS:
-        counters.index("config_reloads", result)
+    _open(counters, ("mirror_dropped", "config_last_reload_successful", "config_last_reload_timestamp_seconds"))
+    _open_each(counters, "config_reloads", last=RELOAD_RESULTS)
     if table.record is not None:
-        for name in ("recorded_datagrams", "recorded_bytes"):
-            counters.index(name)
-        for reason in RECORD_DROP_REASONS:
-            counters.index("record_dropped", reason)
+        _open(counters, ("recorded_datagrams", "recorded_bytes"))
+        _open_each(counters, "record_dropped", last=RECORD_DROP_REASONS)
 
 
 def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[Handler]:
@@ -147,19 +152,16 @@ def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counter
     A route from UDP has one function, a route from ROS one for each of its topics.
     """
     route, case = checked.route, checked.case
-    counters.index("route_duration_seconds", route.name)
-    counters.index("route_last_message_timestamp_seconds", route.name)
+    _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route.name)
     for topic in route.topics:
-        for policy in QOS_POLICIES:
-            counters.index("qos_incompatible", route.name, topic.topic.value, policy)
+        _open_each(counters, "qos_incompatible", route.name, topic.topic.value, last=QOS_POLICIES)
     if not route.is_outbound:
         generator = HandlerSource(route, case, counters)
         generator.inbound(checked.targets, checked.collect)
         sources: list[str | None] = [source.value for source in route.sources]
         if ANY in sources:
             sources = [*table.endpoints, STRANGER]
-        for source in sources:
-            counters.index("messages_received", route.name, source_label(source))
+        _open_each(counters, "messages_received", route.name, last=map(source_label, sources))
         spans = [target.span for target in checked.targets if target.topic]
         yield _handler(generator, checked, (spans or [route.span])[0].file, frozenset(sources), None)
     for feed in checked.subscriptions:
@@ -188,69 +190,36 @@ def _handler(
     )
 
 
-def _route_deadman(route: str, checked: CheckedDeadman, table: RouteTable, counters: Counters) -> DeadmanPlan:
+def _route_deadman(route: str, checked: CheckedDeadman, table: RouteTable) -> DeadmanPlan:
     datagrams = []
     for to in checked.settings.to:
         trims = table.endpoints[to.value].trim_trailing_zeros
         datagrams.append((to.value, checked.datagram.rstrip(b"\0") if trims else checked.datagram))
-    return _deadman(route, checked.settings, datagrams, counters)
+    return deadman_plan(route, checked.settings, datagrams)
 
 
-def _deadman(
-    name: str, settings: Deadman | InboundDeadman, datagrams: Iterable[tuple[str, bytes]], counters: Counters
-) -> DeadmanPlan:
-    plan = DeadmanPlan(
-        name, settings.timeout.value, settings.repeat.value, tuple(datagrams), at_start=settings.at_start
-    )
-    for metric in ("deadman_active", "deadman_trips"):
-        counters.index(metric, name)
+def _open_deadman_counters(counters: Counters, plan: DeadmanPlan) -> None:
+    _open(counters, ("deadman_active", "deadman_trips"), plan.route)
     for to, _ in plan.datagrams:
-        for metric in ("deadman_datagrams_sent", "deadman_send_errors"):
-            counters.index(metric, name, to)
-    return plan
+        _open(counters, ("deadman_datagrams_sent", "deadman_send_errors"), plan.route, to)
 
 
-# gateways
-
-
-def link_gateway(checked: CheckedGateway, counters: Counters) -> GatewayPlan:
-    """The plan of one gateway; opens its series in the counters."""
-    settings = checked.settings
-    _open_gateway_counters(counters, settings)
-    return GatewayPlan(settings, {entry.label: _inbound(entry, settings.name, counters) for entry in checked.inbound})
-
-
-def _inbound(entry: CheckedInbound, gateway: str, counters: Counters) -> InboundPlan:
-    topic, settings = entry.label, entry.settings
-    counters.index("messages_published", gateway, topic)
-    for reason in INBOUND_DROP_REASONS:
-        counters.index("messages_dropped", gateway, topic, reason)
-    for policy in QOS_POLICIES:
-        counters.index("qos_incompatible", gateway, topic, policy)
-    deadman = None
-    if settings.deadman is not None and entry.stop is not None:
-        deadman = _deadman(f"{gateway}:{topic}", settings.deadman, [(topic, entry.stop)], counters)
-    return InboundPlan(settings, topic, entry.type, deadman)
-
-
-def _open_gateway_counters(counters: Counters, gateway: Gateway) -> None:
-    name = gateway.name
-    for metric in ("datagrams_received", "received_bytes", "gateway_clients", "gateway_client_clock_ahead"):
-        counters.index(metric, name)
-    counters.index("route_last_message_timestamp_seconds", name)
-    for reason in GATEWAY_REJECT_REASONS:
-        counters.index("datagrams_rejected", name, reason)
-    for source in (ROS, CLIENTS):
-        counters.index("messages_received", name, source)
-    for metric in ("messages_sent", "messages_filtered"):
-        counters.index(metric, name, CLIENTS)
-    for reason in GATEWAY_DROP_REASONS:
-        counters.index("messages_dropped", name, CLIENTS, reason)
-    for metric in ("datagrams_sent", "sent_bytes"):
-        counters.index(metric, name, gateway.transport.value.value)
-    if gateway.zenoh is not None:
-        counters.index("gateway_key_conflicts", name)
-    for state in TOPIC_STATES:
-        counters.index("gateway_topics", name, state)
-    for reason in CLIENT_DROP_REASONS:
-        counters.index("client_messages_dropped", name, reason)
+def _open_gateway_counters(counters: Counters, plan: GatewayPlan) -> None:
+    name = plan.settings.name
+    _open(counters, ("datagrams_received", "received_bytes", "gateway_clients", "gateway_client_clock_ahead"), name)
+    _open(counters, ("route_last_message_timestamp_seconds",), name)
+    _open_each(counters, "datagrams_rejected", name, last=GATEWAY_REJECT_REASONS)
+    _open_each(counters, "messages_received", name, last=(ROS, CLIENTS))
+    _open(counters, ("messages_sent", "messages_filtered"), name, CLIENTS)
+    _open_each(counters, "messages_dropped", name, CLIENTS, last=GATEWAY_DROP_REASONS)
+    _open(counters, ("datagrams_sent", "sent_bytes"), name, plan.settings.transport.value.value)
+    if plan.settings.zenoh is not None:
+        _open(counters, ("gateway_key_conflicts",), name)
+    _open_each(counters, "gateway_topics", name, last=TOPIC_STATES)
+    _open_each(counters, "client_messages_dropped", name, last=CLIENT_DROP_REASONS)
+    for topic, inbound in plan.inbound.items():
+        _open(counters, ("messages_published",), name, topic)
+        _open_each(counters, "messages_dropped", name, topic, last=INBOUND_DROP_REASONS)
+        _open_each(counters, "qos_incompatible", name, topic, last=QOS_POLICIES)
+        if inbound.deadman is not None:
+            _open_deadman_counters(counters, inbound.deadman)

@@ -11,9 +11,10 @@ from time import sleep
 
 from router.compiler import Checked
 from router.compiler.cdr import message_size
-from router.compiler.checked import CheckedGateway, CheckedInbound, CheckedRoute, CheckedTarget
+from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
+from router.compiler.program import GatewayPlan, InboundPlan
 from router.compiler.selection import TopicSelector
 from router.compiler.topics import qos_of, resolved
 from router.errors import StartError, shown_path
@@ -184,14 +185,14 @@ def _at_start(sends: bool) -> str:
 # Gateways
 
 
-def explained_gateway(checked: CheckedGateway, topics: Topics) -> Iterator[str]:
+def explained_gateway(checked: GatewayPlan, topics: Topics) -> Iterator[str]:
     gateway = checked.settings
     yield f"{gateway.name}: gateway, {_transport(gateway)}, {gateway.format.value}  ({gateway.span})"
     yield f"  {_period(gateway.publish_period)}; {_regularly(gateway)}"
     yield f"  messages of up to {gateway.max_outbound} bytes{_sizes(gateway)}"
     yield from _patterns(gateway)
-    yield from _matched(TopicSelector(gateway, [entry.label for entry in checked.inbound]), topics)
-    for entry in checked.inbound:
+    yield from _matched(TopicSelector(gateway, checked.inbound), topics)
+    for entry in checked.inbound.values():
         yield ""
         yield from _inbound(entry)
 
@@ -265,20 +266,20 @@ def _matched(selector: TopicSelector, topics: Topics) -> Iterator[str]:
         yield f"  ~ {name}  {types}  {period}  by {why}".rstrip()
 
 
-def _inbound(entry: CheckedInbound) -> Iterator[str]:
+def _inbound(entry: InboundPlan) -> Iterator[str]:
     inbound = entry.settings
     yield f"  from clients {entry.label}: {entry.type}  ({inbound.span})"
     yield _quality(inbound.topic)
     yield from (f"    {words}" for words in phrases(inbound).values())
     if inbound.topic.max_rate is not None:
         yield f"    {phrases(inbound.topic)['max_rate']}"
-    if inbound.deadman is not None and entry.stop is not None:
+    if inbound.deadman is not None and entry.deadman is not None:
         timeout, repeat = duration(inbound.deadman.timeout.value), duration(inbound.deadman.repeat.value)
         start = _at_start(inbound.deadman.at_start)
         yield f"    deadman: {_constants(entry)} when no message came for {timeout}, again every {repeat}, {start}"
 
 
-def _constants(entry: CheckedInbound) -> str:
+def _constants(entry: InboundPlan) -> str:
     assert entry.settings.deadman is not None  # noqa: S101 - the caller's choice
     entries = entry.settings.deadman.fields.entries
     return ", ".join(f"{'.'.join(each.path)} {each.value.text}" for each in entries) or "all fields at their defaults"
