@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import pytest
-from geometry_msgs.msg import TwistStamped
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import FluidPressure, Imu, MagneticField, NavSatFix, NavSatStatus, Temperature
+from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from router.compiler import check_table
 from router.compiler.program import Program
@@ -171,24 +169,6 @@ def published(rover: Program) -> Publish:
     return route
 
 
-def test_imu_is_published_in_si_units(published: Publish) -> None:
-    topics = published("imu_info", accel_x=1.5, accel_y=-2.5, accel_z=9.75, gyro_x=180, gyro_z=-90, mag_x=50, mag_z=-25)
-
-    imu = deserialize_message(topics["imu/data_raw"], Imu)
-    assert (imu.header.frame_id, imu.header.stamp.sec, imu.header.stamp.nanosec) == (
-        "imu_link",
-        1_700_000_000,
-        123_456_789,
-    )
-    acceleration, rotation = imu.linear_acceleration, imu.angular_velocity
-    assert (acceleration.x, acceleration.y, acceleration.z) == (1.5, -2.5, 9.75)
-    assert (rotation.x, rotation.y, rotation.z) == pytest.approx((math.pi, 0, -math.pi / 2))
-    assert imu.orientation_covariance[0] == -1
-
-    field = deserialize_message(topics["imu/mag"], MagneticField).magnetic_field
-    assert (field.x, field.y, field.z) == pytest.approx((50e-6, 0, -25e-6))
-
-
 def test_gps_position_is_published_with_its_uncertainty(published: Publish) -> None:
     topics = published("gps_info", latitude=48.5, longitude=-9.25, altitude=321.5, hdop=0.5, vdop=2, fix_quality=1)
 
@@ -220,33 +200,3 @@ def test_gps_position_of_unknown_quality_is_not_published_as_certain(published: 
 def test_gps_status_follows_the_fix_quality(published: Publish, fix_quality: str | int, status: int) -> None:
     fix = deserialize_message(published("gps_info", fix_quality=fix_quality)["gps/fix"], NavSatFix)
     assert fix.status.status == status
-
-
-@pytest.mark.parametrize(("heading", "east", "north"), [(0, 0, 2), (90, 2, 0), (180, 0, -2), (270, -2, 0)])
-def test_gps_motion_is_published_as_east_and_north(
-    published: Publish, heading: float, east: float, north: float
-) -> None:
-    twist = deserialize_message(published("gps_info", speed=2, heading=heading)["gps/vel"], TwistStamped).twist
-    assert (twist.linear.x, twist.linear.y, twist.linear.z) == pytest.approx((east, north, 0), abs=1e-12)
-
-
-def test_pressure_is_published_in_pascal_in_the_frame_of_its_sensor(published: Publish) -> None:
-    topics = published("pressure_info", sensor_index=3, pressure_kpa=101.5, temperature_c=21.5)
-    pressure = deserialize_message(topics["pressure/data"], FluidPressure)
-    assert (pressure.fluid_pressure, pressure.header.frame_id) == (101_500, "pressure_sensor_3")
-    temperature = deserialize_message(topics["pressure/temperature"], Temperature)
-    assert (temperature.temperature, temperature.header.frame_id) == (21.5, "pressure_sensor_3")
-
-
-@pytest.mark.parametrize(
-    ("case", "field", "topic", "frame"),
-    [
-        ("ph_info", "temperature", "ph/temperature", "ph_probe"),
-        ("sensor_diag", "board_temperature", "sensor_board/temperature", "sensor_board"),
-    ],
-)
-def test_temperatures_are_published_in_their_frames(
-    published: Publish, case: str, field: str, topic: str, frame: str
-) -> None:
-    message = deserialize_message(published(case, **{field: 36.5})[topic], Temperature)
-    assert (message.temperature, message.header.frame_id) == (36.5, frame)

@@ -37,6 +37,16 @@ endpoints:
 {endpoints}"""
 """The rover's table with loopback addresses, to be filled in by `Site.table`."""
 
+BARE = """\
+version: 1
+envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
+metrics: {{address: 127.0.0.1:{metrics}}}
+listen: {{rover: {{address: 127.0.0.5:{listen}}}}}
+endpoints:
+{endpoints}
+"""
+"""A table without routes, to be filled in likewise."""
+
 IMPATIENT_ROVER = ROVER.replace("patient.yaml", "quiet.yaml")
 """With the rover's own times for what is stale, and for its deadmen."""
 

@@ -14,16 +14,12 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.payloads import WIRE, sample
-from tests.acceptance.site import RouterProcess, Site, key, site, total, udp
+from tests.acceptance.site import BARE, RouterProcess, Site, key, site, total, udp
 from tests.ports import free_port
 
-TABLE = """\
-version: 1
-envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
-listen: {{rover: {{address: 127.0.0.5:{listen}}}}}
-endpoints:
-{endpoints}
+TABLE = (
+    BARE
+    + """\
 routes:
   manual_drive:
     source: basestation
@@ -35,6 +31,7 @@ routes:
     destinations: [arm_board]
     deadman: {{timeout: 1h, send: {{manual_arm: {{}}}}, to: [arm_board], at_start: silent}}   # for these tests
 """
+)
 GATEWAY = """\
 gateways:
   operator:

@@ -15,16 +15,12 @@ import pytest
 from tests.acceptance.expected import Values, in_board_units, spelled
 from tests.acceptance.payloads import WIRE, Sample, arbitrary, sample
 from tests.acceptance.ros_peer import RosPeer
-from tests.acceptance.site import RouterProcess, Site, balance, key, site, total, wait_until
+from tests.acceptance.site import BARE, RouterProcess, Site, balance, key, site, total, wait_until
 
-TABLE = """\
-version: 1
-envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
-listen:
-  rover: {{address: 127.0.0.5:{listen}, receive_buffer: 4MiB}}
-endpoints:
-{endpoints}routes:
+TABLE = (
+    BARE.replace("{listen}", "{listen}, receive_buffer: 4MiB")
+    + """\
+routes:
   detected_object:
     source: [left, right]
     collect: {{by: frame_id, count: total_count, order: index, timeout: 1s}}
@@ -34,6 +30,7 @@ endpoints:
         queue_depth: 1000
         fields: {{frame_id: frame_id, detections: items}}
 """
+)
 TOPICS = {"objects": "comms/msg/DetectedObjectArray"}
 CAMERAS = {"left": "127.0.0.31", "right": "127.0.0.32"}
 

@@ -1,19 +1,18 @@
-"""A router whose table has `gateways` only, in a process of its own: the one of docs/moving-over.md, and reloads."""
+"""A router whose table has `gateways` only, in a process of its own, and its reload."""
 
 from __future__ import annotations
 
 import json
-import re
 import signal
 import socket
 import urllib.request
 from functools import partial
 from pathlib import Path
 
-from tests.acceptance.gateway_clients import Headset, lines, repeating
+from tests.acceptance.gateway_clients import lines, repeating
 from tests.acceptance.payloads import WIRE, sample
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
-from tests.acceptance.site import ROOT, RouterProcess, key, site, total, udp, wait_until
+from tests.acceptance.site import RouterProcess, key, site, total, udp, wait_until
 from tests.ports import free_port
 from tests.tables import PROTOS
 
@@ -41,35 +40,6 @@ def asked(port: int, path: str, data: bytes | None = None) -> str:
         return str(answer.read().decode())
 
 
-def test_the_table_of_who_moves_over_streams_topics(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "moving-over.md").read_text(encoding="utf-8")
-    [text] = re.findall(r"^```yaml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
-    with site(tmp_path, {}) as place, udp("127.0.0.9") as opened, RosPeer() as peer:
-        text = text.replace("10.0.20.219:8502", f"127.0.0.9:{opened.getsockname()[1]}")
-        text = text.replace("10.0.0.230:8500", f"127.0.0.5:{free_port('127.0.0.5')}").replace(
-            "9108", str(place.metrics)
-        )
-        assert {host.partition(".")[0] for host in re.findall(r"[\d.]+(?=:\d)", text)} == {"127"}
-        table = tmp_path / "gateway.yaml"
-        table.write_text(text)
-        peer.open("/imu/rate", "geometry_msgs/msg/Vector3", keeps=True)
-        peer.say("/imu/rate", {"x": 1.5})
-        peer.open("/elsewhere", "std_msgs/msg/String")
-        with RouterProcess(tmp_path, table) as router:
-            client = Headset(opened)
-            assert client.wait_for("/imu/rate") == {"x": [1.5], "y": [0.0], "z": [0.0]}
-            assert client.early == []
-            assert peer.heard_by("/elsewhere") == 0
-            assert asked(place.metrics, "/ready").strip() == "ready"
-            counts = place.scrape()
-            assert total(counts, "messages_sent", route="vr_headset") > 0
-            assert total(counts, "datagrams_received") == total(counts, "unhandled") == 0
-            assert json.loads(asked(place.metrics, "/status.json"))["routes"].keys() == {"vr_headset"}
-            assert router.stop(signal.SIGTERM) == 0
-            assert len(router.events("router stopped")) == 1
-            assert [line for line in router.log() if line["level"] != "info"] == []
-
-
 def test_a_reload_gives_it_its_first_routes_and_takes_them_away_again(tmp_path: Path) -> None:
     with site(tmp_path, {}) as place, udp("127.0.0.30") as board, RosPeer() as peer:
         port = free_port("127.0.0.5", kind=socket.SOCK_STREAM)
@@ -81,12 +51,17 @@ def test_a_reload_gives_it_its_first_routes_and_takes_them_away_again(tmp_path: 
         table.write_text(only)
         peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
         peer.say("/gw/word", {"data": "before"})
+        peer.open("/elsewhere", "std_msgs/msg/String")
         with (
             RouterProcess(tmp_path, table) as router,
             socket.create_connection(("127.0.0.5", port), PATIENCE) as opened,
         ):
             received = (line for line in lines(opened) if line["op"] == "data")
             assert next(received)["data"] == {"data": "before"}
+            assert peer.heard_by("/elsewhere") == 0
+            assert asked(place.metrics, "/ready").strip() == "ready"
+            assert json.loads(asked(place.metrics, "/status.json"))["routes"].keys() == {"logger"}
+            assert total(place.scrape(), "datagrams_received") == total(place.scrape(), "unhandled") == 0
 
             table.write_text(only + routes)
             assert json.loads(asked(place.metrics, "/-/reload", b""))["ok"]

@@ -14,18 +14,14 @@ from time import sleep
 from router.recording.reader import Recorded, Recording
 from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.rover_map import HOSTS
-from tests.acceptance.site import ROOT, RouterProcess, Site, site, total, wait_until
+from tests.acceptance.site import BARE, ROOT, RouterProcess, Site, site, total, wait_until
 from tests.recording.recorder_rig import imu
 
-TABLE = """\
-version: 1
-envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
+TABLE = (
+    BARE
+    + """\
 record: {{directory: recordings, last: 60s}}
-listen:
-  rover: {{address: 127.0.0.5:{listen}}}
-endpoints:
-{endpoints}routes:
+routes:
   imu_info: {{source: sensor_board, destinations: [basestation]}}
   manual_drive:
     source: basestation
@@ -33,6 +29,7 @@ endpoints:
     ttl: 10s
     deadman: {{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}, to: [driving_board]}}
 """
+)
 DRIVE = b"\xc2\x01\x00"
 ALL_KINDS = [imu(1), b"", b"no envelope", imu(2).rstrip(b"\0") + bytes(9), b"\xff" * 20_000, imu(3)]
 

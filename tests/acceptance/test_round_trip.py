@@ -14,7 +14,7 @@ from tests.acceptance.round_trip import back_to_back, carried, turned
 from tests.acceptance.site import Site, balance, labels_of, total
 from tests.wire.test_golden_envelopes import GOLDEN
 
-RANDOM = settings.default.max_examples
+RANDOM = settings().max_examples
 Ends = tuple[Site, Site]
 
 

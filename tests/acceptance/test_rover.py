@@ -41,6 +41,7 @@ from tests.acceptance.rover_map import (
     topics_of,
 )
 from tests.acceptance.site import (
+    BARE,
     RouterProcess,
     Site,
     arrived,
@@ -63,7 +64,7 @@ CLOCK_STEP = 1e-6
 AT_ONCE = 8
 """Messages that may be on their way: the router's queues hold ten, of which the newest remain."""
 
-RANDOM = settings.default.max_examples
+RANDOM = settings().max_examples
 LENGTHS = (0, 1, 2, 500, 0, 3)
 LOAD = 100 * RANDOM
 IMU = next(generated("imu_info"))
@@ -488,12 +489,7 @@ def test_what_the_kernel_drops_is_counted(watched: Rover) -> None:
 # -- another table ---------------------------------------------------------------------------------------------------
 
 NARROW = """\
-version: 1
-envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
-listen: {{rover: {{address: 127.0.0.5:{listen}, framing: exact}}}}
-endpoints:
-{endpoints}  down: {{address: 127.0.0.51:@down, kind: tool}}
+  down: {{address: 127.0.0.51:@down, kind: tool}}
 routes:
   ph_info: {{source: sensor_board, destinations: [basestation, down, driving_board]}}
   imu_info: {{ignore: a test}}
@@ -502,10 +498,11 @@ routes:
 
 def test_a_narrow_table_ignores_and_lacks_cases_repairs_nothing_and_serves_who_is_there(tmp_path: Path) -> None:
     down = free_port("127.0.0.51")
+    table = BARE.replace("{listen}", "{listen}, framing: exact") + NARROW
     refused = key("messages_dropped", route="ph_info", target="down", reason="send_error")
     with (
         site(tmp_path) as place,
-        RouterProcess(tmp_path, place.table(NARROW.replace("@down", str(down)))) as router,
+        RouterProcess(tmp_path, place.table(table.replace("@down", str(down)))) as router,
     ):
         gps, empty = next(generated("gps_info")).datagram, golden(bytes.fromhex("0a00")).datagram
         assert exchange(place, IMU.datagram, "sensor_board") == rejected(IMU.datagram, "ignored")

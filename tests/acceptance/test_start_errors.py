@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.acceptance.rover_map import ROUTER
-from tests.acceptance.site import ROVER, RouterProcess, Site, site, udp
+from tests.acceptance.site import BARE, RouterProcess, Site, site
 
 BAD_TABLE = 78
 
@@ -29,15 +28,6 @@ def refusal(place: Site, table: Path, **environment: str) -> str:
     return router.text()
 
 
-def test_a_port_that_is_taken(place: Site) -> None:
-    with udp(ROUTER) as taken:
-        place.listen = taken.getsockname()[1]
-        table = place.table()
-        text = refusal(place, table)
-    assert f"{table}:7:14: listener 'rover' cannot use {ROUTER}:{place.listen}" in text
-    assert f"(pid {os.getpid()}) has the port" in text
-
-
 def test_a_metrics_port_that_is_taken(place: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         place.metrics = taken.getsockname()[1]
@@ -45,22 +35,6 @@ def test_a_metrics_port_that_is_taken(place: Site) -> None:
         text = refusal(place, table)
     assert f"{table}:4:12: metrics cannot be served at 127.0.0.1:{place.metrics}" in text
     assert f"(pid {os.getpid()}) has the port" in text
-
-
-def test_a_table_with_errors_shows_all_of_them(place: Site) -> None:
-    errors = """\
-routes:
-  imu_info:
-    destinations: [bassestation]
-  gps_info:
-    source: sensorboard
-"""
-    table = place.table(ROVER + errors)
-    text = refusal(place, table)
-    assert f"{table}:16:20: error[unknown-endpoint]" in text
-    assert "did you mean 'basestation'?" in text
-    assert f"{table}:18:13: error[unknown-endpoint]" in text
-    assert "did you mean 'sensor_board'?" in text
 
 
 OTHER_COMMS = """\
@@ -81,23 +55,8 @@ def test_comms_interfaces_that_are_not_those_of_the_table(place: Site) -> None:
     package.mkdir(parents=True)
     (package.parent / "__init__.py").touch()
     (package / "__init__.py").write_text(OTHER_COMMS)
-    topic = """\
-version: 1
-envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-listen:
-  rover:
-    address: 127.0.0.5:{listen}
-endpoints:
-{endpoints}
-routes:
-  ph_info:
-    source: sensor_board
-    topics:
-      - topic: ph_data
-        type: comms/msg/SensorBoardPHInfo
-        fields: auto
-"""
-    table = place.table(topic)
+    topic = "{{topic: ph_data, type: comms/msg/SensorBoardPHInfo, fields: auto}}"
+    table = place.table(BARE + f"routes: {{{{ph_info: {{{{source: sensor_board, topics: [{topic}]}}}}}}}}\n")
     text = refusal(place, table, PYTHONPATH=str(package.parent.parent))
-    assert f"{table}:17:16: comms/msg/SensorBoardPHInfo as installed is not what the table was compiled for" in text
+    assert f"{table}:12:59: comms/msg/SensorBoardPHInfo as installed is not what the table was compiled for" in text
     assert "installed: double ph_value" in text

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.acceptance.payloads import generated
-from tests.acceptance.site import RouterProcess, Site, key, site, wait_until
+from tests.acceptance.site import BARE, RouterProcess, Site, key, site, wait_until
 from tests.gateway.browser import Browser, Page, executable
 
 PROGRAM = executable()
@@ -18,16 +18,7 @@ pytestmark = [
     pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
 ]
 
-TABLE = """\
-version: 1
-envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: "127.0.0.1:{metrics}"}}
-listen: {{rover: {{address: "127.0.0.5:{listen}"}}}}
-endpoints:
-{endpoints}
-routes:
-  ph_info: {{source: sensor_board, destinations: [basestation]}}
-"""
+TABLE = BARE + "routes: {{ph_info: {{source: sensor_board, destinations: [basestation]}}}}\n"
 HOSTS = {"sensor_board": "127.0.0.30", "basestation": "127.0.0.10"}
 RECEIVED = "[...document.querySelectorAll('#tiles small')][0].textContent"
 PH = next(generated("ph_info")).datagram

@@ -80,14 +80,6 @@ def test_who_does_not_read_his_tap_misses_datagrams_and_is_told_how_many(rover: 
     assert seen + missed == arrived
 
 
-def test_a_program_can_tap_as_well(rover: Rover) -> None:
-    with tap(f"http://127.0.0.1:{rover.site.metrics}", ["imu_info"]) as batches:
-        rover.site.send("sensor_board", GPS, IMU)
-        while not (batch := next(batches)):
-            pass
-        assert [getattr(each, "data", None) for each in batch] == [IMU]
-
-
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
