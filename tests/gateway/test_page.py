@@ -245,13 +245,15 @@ def test_a_topic_plotted_stays_plotted_while_another_is_looked_at(gateway: FakeG
     page.until("document.querySelector('#legend').innerText.includes('/a x: 4 (min 1, max 4)')")
 
 
-@pytest.mark.parametrize("values", [[1e308, -1e308], [5e-324, 0.0], [1e9, 1e9 + 1e-7], [None], [2**64 - 1]])
-def test_extreme_numbers_are_plotted(gateway: FakeGateway, page: Page, values: list[float]) -> None:
-    gateway.data("/a", {"x": values[0]})
-    choose(page, "/a")
-    tick(page, "/a", "x")
-    for value in values:
-        gateway.data("/a", {"x": value})
+def test_extreme_numbers_are_plotted(gateway: FakeGateway, page: Page) -> None:
+    extremes: list[list[Any]] = [[1e308, -1e308], [5e-324, 0.0], [1e9, 1e9 + 1e-7], [None], [2**64 - 1]]
+    for number, values in enumerate(extremes):
+        topic = f"/extreme_{number}"
+        gateway.data(topic, {"x": values[0]})
+        choose(page, topic)
+        tick(page, topic, "x")
+        for value in values:
+            gateway.data(topic, {"x": value})
     gateway.data("/done", {})
     page.until(f"{row('/done')} !== null")
     page.evaluate("render()")
@@ -314,45 +316,38 @@ def choose_target(page: Page, topic: str) -> None:
     page.evaluate(f"{select}.value = {json.dumps(topic)}; {select}.dispatchEvent(new Event('change'))")
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "problem"),
-    [
-        ("level", "256", "level: must be from 0 to 255"),
-        ("level", "1.5", "level: must be a whole number"),
-        ("level", "", "level: must be a number"),
-        ("level", "1,000", "level: must be a number"),
-        ("id", "18446744073709551616", "id: must be from 0 to 18446744073709551615"),
-        ("gains", "[1, 1e39]", "gains[1]: is too large for a float32"),
-        ("gains", "[1, null]", "gains[1]: must be a number"),
-        ("gains", "1", "gains: must be an array"),
-        ("gains", "[1", "gains: must be an array"),
-    ],
-)
-def test_what_does_not_fit_is_not_sent(gateway: FakeGateway, page: Page, name: str, text: str, problem: str) -> None:
+def test_what_does_not_fit_is_not_sent(gateway: FakeGateway, page: Page) -> None:
     choose_target(page, "/mode")
-    page.type(f"[data-field={name}]", text)
-    page.key("Enter") if name != "gains" else page.click("[form=form]")
-    page.until(f"document.querySelector('#sent').textContent.includes({json.dumps('Not sent. ' + problem)})")
-    assert page.evaluate(f"document.querySelector('[data-field={name}]').ariaInvalid") == "true"
+    for name, text, fitting, problem in (
+        ("level", "256", "1", "level: must be from 0 to 255"),
+        ("level", "1.5", "1", "level: must be a whole number"),
+        ("level", "", "1", "level: must be a number"),
+        ("level", "1,000", "1", "level: must be a number"),
+        ("id", "18446744073709551616", "1", "id: must be from 0 to 18446744073709551615"),
+        ("gains", "[1, 1e39]", "[]", "gains[1]: is too large for a float32"),
+        ("gains", "[1, null]", "[]", "gains[1]: must be a number"),
+        ("gains", "1", "[]", "gains: must be an array"),
+        ("gains", "[1", "[]", "gains: must be an array"),
+    ):
+        page.type(f"[data-field={name}]", text)
+        page.key("Enter") if name != "gains" else page.click("[form=form]")
+        page.until(f"document.querySelector('#sent').textContent.includes({json.dumps('Not sent. ' + problem)})")
+        assert page.evaluate(f"document.querySelector('[data-field={name}]').ariaInvalid") == "true"
+        page.type(f"[data-field={name}]", fitting)
     assert gateway.received.empty()
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
+def test_json_that_does_not_fit_is_not_sent(gateway: FakeGateway, page: Page) -> None:
+    choose_target(page, "/mode")
+    page.click("#as-json")
+    for change, problem in (
         ({"extra": 1}, "extra: there is no such field"),
         ({"name": 5}, "name: must be text"),
         ({"is_armed": 1}, "is_armed: must be true or false"),
-    ],
-)
-def test_json_that_does_not_fit_is_not_sent(
-    gateway: FakeGateway, page: Page, change: dict[str, Any], problem: str
-) -> None:
-    choose_target(page, "/mode")
-    page.click("#as-json")
-    page.type("#json", json.dumps({**MIXED["example"], **change}))  # type: ignore[dict-item]
-    page.click("[form=form]")
-    page.until(f"document.querySelector('#sent').textContent.includes({json.dumps('Not sent. ' + problem)})")
+    ):
+        page.type("#json", json.dumps(MIXED["example"] | change))  # type: ignore[operator]
+        page.click("[form=form]")
+        page.until(f"document.querySelector('#sent').textContent.includes({json.dumps('Not sent. ' + problem)})")
     assert gateway.received.empty()
 
 
@@ -518,20 +513,12 @@ def test_every_control_has_a_name_for_assistive_technology(gateway: FakeGateway,
         for node in nodes
         if node.get("role", {}).get("value") in controls
     ]
-    assert {role for role, _ in roles} >= {
-        "button",
-        "checkbox",
-        "combobox",
-        "image",
-        "searchbox",
-        "spinbutton",
-        "textbox",
-    }
+    assert {role for role, _ in roles} == controls
     assert [role for role, name in roles if not name.strip()] == []
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_follows_the_colour_scheme(page: Page, scheme: str) -> None:
-    page.prefer(scheme)
-    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert (sum(map(int, re.findall(r"\d+", ground))) > 600) is (scheme == "light")
+def test_the_page_follows_the_colour_scheme(page: Page) -> None:
+    for scheme in ("light", "dark"):
+        page.prefer(scheme)
+        ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (sum(map(int, re.findall(r"\d+", ground))) > 600) is (scheme == "light")

@@ -192,6 +192,7 @@ async def test_a_message_has_to_end_in_time_although_a_byte_comes_now_and_then(
                     break
                 await slow.send(piece)
                 await asyncio.sleep(0.05)
+            await until(lambda: events.gone)
             assert [client.label for client in events.gone] == [slow.label]
             assert [client.label for client in events.clients] == [silent.label]
             assert events.said == []
@@ -207,7 +208,7 @@ async def test_the_time_is_for_each_message_where_one_follows_the_other(
 ) -> None:
     """Also where what comes at a time always ends in the middle of a message."""
     monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
-    monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.3)
+    monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.5)
     message = framed(kind, b"abc")
     events = Events()
     transport = transport_of(kind, events)
