@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from contextlib import suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 
 from router.gateway.transport.stream import Limits, StreamTransport
 from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.websocket import WebsocketTransport
 from router.table.addresses import Address
+from tests.gateway.transport_events import Events, opened
 
 KINDS = ("packets", "lines", "websocket")
 ANY = Address("127.0.0.1", 0)
@@ -24,10 +26,19 @@ CLOSE = 8
 """The opcode of the frame that ends a websocket."""
 
 
-def transport_of(kind: str, events: object, limits: Limits = TEN, address: Address = ANY) -> StreamTransport:
+def transport_of(kind: str, events: Events, limits: Limits = TEN, address: Address = ANY) -> StreamTransport:
     if kind == "websocket":
-        return WebsocketTransport(address, events, limits, text=False, page=b"")  # type: ignore[arg-type]
-    return TcpTransport(address, events, limits, prefixed=kind == "packets")  # type: ignore[arg-type]
+        return WebsocketTransport(address, events, limits, text=False, page=b"")
+    return TcpTransport(address, events, limits, prefixed=kind == "packets")
+
+
+@asynccontextmanager
+async def served(kind: str, limits: Limits = TEN) -> AsyncIterator[tuple[StreamTransport, Events]]:
+    """An open transport, and what it tells."""
+    events = Events()
+    transport = transport_of(kind, events, limits)
+    async with opened(transport):
+        yield transport, events
 
 
 def framed(kind: str, *messages: bytes) -> bytes:

@@ -20,7 +20,7 @@ from router.gateway.transport.arrival import AWAY_NS, CATCH_UP_NS, LoopClock
 from router.gateway.transport.zenoh import ZenohTransport
 from router.table.model import ZenohSettings
 from tests.gateway.asynchronous import asynchronous, until
-from tests.gateway.stream_peers import GREETING, KINDS, framed, join, transport_of
+from tests.gateway.stream_peers import GREETING, KINDS, framed, join, served
 from tests.gateway.transport_events import Events, opened
 from tests.ports import free_port
 
@@ -97,9 +97,7 @@ class TestStreams:
     @asynchronous
     async def test_all_that_waited_while_the_loop_was_away_is_as_old_as_that(self, kind: str) -> None:
         """More than is handled in one turn."""
-        events = Events()
-        transport = transport_of(kind, events)
-        async with opened(transport):
+        async with served(kind) as (transport, events):
             peer = await join(kind, transport)
             await until(lambda: events.clients)
             peer.writer.write(framed(kind, *[b"stop"] * 100))
@@ -111,9 +109,7 @@ class TestStreams:
 
     @asynchronous
     async def test_so_is_what_a_client_said_that_came_meanwhile(self, kind: str) -> None:
-        events = Events()
-        transport = transport_of(kind, events)
-        async with opened(transport):
+        async with served(kind) as (transport, events):
             assert transport.address is not None
             with socket.create_connection(transport.address) as peer:
                 peer.sendall(GREETINGS[kind] + framed(kind, b"stop"))
@@ -127,9 +123,7 @@ class TestStreams:
         self, monkeypatch: pytest.MonkeyPatch, kind: str
     ) -> None:
         monkeypatch.setattr(gateway_arrival, "AWAY_NS", 10**12)
-        events = Events()
-        transport = transport_of(kind, events)
-        async with opened(transport):
+        async with served(kind) as (transport, events):
             peer = await join(kind, transport)
             sent = wall_ns()
             await peer.say(b"go")

@@ -15,7 +15,7 @@ from router.gateway.transport import stream as gateway_stream
 from router.gateway.transport.base import HIGH_WATER, LOW_WATER, Client
 from router.gateway.transport.stream import Limits
 from tests.gateway.asynchronous import PATIENCE_SECONDS, asynchronous, until
-from tests.gateway.stream_peers import KINDS, MOST, framed, join, transport_of, websocket_frame
+from tests.gateway.stream_peers import KINDS, MOST, framed, join, served, transport_of, websocket_frame
 from tests.gateway.transport_events import Events, data, opened, resident_kib
 
 EACH_KIND = pytest.mark.parametrize("kind", KINDS)
@@ -26,9 +26,7 @@ EACH_KIND = pytest.mark.parametrize("kind", KINDS)
 async def test_a_large_message_arrives_whole_between_small_ones_while_others_are_served(kind: str) -> None:
     large = b"x" * 7_000_000
     messages = [b"before", large, b"after", large[:70_000], b"end"]
-    events = Events()
-    transport = transport_of(kind, events)
-    async with opened(transport):
+    async with served(kind) as (transport, events):
         peer = await join(kind, transport)
         await until(lambda: events.clients)
         events.clients[0].write([data(message) for message in messages])
@@ -47,9 +45,7 @@ async def test_a_large_message_arrives_whole_between_small_ones_while_others_are
 @asynchronous
 async def test_clients_that_stand_still_hold_up_nobody_and_cost_no_memory_of_their_own(kind: str) -> None:
     """Fifty of them, each with 7 MB to get: the pieces are shared."""
-    events = Events()
-    transport = transport_of(kind, events, Limits(51, 51, MOST))
-    async with opened(transport):
+    async with served(kind, Limits(51, 51, MOST)) as (transport, events):
         still = [await join(kind, transport) for _ in range(50)]
         for each in still:
             each.stand_still()
@@ -74,8 +70,6 @@ async def test_clients_that_stand_still_hold_up_nobody_and_cost_no_memory_of_the
 async def test_a_slow_client_is_written_to_while_it_takes_and_told_when_it_has_drained(kind: str) -> None:
     """As a service does it: nothing over HIGH_WATER, and on from `drained`."""
     message, wanted, sent = b"x" * 9996, 400, 0
-    events = Events()
-    transport = transport_of(kind, events)
 
     def send(client: Client) -> None:
         nonlocal sent
@@ -87,8 +81,8 @@ async def test_a_slow_client_is_written_to_while_it_takes_and_told_when_it_has_d
         assert client.backlog() < LOW_WATER
         send(client)
 
-    events.on_drained = go_on
-    async with opened(transport):
+    async with served(kind) as (transport, events):
+        events.on_drained = go_on
         peer = await join(kind, transport)
         await until(lambda: events.clients)
         send(events.clients[0])
@@ -106,10 +100,8 @@ async def test_a_client_that_takes_nothing_for_long_is_closed_and_told(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(gateway_stream, "STALLED_SECONDS", 0.3)
-    events = Events()
-    transport = transport_of(kind, events)
     with capture_logs() as logs:
-        async with opened(transport):
+        async with served(kind) as (transport, events):
             peer = await join(kind, transport)
             peer.stand_still()
             await until(lambda: events.clients)
@@ -123,9 +115,7 @@ async def test_a_client_that_takes_nothing_for_long_is_closed_and_told(
 @EACH_KIND
 @asynchronous
 async def test_a_client_that_is_killed_leaves(kind: str) -> None:
-    events = Events()
-    transport = transport_of(kind, events)
-    async with opened(transport):
+    async with served(kind) as (transport, events):
         peer = await join(kind, transport)
         await until(lambda: events.clients)
         [client] = events.clients
@@ -141,10 +131,8 @@ async def test_a_client_that_is_killed_leaves(kind: str) -> None:
 @EACH_KIND
 @asynchronous
 async def test_places_are_limited_for_each_host_and_for_all(kind: str) -> None:
-    events = Events()
-    transport = transport_of(kind, events, Limits(4, 3, MOST))
     with capture_logs() as logs:
-        async with opened(transport):
+        async with served(kind, Limits(4, 3, MOST)) as (transport, events):
             peers = [await join(kind, transport) for _ in range(3)]
             await until(lambda: len(events.clients) == 3)
             refused = await join(kind, transport)
@@ -181,10 +169,8 @@ async def test_a_message_has_to_end_in_time_although_a_byte_comes_now_and_then(
 ) -> None:
     monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
     monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.2)
-    events = Events()
-    transport = transport_of(kind, events)
     with capture_logs() as logs:
-        async with opened(transport):
+        async with served(kind) as (transport, events):
             slow, silent = [await join(kind, transport) for _ in range(2)]
             await until(lambda: len(events.clients) == 2)
             for piece in pieces:
@@ -210,9 +196,7 @@ async def test_the_time_is_for_each_message_where_one_follows_the_other(
     monkeypatch.setattr(gateway_stream, "WATCH_SECONDS", 0.02)
     monkeypatch.setattr(gateway_stream, "MESSAGE_SECONDS", 0.5)
     message = framed(kind, b"abc")
-    events = Events()
-    transport = transport_of(kind, events)
-    async with opened(transport):
+    async with served(kind) as (transport, events):
         peer = await join(kind, transport)
         await until(lambda: events.clients)
         stream = message * 7
@@ -236,10 +220,8 @@ async def test_the_time_is_for_each_message_where_one_follows_the_other(
 )
 @asynchronous
 async def test_what_is_too_long_is_refused_and_its_sender_closed(kind: str, hostile: bytes) -> None:
-    events = Events()
-    transport = transport_of(kind, events)
     with capture_logs() as logs:
-        async with opened(transport):
+        async with served(kind) as (transport, events):
             peer = await join(kind, transport)
             await peer.say(b"x" * MOST)
             await peer.send(hostile)
@@ -254,9 +236,7 @@ async def test_what_is_too_long_is_refused_and_its_sender_closed(kind: str, host
 @EACH_KIND
 @asynchronous
 async def test_a_port_that_is_taken_is_refused_with_who_has_it_and_free_again_at_once_after_closing(kind: str) -> None:
-    events = Events()
-    first = transport_of(kind, events)
-    async with opened(first):
+    async with served(kind) as (first, events):
         assert first.address is not None
         second = transport_of(kind, Events(), address=first.address)
         with pytest.raises(StartError, match=r"127\.0\.0\.1:\d+ cannot be used: .*\(pid \d+\) has the port"):
@@ -275,18 +255,16 @@ async def test_a_port_that_is_taken_is_refused_with_who_has_it_and_free_again_at
 @EACH_KIND
 @asynchronous
 async def test_a_fault_of_ours_is_told_and_closes_that_client_alone(kind: str) -> None:
-    events = Events()
     faults: list[Exception] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: faults.append(context["exception"]))
-    transport = transport_of(kind, events)
 
     def stumble(client: Client, data: bytes, arrived_ns: int) -> None:
         if data == b"stumble":
             raise ZeroDivisionError
         events.said.append(data)
 
-    events.received = stumble  # type: ignore[method-assign]
-    async with opened(transport):
+    async with served(kind) as (transport, events):
+        events.received = stumble  # type: ignore[method-assign]
         peer, other = [await join(kind, transport) for _ in range(2)]
         await until(lambda: len(events.clients) == 2)
         await peer.say(b"stumble")

@@ -9,15 +9,13 @@ from hypothesis import strategies as st
 
 from router.gateway.transport.stream import READ_PER_TURN
 from tests.gateway.asynchronous import asynchronous, until
-from tests.gateway.stream_peers import MOST, framed, join, transport_of
-from tests.gateway.transport_events import Events, data, opened
+from tests.gateway.stream_peers import MOST, framed, join, served
+from tests.gateway.transport_events import data
 
 
 @asynchronous
 async def test_packets_go_both_ways_each_preceded_by_its_length() -> None:
-    events = Events()
-    transport = transport_of("packets", events)
-    async with opened(transport):
+    async with served("packets") as (transport, events):
         peer = await join("packets", transport)
         await peer.send(b"\3\0\0\0one" + b"\0\0\0\0" + b"\xe8\3\0\0" + b"x" * MOST)
         await until(lambda: len(events.said) == 3)
@@ -32,9 +30,7 @@ async def test_packets_go_both_ways_each_preceded_by_its_length() -> None:
 
 @asynchronous
 async def test_lines_go_both_ways_and_several_clients_get_the_same() -> None:
-    events = Events()
-    transport = transport_of("lines", events)
-    async with opened(transport):
+    async with served("lines") as (transport, events):
         peers = [await join("lines", transport) for _ in range(3)]
         await until(lambda: len(events.clients) == 3)
         transport.write_all(events.clients, [data(b"one"), data(b"two")])
@@ -50,9 +46,7 @@ async def test_lines_go_both_ways_and_several_clients_get_the_same() -> None:
 
 @asynchronous
 async def test_one_that_sends_without_end_does_not_keep_others_waiting() -> None:
-    events = Events()
-    transport = transport_of("lines", events)
-    async with opened(transport):
+    async with served("lines") as (transport, events):
         flood, other = [await join("lines", transport) for _ in range(2)]
         await until(lambda: len(events.clients) == 2)
         flood.writer.write(b"\n" * 20 * READ_PER_TURN)
@@ -72,9 +66,7 @@ async def test_it_does_not_matter_how_the_network_cuts_what_is_sent(
     messages: list[bytes], cuts: list[int], kind: str
 ) -> None:
     sent = framed(kind, *messages)
-    events = Events()
-    transport = transport_of(kind, events)
-    async with opened(transport):
+    async with served(kind) as (transport, events):
         peer = await join(kind, transport)
         at = 0
         while at < len(sent):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
 
 import pytest
 from structlog.testing import capture_logs
@@ -38,6 +39,15 @@ def local() -> Address:
     return Address("127.0.0.1", free_port())
 
 
+@asynccontextmanager
+async def served(headset: socket.socket) -> AsyncIterator[tuple[UdpTransport, Events]]:
+    """An open transport, and what it tells."""
+    events = Events()
+    transport = UdpTransport(address_of(headset), local(), events)
+    async with opened(transport):
+        yield transport, events
+
+
 async def hear(peer: socket.socket) -> tuple[bytes, tuple[str, int]]:
     heard: tuple[bytes, tuple[str, int]] = await asyncio.to_thread(peer.recvfrom, 65536)
     return heard
@@ -45,9 +55,7 @@ async def hear(peer: socket.socket) -> tuple[bytes, tuple[str, int]]:
 
 @asynchronous
 async def test_each_frame_is_a_datagram_from_the_local_address(headset: socket.socket) -> None:
-    events = Events()
-    transport = UdpTransport(address_of(headset), local(), events)
-    async with opened(transport):
+    async with served(headset) as (transport, events):
         [client] = events.clients
         assert client.label == str(address_of(headset))
         transport.write_all([client], [data(b"one"), data(b"x" * 65507)])
@@ -61,9 +69,7 @@ async def test_each_frame_is_a_datagram_from_the_local_address(headset: socket.s
 
 @asynchronous
 async def test_the_clients_host_is_heard_from_any_port_and_nobody_else(headset: socket.socket) -> None:
-    events = Events()
-    transport = UdpTransport(address_of(headset), local(), events)
-    async with opened(transport):
+    async with served(headset) as (transport, events):
         assert transport.address is not None
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as restarted:
             restarted.sendto(b"hello", transport.address)
@@ -92,9 +98,7 @@ async def test_without_a_local_address_it_sends_from_any_port_and_hears_nothing(
 @asynchronous
 async def test_what_was_said_counts_from_when_the_kernel_got_it(headset: socket.socket) -> None:
     """Which begins to stamp a little after it was asked to."""
-    events = Events()
-    transport = UdpTransport(address_of(headset), local(), events)
-    async with opened(transport):
+    async with served(headset) as (transport, events):
         assert transport.address is not None
         for number in range(1, 100):
             headset.sendto(b"go", transport.address)
@@ -134,9 +138,7 @@ async def test_a_client_that_is_not_there_costs_nothing() -> None:
 
 @asynchronous
 async def test_what_cannot_be_sent_is_told_once_for_all_of_a_burst(headset: socket.socket) -> None:
-    events = Events()
-    transport = UdpTransport(address_of(headset), local(), events)
-    async with opened(transport):
+    async with served(headset) as (_, events):
         [client] = events.clients
         client.write([data(b"x" * 65508), data(b"fits"), data(b"x" * 65508)])
         assert (await hear(headset))[0] == b"fits"
@@ -148,9 +150,7 @@ async def test_what_cannot_be_sent_is_told_once_for_all_of_a_burst(headset: sock
 @asynchronous
 async def test_a_burst_is_paced_and_goes_out_in_order(headset: socket.socket) -> None:
     headset.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)  # what is late here is this test's own thread
-    events = Events()
-    transport = UdpTransport(address_of(headset), local(), events)
-    async with opened(transport):
+    async with served(headset) as (_, events):
         [client] = events.clients
         frames = [data(b"%06d" % number + b"x" * 1394) for number in range(1000)]
         reading = asyncio.get_running_loop().run_in_executor(None, lambda: [headset.recv(2000) for _ in frames])
@@ -168,9 +168,7 @@ async def test_a_burst_is_paced_and_goes_out_in_order(headset: socket.socket) ->
 
 @asynchronous
 async def test_large_datagrams_are_paced_by_their_bytes(headset: socket.socket) -> None:
-    events = Events()
-    transport = UdpTransport(address_of(headset), local(), events)
-    async with opened(transport):
+    async with served(headset) as (_, events):
         events.clients[0].write([data(b"x" * 60_000)] * 10)
         assert events.clients[0].backlog() == 7 * 60_000
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import base64
 import re
-from contextlib import AsyncExitStack, suppress
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from functools import partial
 from hashlib import sha256
 
 import pytest
@@ -23,12 +25,17 @@ from tests.gateway.transport_events import Events, data, opened
 PAGE = b"<!doctype html><style>a{}</style><p>\xc3\xa4</p><script>let a;</script><script>let b;</script>"
 
 
-def documents(events: Events, max_clients: int = 10) -> WebsocketTransport:
-    return WebsocketTransport(ANY, events, Limits(max_clients, max_clients, MOST), text=True, page=PAGE)
+@asynccontextmanager
+async def served(max_clients: int, *, text: bool) -> AsyncIterator[tuple[WebsocketTransport, Events]]:
+    """An open transport, and what it tells."""
+    events = Events()
+    transport = WebsocketTransport(ANY, events, Limits(max_clients, max_clients, MOST), text=text, page=PAGE)
+    async with opened(transport):
+        yield transport, events
 
 
-def packets(events: Events) -> WebsocketTransport:
-    return WebsocketTransport(ANY, events, Limits(10, 10, MOST), text=False, page=PAGE)
+documents = partial(served, 10, text=True)
+packets = partial(served, 10, text=False)
 
 
 def dial(transport: WebsocketTransport, path: str = "/", host: str = "", **settings: str) -> connect:
@@ -56,9 +63,7 @@ async def fetch(transport: WebsocketTransport, path: str, *headers: str) -> tupl
 
 @asynchronous
 async def test_frames_of_one_writing_are_one_text_message_joined_by_newlines() -> None:
-    events = Events()
-    transport = documents(events)
-    async with opened(transport), dial(transport) as one, dial(transport, "/any/path?x=1") as other:
+    async with documents() as (transport, events), dial(transport) as one, dial(transport, "/any/path?x=1") as other:
         await until(lambda: len(events.clients) == 2)
         assert events.clients[0].label == "{}:{}".format(*one.local_address)
         assert one.protocol.extensions == []  # nothing is compressed
@@ -76,9 +81,7 @@ async def test_frames_of_one_writing_are_one_text_message_joined_by_newlines() -
 
 @asynchronous
 async def test_packets_are_binary_messages_of_their_own() -> None:
-    events = Events()
-    transport = packets(events)
-    async with opened(transport), dial(transport) as end:
+    async with packets() as (transport, events), dial(transport) as end:
         await until(lambda: events.clients)
         events.clients[0].write([data(b"one"), data(b""), data(b"x" * 200_000)])
         assert [await end.recv() for _ in range(3)] == [b"one", b"", b"x" * 200_000]
@@ -87,9 +90,7 @@ async def test_packets_are_binary_messages_of_their_own() -> None:
 @asynchronous
 async def test_a_large_message_is_cut_so_that_pings_pass_and_arrives_whole() -> None:
     large = "ä€" * 1_400_000
-    events = Events()
-    transport = documents(events)
-    async with opened(transport), dial(transport) as end:
+    async with documents() as (transport, events), dial(transport) as end:
         await until(lambda: events.clients)
         [client] = events.clients
         client.write([data(large.encode())])
@@ -108,9 +109,7 @@ async def test_a_large_message_is_cut_so_that_pings_pass_and_arrives_whole() -> 
 async def test_a_client_that_does_not_answer_pings_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gateway_websocket, "PING_SECONDS", 0.1)
     monkeypatch.setattr(gateway_websocket, "CLOSING_SECONDS", 0.1)
-    events = Events()
-    transport = documents(events)
-    async with opened(transport):
+    async with documents() as (transport, events):
         peer = await join("websocket", transport)
         peer.stand_still()
         await until(lambda: len(events.gone) == 1)
@@ -120,9 +119,7 @@ async def test_a_client_that_does_not_answer_pings_is_closed(monkeypatch: pytest
 @asynchronous
 async def test_a_client_that_pings_without_end_and_reads_nothing_is_closed() -> None:
     pings = (b"\x89\xfdmask" + b"x" * 125) * 100
-    events = Events()
-    transport = documents(events)
-    async with opened(transport):
+    async with documents() as (transport, events):
         peer = await join("websocket", transport)
         peer.stand_still()
         with suppress(ConnectionError):
@@ -134,9 +131,7 @@ async def test_a_client_that_pings_without_end_and_reads_nothing_is_closed() -> 
 
 @asynchronous
 async def test_clients_that_leave_in_either_way_are_gone() -> None:
-    events = Events()
-    transport = documents(events)
-    async with opened(transport):
+    async with documents() as (transport, events):
         async with dial(transport) as end:
             await until(lambda: len(events.clients) == 1)
             end.transport.abort()
@@ -155,9 +150,7 @@ async def test_clients_that_leave_in_either_way_are_gone() -> None:
 
 @asynchronous
 async def test_a_message_that_is_too_long_is_refused_and_its_sender_closed() -> None:
-    events = Events()
-    transport = documents(events)
-    async with opened(transport), dial(transport) as end:
+    async with documents() as (transport, events), dial(transport) as end:
         await end.send("x" * MOST)
         await end.send("x" * (MOST + 1))
         await until(lambda: events.gone)
@@ -168,8 +161,7 @@ async def test_a_message_that_is_too_long_is_refused_and_its_sender_closed() -> 
 
 @asynchronous
 async def test_the_page_is_given_with_a_policy_that_lets_it_nothing_from_outside() -> None:
-    transport = documents(Events())
-    async with opened(transport):
+    async with documents() as (transport, _):
         status, head, body = await fetch(transport, "/")
         assert (status, body) == (200, PAGE)
         assert "Content-Type: text/html; charset=utf-8" in head
@@ -205,9 +197,7 @@ ORIGINS = [
 
 @asynchronous
 async def test_a_page_of_another_host_may_not_connect() -> None:
-    events = Events()
-    transport = documents(events)
-    async with opened(transport):
+    async with documents() as (transport, events):
         for host, origin, welcome in ORIGINS:
             dialling = dial(transport, host=host, additional_headers={"Origin": origin})  # type: ignore[arg-type]
             if welcome:
@@ -222,10 +212,8 @@ async def test_a_page_of_another_host_may_not_connect() -> None:
 
 @asynchronous
 async def test_a_client_beyond_the_most_is_sent_away_and_told_but_may_see_the_page() -> None:
-    events = Events()
-    transport = documents(events, max_clients=1)
     with capture_logs() as logs:
-        async with opened(transport), dial(transport):
+        async with served(1, text=True) as (transport, events), dial(transport):
             await until(lambda: events.clients)
             async with dial(transport) as second:
                 with pytest.raises(ConnectionClosed, match="1013"):
@@ -241,10 +229,8 @@ async def test_a_client_beyond_the_most_is_sent_away_and_told_but_may_see_the_pa
 )
 @asynchronous
 async def test_who_does_not_speak_http_does_not_hold_up_closing(greeting: bytes) -> None:
-    events = Events()
-    transport = documents(events)
     with capture_logs() as logs:
-        async with opened(transport):
+        async with documents() as (transport, events):
             assert transport.address is not None
             _, writer = await asyncio.open_connection(*transport.address)
             writer.write(greeting)
@@ -259,9 +245,7 @@ async def test_who_does_not_speak_http_does_not_hold_up_closing(greeting: bytes)
 
 @asynchronous
 async def test_clients_that_say_goodbye_hear_that_the_gateway_goes_away() -> None:
-    events = Events()
-    transport = documents(events)
-    async with AsyncExitStack() as stack, opened(transport):
+    async with AsyncExitStack() as stack, documents() as (transport, events):
         ends: list[ClientConnection] = [await stack.enter_async_context(dial(transport)) for _ in range(3)]
         await until(lambda: len(events.clients) == 3)
         await transport.close()
@@ -273,9 +257,7 @@ async def test_clients_that_say_goodbye_hear_that_the_gateway_goes_away() -> Non
 
 @asynchronous
 async def test_a_hundred_clients_come_at_once_and_all_get_the_same() -> None:
-    events = Events()
-    transport = documents(events, max_clients=100)
-    async with opened(transport), AsyncExitStack() as stack:
+    async with served(100, text=True) as (transport, events), AsyncExitStack() as stack:
         ends = await asyncio.gather(*(stack.enter_async_context(dial(transport)) for _ in range(100)))
         await until(lambda: len(events.clients) == 100)
         transport.write_all(events.clients, [data(b"hello")])
@@ -288,9 +270,7 @@ async def test_connections_of_one_host_without_a_websocket_take_no_room_from_oth
 ) -> None:
     monkeypatch.setattr(gateway_websocket, "STRANGERS", 10)
     monkeypatch.setattr(gateway_websocket, "STRANGERS_PER_HOST", 2)
-    events = Events()
-    transport = documents(events, max_clients=2)
-    async with opened(transport):
+    async with served(2, text=True) as (transport, events):
         first = await join("websocket", transport, "127.0.0.1")
         await until(lambda: len(events.clients) == 1)
         strangers = [await join("stranger", transport, "127.0.0.2") for _ in range(20)]
@@ -305,8 +285,7 @@ async def test_connections_of_one_host_without_a_websocket_take_no_room_from_oth
 @asynchronous
 async def test_a_handshake_has_to_end_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gateway_websocket, "MESSAGE_SECONDS", 0.2)
-    transport = documents(Events())
-    async with opened(transport):
+    async with documents() as (transport, _):
         peer = await join("stranger", transport)
         await peer.send(b"GET / HTTP/1.1\r\n")
         assert await peer.is_closed()
