@@ -9,6 +9,7 @@ import pytest
 
 from router.cli import BAD_TABLE, OK, main
 from router.compiler import Checked, check_table
+from router.compiler.lookup import Definitions
 from router.tools.explain import diff
 from tests.tables import ROUTES
 
@@ -30,8 +31,11 @@ gateways:
 """
 
 
+DEFINITIONS = Definitions()
+
+
 def checked(path: Path) -> Checked:
-    found = check_table(path)
+    found = check_table(path, definitions=DEFINITIONS)
     assert not found.has_errors, found.diagnostics
     return found
 
