@@ -17,7 +17,7 @@ from demo.recorded import first_of, recordings
 from demo.screen import open_screen
 from demo.verdict import Finding, judge
 from router.errors import RouterError, TransportError
-from router.observe.snapshot import Snapshot, parse_metrics
+from router.observe.snapshot import Snapshot
 from router.table.model import RouteTable
 from router.tools.running_router import metrics, url_of
 from router.tools.top import Window, view
@@ -115,7 +115,7 @@ class Demo:
     def _snapshot(self) -> Snapshot:
         self._check()
         try:
-            return parse_metrics(*metrics(self._url))
+            return metrics(self._url)
         except TransportError:
             self._check()  # a router that has ended has better words than a refused connection
             raise

@@ -12,7 +12,6 @@ from router.cli.tool_options import add_router_options, positive, running_url
 from router.errors import TransportError
 
 if TYPE_CHECKING:
-    from router.observe.snapshot import Snapshot
     from router.tools.top import Order
 
 ORDERS = ("table", "rate", "drops", "age", "latency")
@@ -42,29 +41,16 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def _snapshot(url: str) -> Snapshot:
-    from router.observe.snapshot import parse_metrics
-    from router.tools.running_router import metrics
-
-    text, at = metrics(url)
-    try:
-        found = parse_metrics(text, at)
-    except (ValueError, KeyError) as error:
-        raise TransportError(f"what answers at {url}/metrics is no router") from error
-    if not found.values:
-        raise TransportError(f"what answers at {url}/metrics is no router: it has no metrics of one")
-    return found
-
-
 def _show_once(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
 
+    from router.tools.running_router import metrics
     from router.tools.top import view
     from router.tools.top_view import page
 
-    before = _snapshot(url)
+    before = metrics(url)
     time.sleep(interval)
-    after = _snapshot(url)
+    after = metrics(url)
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
     console.print(page(view(before, after), order))
 
@@ -78,19 +64,20 @@ def _show(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
     from rich.live import Live
 
+    from router.tools.running_router import metrics
     from router.tools.top import Order, Window, view
     from router.tools.top_view import keys, screen
 
     console, orders = Console(), {each.key: each for each in Order}
     window, note = Window(), ""
-    window.add(_snapshot(url))
+    window.add(metrics(url))
     with Live(console=console, screen=True, auto_refresh=False) as live, keys() as wait_for_key:
         key, due = "", 0.0
         while key != "q":
             if time.monotonic() >= due:
                 due = time.monotonic() + interval
                 try:
-                    newest = _snapshot(url)
+                    newest = metrics(url)
                 except TransportError as error:
                     note = str(error)
                 else:

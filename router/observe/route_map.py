@@ -230,13 +230,6 @@ class RouteMap:
     measures: Measures
 
 
-class _Side(enum.IntEnum):
-    """The ends of an edge."""
-
-    START = 0
-    END = 1
-
-
 def route_map(table: RouteTable, measures: Measures = WIDE) -> RouteMap:
     """Lay a table out. Cases keep the order of the table; sources and targets are placed beside their cases."""
     nodes, edges = nodes_and_edges(table)
@@ -334,14 +327,22 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _curves(edges: Sequence[Edge], boxes: Mapping[str, Box], measures: Measures) -> Iterator[Curve]:
-    """Those that meet at a box stand beside each other there, in the order of their other ends, and cross less."""
-    heights = {}
-    for side in _Side:
-        for key, box in boxes.items():
-            met = [index for index, edge in enumerate(edges) if (edge.start, edge.end)[side] == key]
-            met.sort(key=lambda index: boxes[(edges[index].end, edges[index].start)[side]].y)
-            first = box.y + box.height / 2 - measures.port * (len(met) - 1) / 2
-            heights.update({(side, index): first + measures.port * place for place, index in enumerate(met)})
-    for index, edge in enumerate(edges):
-        start, end = boxes[edge.start], boxes[edge.end]
-        yield Curve(edge, start.x + start.width, heights[_Side.START, index], end.x, heights[_Side.END, index])
+    starts = _ports([(edge.start, edge.end) for edge in edges], boxes, measures)
+    ends = _ports([(edge.end, edge.start) for edge in edges], boxes, measures)
+    for edge, y0, y1 in zip(edges, starts, ends, strict=True):
+        yield Curve(edge, boxes[edge.start].x + boxes[edge.start].width, y0, boxes[edge.end].x, y1)
+
+
+def _ports(ends: Sequence[tuple[str, str]], boxes: Mapping[str, Box], measures: Measures) -> list[float]:
+    """Return how high each edge, of which a box and the one at its other end are given, meets the box.
+
+    Those that meet there stand beside each other in the order of their other ends, and cross less.
+    """
+    heights = [0.0] * len(ends)
+    for key, box in boxes.items():
+        met = [index for index, (own, _) in enumerate(ends) if own == key]
+        met.sort(key=lambda index: boxes[ends[index][1]].y)
+        first = box.y + box.height / 2 - measures.port * (len(met) - 1) / 2
+        for place, index in enumerate(met):
+            heights[index] = first + measures.port * place
+    return heights

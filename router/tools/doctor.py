@@ -14,7 +14,7 @@ from router.compiler import Checked, check_table
 from router.compiler.metrics import INTENDED_REASONS
 from router.compiler.program import Program
 from router.errors import Severity, TransportError, shown_path
-from router.observe.snapshot import Snapshot, parse_metrics
+from router.observe.snapshot import Snapshot
 from router.table import summary
 from router.table.model import RouteTable
 from router.table.units import duration
@@ -104,11 +104,10 @@ _SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """The metrics of a router that may run another version of `table` by now. `now` in seconds since the epoch."""
+    """The metrics of a router that may run another version of `table` by now."""
 
     table: RouteTable
     snapshot: Snapshot
-    now: float
 
     def findings(self) -> Iterator[CheckResult]:
         found = [*self._table(), *self._silent(), *self._lost(), *self._kept_away(), *self._deadmen()]
@@ -136,9 +135,9 @@ class Health:
             )
             if not seen:
                 yield warning("endpoints", f"{name} was never heard since the router started", remedy)
-            elif self.now - seen > endpoint.stale_after / 1e9:
+            elif self.snapshot.at - seen > endpoint.stale_after / 1e9:
                 limit = duration(endpoint.stale_after)
-                what = f"{name} is stale: silent for {self.now - seen:.0f} s, and more than {limit} is too long"
+                what = f"{name} is stale: silent for {self.snapshot.at - seen:.0f} s, and more than {limit} is too long"
                 yield problem("endpoints", what, remedy)
 
     def _lost(self) -> Iterator[CheckResult]:
@@ -187,7 +186,6 @@ def health(program: Program) -> Health | None:
     if table.metrics is None:
         return None
     try:
-        snapshot = parse_metrics(*metrics(url_of(table)))
-    except (TransportError, ValueError, KeyError):  # no answer, or another program's
+        return Health(table, metrics(url_of(table)))
+    except TransportError:  # no answer, or another program's
         return None
-    return Health(table, snapshot, snapshot.at) if snapshot.values else None

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 from router.errors import TransportError, UsageError
-from router.observe.snapshot import COLLECTED_AT
+from router.observe.snapshot import COLLECTED_AT, Snapshot, parse_metrics
 from router.observe.tap import Lost, StreamReader
 from router.recording.mirror import MirroredDatagram
 from router.table.model import RouteTable
@@ -50,8 +50,8 @@ def post(url: str, path: str, patience: float = PATIENCE) -> Answer:
         return Answer(response.status == http.client.OK, body)
 
 
-def metrics(url: str) -> tuple[str, float]:
-    """Return the text of /metrics, and when its numbers were read (s, wall clock).
+def metrics(url: str) -> Snapshot:
+    """Return the numbers of a running router, and when they were read (`at`: s, wall clock).
 
     Raises TransportError where nobody answers, or something else than a router.
     """
@@ -60,7 +60,14 @@ def metrics(url: str) -> tuple[str, float]:
         text = _read(response, url)
         if response.status != http.client.OK:
             raise TransportError(f"{url}/metrics: {response.status} {_first_line(text)}")
-        return text.decode(errors="replace"), _collected_at(response)
+    try:
+        at = float(response.headers.get(COLLECTED_AT) or time.time())
+        found = parse_metrics(text.decode(errors="replace"), at)
+    except (ValueError, KeyError) as error:
+        raise TransportError(f"what answers at {url}/metrics is no router") from error
+    if not found.values:
+        raise TransportError(f"what answers at {url}/metrics is no router: it has no metrics of one")
+    return found
 
 
 @contextmanager
@@ -119,14 +126,6 @@ def _read(response: http.client.HTTPResponse, url: str) -> bytes:
         return response.read()
     except (OSError, http.client.HTTPException) as error:
         raise TransportError(f"the router at {url} broke off: {error}") from error
-
-
-def _collected_at(response: http.client.HTTPResponse) -> float:
-    """A router may answer with numbers that are half a second old."""
-    try:
-        return float(response.headers[COLLECTED_AT])
-    except (TypeError, ValueError):  # no router, or an older one
-        return time.time()
 
 
 def _first_line(text: bytes) -> str:

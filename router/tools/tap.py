@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import Message
 
+from router.clock import wall_ns
 from router.compiler.expressions import ExpressionError, ParsedReads, Scope, check
 from router.compiler.expressions.kinds import BoolKind
 from router.compiler.namespace import NAMESPACE
@@ -206,24 +207,20 @@ class RunningTap:
             for each in batch:
                 if isinstance(each, Lost):
                     self.missed += each.number
-                elif (tapped := self._tapped(each)) is not None:
+                    continue
+                peer = self._name_of(each.peer, each.listener)
+                tapped = tapped_datagram(each.at, peer, each.data, self._wire)
+                if self._is_wanted(tapped, each.at):
                     shown.append(tapped)
             yield shown
 
-    def _tapped(self, seen: MirroredDatagram) -> TappedDatagram | None:
-        """None where it is not wanted."""
-        peer = self._name_of(seen.peer, seen.listener)
-        try:
-            decoded = self._wire.decode(seen.data)
-        except DecodeError as error:
-            is_wanted = not self._cases and self._condition is None
-            return TappedDatagram(_local_time(seen.at), peer, seen.data, None, str(error)) if is_wanted else None
-        case = decoded.case.name
+    def _is_wanted(self, tapped: TappedDatagram, at: int) -> bool:
+        if tapped.decoded is None:
+            return not self._cases and self._condition is None
+        case, payload = tapped.decoded.case.name, tapped.decoded.message
         if self._cases and case not in self._cases:
-            return None
-        if self._condition is not None and not self._condition.holds(case, decoded.message, peer, seen.at):
-            return None
-        return TappedDatagram(_local_time(seen.at), peer, seen.data, decoded)
+            return False
+        return self._condition is None or self._condition.holds(case, payload, tapped.peer, at)
 
 
 def listen_to_topic(listener: TopicListener) -> Iterator[TappedMessage]:
@@ -238,13 +235,12 @@ def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> 
     receiver.setblocking(True)
     while True:
         data, peer = receiver.recvfrom(LARGEST_DATAGRAM)
-        yield received(data, name_of(peer), wire)
+        yield tapped_datagram(wall_ns(), name_of(peer), data, wire)
 
 
-def received(data: bytes, peer: str, wire: Wire) -> TappedDatagram:
-    """A datagram that has just arrived."""
-    at = dt.datetime.now().astimezone()
+def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire) -> TappedDatagram:
+    """A datagram that was received at `at`, ns since 1970."""
     try:
-        return TappedDatagram(at, peer, data, wire.decode(data))
+        return TappedDatagram(_local_time(at), peer, data, wire.decode(data))
     except DecodeError as error:
-        return TappedDatagram(at, peer, data, None, str(error))
+        return TappedDatagram(_local_time(at), peer, data, None, str(error))

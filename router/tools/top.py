@@ -93,14 +93,13 @@ class View:
 class Window:
     """The snapshots of the last seconds, of one run of the router."""
 
-    def __init__(self, seconds: float = WINDOW) -> None:
-        self._seconds = seconds
+    def __init__(self) -> None:
         self._snapshots: deque[Snapshot] = deque()
 
     def add(self, newest: Snapshot) -> None:
         if self._snapshots and _is_of_another_run(self._snapshots[-1], newest):
             self._snapshots.clear()
-        while len(self._snapshots) > 1 and newest.at - self._snapshots[1].at >= self._seconds:
+        while len(self._snapshots) > 1 and newest.at - self._snapshots[1].at >= WINDOW:
             self._snapshots.popleft()
         self._snapshots.append(newest)
 

@@ -7,6 +7,7 @@ import socket
 import pytest
 
 from router.errors import TransportError, UsageError
+from router.observe.snapshot import Snapshot
 from router.tools.running_router import metrics
 from tests.ports import free_port
 from tests.tools.answering import COLLECTED_AT, answering
@@ -14,8 +15,9 @@ from tests.tools.answering import COLLECTED_AT, answering
 
 def test_metrics_are_asked_for_at_the_router_and_no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:1")
-    with answering("# nothing yet\n") as url:
-        assert metrics(url) == metrics(url.removeprefix("http://")) == ("# nothing yet\n", COLLECTED_AT)
+    found = Snapshot(COLLECTED_AT, {"kernel_drops": {("rover",): 3.0}})
+    with answering('router_kernel_drops_total{listener="rover"} 3\n') as url:
+        assert metrics(url) == metrics(url.removeprefix("http://")) == found
 
 
 def test_where_no_router_answers_is_a_network_fault() -> None:

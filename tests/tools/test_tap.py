@@ -10,7 +10,7 @@ import pytest
 from router.engine.wire import Wire
 from router.errors import UsageError
 from router.table.addresses import Address
-from router.tools.tap import Condition, listen, received
+from router.tools.tap import Condition, listen, tapped_datagram
 from router.tools.udp import open_udp
 from router.values import payload
 from tests.observe.fake_running import sim_program
@@ -22,24 +22,24 @@ def datagram(wire: Wire, *words: str) -> bytes:
 
 
 def test_a_line_tells_time_peer_case_and_fields(wire: Wire) -> None:
-    told = received(datagram(wire, "i32=5", "mode=MODE_ON"), "board", wire)
+    told = tapped_datagram(0, "board", datagram(wire, "i32=5", "mode=MODE_ON"), wire)
     assert told.line(with_hex=False).split(" ", 1)[1] == "board every_kind i32=5 mode=MODE_ON"
     assert told.line(with_hex=True).endswith("[0a0410056001]")
 
 
 def test_repairs_are_told(wire: Wire) -> None:
-    assert received(b"\x12", "board", wire).line(with_hex=False).endswith("(trimmed: 1 zeros put back)")
-    assert received(b"\x12\0\0\0", "board", wire).line(with_hex=False).endswith("(padded: 2 zeros taken off)")
+    assert tapped_datagram(0, "board", b"\x12", wire).line(with_hex=False).endswith("(trimmed: 1 zeros put back)")
+    assert tapped_datagram(0, "board", b"\x12\0\0\0", wire).line(with_hex=False).endswith("(padded: 2 zeros taken off)")
 
 
 def test_an_undecodable_datagram_is_shown_with_reason_and_bytes(wire: Wire) -> None:
-    told = received(b"\xff\xff", "127.0.0.1:5", wire)
+    told = tapped_datagram(0, "127.0.0.1:5", b"\xff\xff", wire)
     assert told.line(with_hex=False).split(" ", 1)[1] == "127.0.0.1:5 undecodable (malformed: no PBEnvelope): ffff"
     assert json.loads(told.json(with_hex=False))["hex"] == "ffff"
 
 
 def test_json_has_the_fields_by_their_proto_names(wire: Wire) -> None:
-    said = json.loads(received(datagram(wire, "point.x=3", "single=nan"), "board", wire).json(with_hex=False))
+    said = json.loads(tapped_datagram(0, "board", datagram(wire, "point.x=3", "single=nan"), wire).json(with_hex=False))
     assert said["fields"] == {"single": "NaN", "point": {"x": 3}}
     assert (said["case"], said["peer"], said["bytes"], "hex" in said) == ("every_kind", "board", 11, False)
 

@@ -132,7 +132,7 @@ def test_reasons_are_in_order_of_their_number() -> None:
 
 
 def test_a_window_gives_rates_over_its_last_seconds_only() -> None:
-    window, rates = Window(seconds=3.0), []
+    window, rates = Window(), []
     for at, imu in ((0, 0), (1, 10), (2, 20), (3, 60), (5, 140)):
         window.add(snapshot(at, imu))
         rates.append(view(*window.ends).routes[0].rate)
