@@ -45,7 +45,7 @@ def supervised(progress: Callable[[], int]) -> Iterator[None]:
         notify("READY=1")
         if (limit := _watchdog_ns()) is not None:
             faulthandler.enable()
-            thread = TimerThread("watchdog", monotonic_ns, _log_fault)
+            thread = TimerThread("watchdog", _log_fault)
             thread.add(Watchdog(progress, limit // _CHECKS, monotonic_ns()))
             thread.start()
             ending.callback(thread.stop)

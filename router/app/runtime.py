@@ -57,7 +57,7 @@ class Runtime:
         self._ros_args = ros_args
         self._tee = tee
         self._ros: RouterNode | None = None
-        self._receiving = ReceiveThread([], {}, MAX_DATAGRAM, self._coalescing_target, context.reporter.failed)
+        self._receiving = ReceiveThread(MAX_DATAGRAM, self._coalescing_target, context.reporter.failed)
 
     @property
     def turns(self) -> int:

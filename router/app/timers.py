@@ -20,12 +20,11 @@ class TimerThread:
     Other threads use a timer through `locked`. What is called under the lock has to be short and must not block: the
     receive thread may wait for the lock.
 
-    `clock_ns` is a monotonic clock in ns. `failed` is called with what a timer raises when it is due or ended; the
+    `failed` is called with what a timer raises when it is due or ended; the
     others are served all the same, and it is tried again after 100 ms, or when one of them is used.
     """
 
-    def __init__(self, name: str, clock_ns: Callable[[], int], failed: Callable[[Exception], None]) -> None:
-        self._clock_ns = clock_ns
+    def __init__(self, name: str, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
         self._timers: list[Timer] = []
         self._lock = threading.Lock()
@@ -84,7 +83,7 @@ class TimerThread:
 
     def _end(self, timer: Timer) -> None:
         try:
-            timer.end(self._clock_ns())
+            timer.end(monotonic_ns())
         except Exception as error:  # noqa: BLE001 the other timers have to be ended as well
             self._failed(error)
 
@@ -95,11 +94,11 @@ class TimerThread:
                     return
                 # In reverse order, as those added later may pass on to earlier ones.
                 self._waits_until = min(map(self._serve, reversed(self._timers)), default=_NEVER)
-            self._wake.wait(self._waits_until - self._clock_ns())
+            self._wake.wait(self._waits_until - monotonic_ns())
 
     def _serve(self, timer: Timer) -> int:
         """Call the timer if it is due. Return the time of its next call."""
-        now = self._clock_ns()
+        now = monotonic_ns()
         earliest = now
         if timer.next_due is not None and timer.next_due <= now:
             try:
@@ -119,7 +118,7 @@ class Timers:
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self.deadman, self.inbound_deadman, self.pacing, self.collecting = self._threads = tuple(
-            TimerThread(name, monotonic_ns, failed) for name in ("deadman", "inbound deadman", "pacing", "collect")
+            TimerThread(name, failed) for name in ("deadman", "inbound deadman", "pacing", "collect")
         )
 
     def start(self) -> None:

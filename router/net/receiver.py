@@ -134,25 +134,18 @@ class _Reader:
 
 
 class ReceiveThread:
-    """Calls `receive[listener](data, peer)` for each datagram, in a thread of its own.
+    """Calls the receivers that `serve` sets for each datagram, in a thread of its own.
 
     `limit` is the longest datagram in bytes that is received whole. A longer one has its true length (MSG_TRUNC) with
     arbitrary bytes at the end: the receiver must reject it by its length. `coalescing_target()` is how many datagrams
-    of a listener may gather before they are read. `failed` is called with what `receive` raises.
+    of a listener may gather before they are read. `failed` is called with what a receiver raises.
     """
 
-    def __init__(
-        self,
-        listeners: Sequence[Listener],
-        receive: Mapping[str, Receive],
-        limit: int,
-        coalescing_target: Callable[[], int],
-        failed: Callable[[Exception], None],
-    ) -> None:
+    def __init__(self, limit: int, coalescing_target: Callable[[], int], failed: Callable[[Exception], None]) -> None:
         self._size = limit + 1
         self._coalescing_target = coalescing_target
+        self._listeners: Sequence[Listener] = ()
         self._readers: list[_Reader] = []
-        self.serve(listeners, receive)
         self._failed = failed
         self._ended = False
         self._turns = 0
@@ -171,7 +164,7 @@ class ReceiveThread:
         self._thread.start()
 
     def serve(self, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
-        """Replace the listeners. Once the thread runs, to be called by a task only."""
+        """Replace the listeners, and their receivers by name. Once the thread runs, to be called by a task only."""
         self._listeners = listeners
         self._readers = [_Reader(each, receive[each.name], self._size, self._coalescing_target) for each in listeners]
 

@@ -62,7 +62,7 @@ class Running:
     def __init__(self, stack: ExitStack) -> None:
         self.rung: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.failures: queue.SimpleQueue[Exception] = queue.SimpleQueue()
-        self.thread = TimerThread("test", monotonic_ns, self.failures.put)
+        self.thread = TimerThread("test", self.failures.put)
         self._stack = stack
 
     def start(self) -> None:

@@ -44,10 +44,9 @@ def test_what_the_library_accepts_is_left_alone(data: bytes) -> None:
         assert restored(data, LIMIT) == data
 
 
-@pytest.mark.parametrize("case", rover_envelope().cases)
-def test_every_payload_case_may_arrive_as_its_tag_alone(case: str) -> None:
-    number = rover_envelope().cases[case].number
-    assert restored(tag(number, LEN), LIMIT) == framed(number, b"")
+def test_every_payload_case_may_arrive_as_its_tag_alone() -> None:
+    for case in rover_envelope().cases.values():
+        assert restored(tag(case.number, LEN), LIMIT) == framed(case.number, b"")
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,8 @@ class Receiving:
         self.got: queue.SimpleQueue[tuple[str, bytes, tuple[str, int]]] = queue.SimpleQueue()
         self.failures: queue.SimpleQueue[Exception] = queue.SimpleQueue()
         receive = {listener.name: self._into_queue(listener.name) for listener in listeners}
-        self.thread = ReceiveThread(listeners, receive, LIMIT, lambda: FOR_SOCKETS, self.failures.put)
+        self.thread = ReceiveThread(LIMIT, lambda: FOR_SOCKETS, self.failures.put)
+        self.thread.serve(listeners, receive)
 
     def _into_queue(self, name: str) -> Callable[[bytes, tuple[str, int]], None]:
         def receive(data: bytes, peer: tuple[str, int]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -158,24 +159,31 @@ def test_two_of_our_own_that_do_not_go_together_are_counted() -> None:
         apart.wait_for()
 
 
-@pytest.mark.parametrize("reliability", ["best_effort", "reliable", "system_default"])
-@pytest.mark.parametrize("durability", ["volatile", "transient_local", "system_default"])
-@pytest.mark.parametrize("deadline", [None, 1_000_000_000])
-@pytest.mark.parametrize("liveliness", [("automatic", None), ("automatic", 1_000_000), ("manual_by_topic", None)])
-def test_policies_keep_apart_as_rclpy_says(
-    reliability: str, durability: str, deadline: int | None, liveliness: tuple[str, int | None]
-) -> None:
+def test_policies_keep_apart_as_rclpy_says() -> None:
     def plan(reliability: str, durability: str, deadline: int | None, kind: str, lease: int | None) -> QosPlan:
         return QosPlan(reliability, durability, "keep_last", 5, deadline, None, kind, lease)
 
     asked = plan("reliable", "transient_local", 500_000_000, "manual_by_topic", 1_000_000)
-    offered = plan(reliability, durability, deadline, *liveliness)
-    with closing(open_ros(string_topic(offered), subscriptions=[string_topic(asked)])) as ros:
-        ours, theirs = ros._publications["greeting"].qos, ros._subscriptions["greeting"].qos
-    assert ReliabilityPolicy.SYSTEM_DEFAULT not in (ours.reliability, ours.durability)  # but what the middleware took
-    policies = set(incompatible_policies(ours, theirs))
-    verdict, why = qos_check_compatible(_profile(ours), _profile(theirs))
-    assert bool(policies) == (verdict == QoSCompatibility.ERROR), why
+    offers = itertools.product(
+        ("best_effort", "reliable", "system_default"),
+        ("volatile", "transient_local", "system_default"),
+        (None, 1_000_000_000),
+        (("automatic", None), ("automatic", 1_000_000), ("manual_by_topic", None)),
+    )
+    offered = {
+        f"topic_{number}": plan(reliability, durability, deadline, *liveliness)
+        for number, (reliability, durability, deadline, liveliness) in enumerate(offers)
+    }
+    published = [string_topic(qos, topic) for topic, qos in offered.items()]
+    with closing(open_ros(*published, subscriptions=[string_topic(asked)])) as ros:
+        theirs = ros._subscriptions["greeting"].qos
+        qualities = {topic: ros._publications[topic].qos for topic in offered}
+    for topic, ours in qualities.items():
+        # what the middleware took for `system_default`
+        assert ReliabilityPolicy.SYSTEM_DEFAULT not in (ours.reliability, ours.durability), offered[topic]
+        policies = set(incompatible_policies(ours, theirs))
+        verdict, why = qos_check_compatible(_profile(ours), _profile(theirs))
+        assert bool(policies) == (verdict == QoSCompatibility.ERROR), (offered[topic], why)
 
 
 def _profile(qos: ActualQos) -> QoSProfile:
