@@ -56,12 +56,6 @@ def test_the_line_with_the_count_tells_of_the_last_event(lines: Lines) -> None:
     assert [values["part"] for _, values in lines.written] == [0, 2]
 
 
-def test_kinds_are_told_apart(lines: Lines) -> None:
-    lines.note("drop")
-    lines.note("reject")
-    assert [event for event, _ in lines.written] == ["drop", "reject"]
-
-
 def test_flush_tells_the_end_of_a_flood_when_it_is_due(lines: Lines) -> None:
     lines.note("drop")
     lines.note("drop")
@@ -71,13 +65,6 @@ def test_flush_tells_the_end_of_a_flood_when_it_is_due(lines: Lines) -> None:
     lines.floods.flush()
     lines.floods.flush()
     assert [values.get("more") for _, values in lines.written] == [None, 1]
-
-
-def test_the_final_flush_waits_for_nothing(lines: Lines) -> None:
-    lines.note("drop")
-    lines.note("drop")
-    lines.floods.flush(final=True)
-    assert lines.written[1][1]["more"] == 1
 
 
 def test_the_number_of_kinds_is_bounded(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:

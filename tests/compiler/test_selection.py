@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.compiler import selection
-from router.compiler.selection import TopicSelector, is_hidden, matcher, pattern_problem
+from router.compiler.selection import TopicSelector, is_hidden, pattern_problem
 from router.errors import Located, SourceSpan
 from router.table.model import EACH, Gateway, GatewayFormat, TopicPattern, TopicRate, Transport
 
@@ -179,27 +178,6 @@ def test_what_says_that_the_whole_name_is_meant_changes_nothing(regex: str) -> N
     assert chosen.selects("/imu_2")
     assert not chosen.selects("/camera/imu_2")
     assert not chosen.selects("/im")
-
-
-def test_answers_are_remembered_but_not_for_any_number_of_topics(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    def watched(pattern: TopicPattern) -> Callable[[str], object]:
-        matches = matcher(pattern)
-
-        def asking(topic: str) -> object:
-            asked.append(topic)
-            return matches(topic)
-
-        return asking
-
-    monkeypatch.setattr(selection, "matcher", watched)
-    chosen = selector(["/a*"], rates={"/*": 5})
-    assert all(chosen.selects("/a") and chosen.period("/a") == 5 for _ in range(3))
-    assert asked == ["/a", "/a"]
-    assert all(chosen.selects(f"/a{number}") for number in range(5000))
-    assert chosen.selects("/a")
-    assert len(asked) == 2 * 5002
 
 
 @pytest.mark.parametrize(

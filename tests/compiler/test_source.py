@@ -75,87 +75,51 @@ def test_expression_inside_a_line_is_put_in_brackets_where_it_needs_them() -> No
 # run-time failures
 
 
+ROUTE = """
+routes:
+  imu_info:
+    source: board
+    topics:
+      - topic: out
+"""
 FAILING = {
     "division by zero in a field": (
-        """
-        routes:
-          imu_info:
-            source: board
-            topics:
-              - topic: out
-                type: geometry_msgs/msg/Vector3
-                fields:
-                  x: accel_x
-                  y: 1 + accel_x / gyro_x
-        """,
-        "y: 1 + accel_x / gyro_x",
+        ["type: geometry_msgs/msg/Vector3", "fields:", "  x: accel_x", "  y: 1 + accel_x / gyro_x"],
         "accel_x / gyro_x",
         ZeroDivisionError,
     ),
     "division by zero in a when": (
-        """
-        routes:
-          imu_info:
-            source: board
-            topics:
-              - topic: out
-                when: 1 / gyro_x > 2
-                type: geometry_msgs/msg/Vector3
-                fields: {x: accel_x}
-        """,
-        "when: 1 / gyro_x > 2",
+        ["type: geometry_msgs/msg/Vector3", "fields: {x: accel_x}", "when: 1 / gyro_x > 2"],
         "1 / gyro_x",
         ZeroDivisionError,
     ),
     "a number that the field cannot hold": (
-        """
-        routes:
-          imu_info:
-            source: board
-            topics:
-              - topic: out
-                type: std_msgs/msg/UInt8
-                fields: {data: round(mag_x * 1000)}
-        """,
-        "fields: {data: round(mag_x * 1000)}",
+        ["type: std_msgs/msg/UInt8", "fields: {data: round(mag_x * 1000)}"],
         "round(mag_x * 1000)",
         Exception,
     ),
     "an expression behind non-ASCII text": (
-        """
-        routes:
-          imu_info:
-            source: board
-            topics:
-              - topic: out
-                type: std_msgs/msg/Header
-                fields: {frame_id: "'é€'", stamp: time_from_seconds(accel_x / gyro_x)}  # Größe
-        """,
-        """fields: {frame_id: "'é€'", stamp: time_from_seconds(accel_x / gyro_x)}  # Größe""",
+        [
+            "type: std_msgs/msg/Header",
+            """fields: {frame_id: "'é€'", stamp: time_from_seconds(accel_x / gyro_x)}  # Größe""",
+        ],
         "accel_x / gyro_x",
         ZeroDivisionError,
     ),
     "non-ASCII text in the expression": (
-        """
-        routes:
-          imu_info:
-            source: board
-            topics:
-              - topic: out
-                type: std_msgs/msg/String
-                fields: {data: "'é€' + str(accel_x / gyro_x)"}
-        """,
-        """fields: {data: "'é€' + str(accel_x / gyro_x)"}""",
+        ["type: std_msgs/msg/String", """fields: {data: "'é€' + str(accel_x / gyro_x)"}"""],
         "accel_x / gyro_x",
         ZeroDivisionError,
     ),
 }
+"""The topic, of which the last line fails; the part that is blamed; the error."""
 
 
 @pytest.mark.parametrize("name", FAILING)
 def test_traceback_points_into_the_table(name: str, check_text: CheckText) -> None:
-    routes, line, blamed, kind = FAILING[name]
-    program = check_text(routes).program
+    topic, blamed, kind = FAILING[name]
+    line = topic[-1].strip()
+    program = check_text(ROUTE + "".join(f"        {part}\n" for part in topic)).program
     assert program is not None
     ((handler,),) = program.inbound.values()
     serve = Published(program, handler)

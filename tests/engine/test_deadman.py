@@ -83,19 +83,6 @@ def test_without_a_command_nothing_is_ever_due() -> None:
     assert (watched.deadman.next_due, watched.sent, watched.told) == (None, [], [])
 
 
-def test_it_tells_once_each_way() -> None:
-    watched = Watched()
-    seen = []
-    for now in (0, 10, 1000, 1010, 5000):
-        watched.run(now)
-        seen.append(watched.count("deadman_active"))
-        watched.feed(now)
-        seen.append(watched.count("deadman_active"))
-    assert seen == [0, 0, 0, 0, 1, 0, 0, 0, 1, 0]
-    assert [told[:2] for told in watched.told] == 2 * [("drive", True), ("drive", False)]
-    assert watched.count("deadman_trips") == 2
-
-
 def test_it_is_active_and_has_sent_when_it_tells_that_it_tripped() -> None:
     watched = Watched()
     watched.feed(0)

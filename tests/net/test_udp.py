@@ -120,16 +120,6 @@ def test_each_datagram_arrives_with_its_listener_and_peer(several: list[Listener
     assert arrived == {(listener.name, listener.name.encode(), peer.getsockname()) for listener in several}
 
 
-def test_stop_handles_what_has_arrived_and_ends(several: list[Listener], peer: socket.socket) -> None:
-    receiving = Receiving(several)
-    sent = [b"%d" % number for number in range(20)]
-    for data in sent:
-        peer.sendto(data, several[-1].address)
-    receiving.thread.start()
-    receiving.thread.stop()
-    assert receiving.all_received() == sent
-
-
 def test_what_is_called_can_be_replaced_between_two_datagrams(several: list[Listener], peer: socket.socket) -> None:
     receiving = Receiving(several)
     receiving.thread.start()
@@ -262,6 +252,7 @@ def test_a_bug_while_datagrams_gather_loses_nothing(several: list[Listener], pee
     receiving.thread.stop()
     assert receiving.all_received() == [data for data in sent if data != b"bug"]
     assert receiving.failures.qsize() == sent.count(b"bug")
+    assert isinstance(receiving.failures.get(), LookupError)
 
 
 def test_nothing_new_gets_in_after_the_end_of_input(stack: ExitStack, peer: socket.socket) -> None:
@@ -307,16 +298,6 @@ def test_a_datagram_arrives_with_its_true_length(several: list[Listener], peer: 
     _, data, _ = receiving.got.get(timeout=5)
     receiving.thread.stop()
     assert (len(data), data[:LIMIT]) == (length, sent[:LIMIT])
-
-
-def test_a_fault_is_handed_over_and_receiving_goes_on(several: list[Listener], peer: socket.socket) -> None:
-    receiving = Receiving(several)
-    receiving.thread.start()
-    peer.sendto(b"bug", several[0].address)
-    peer.sendto(b"fine", several[0].address)
-    assert receiving.got.get(timeout=5)[1] == b"fine"
-    receiving.thread.stop()
-    assert isinstance(receiving.failures.get_nowait(), LookupError)
 
 
 def test_the_kernel_tells_when_each_datagram_arrived_however_long_it_was_left_lying(
