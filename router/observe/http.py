@@ -21,8 +21,9 @@ import socket
 import struct
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from email.message import Message
 from enum import IntEnum
 from functools import partial
@@ -143,6 +144,22 @@ class _Stage(IntEnum):
     ASKING = 2
 
 
+@dataclass(slots=True)
+class _Open:
+    """A connection. `progress`: when it got further last (monotonic, s). `is_busy`: its client waits for the router."""
+
+    host: str
+    progress: float
+    stage: _Stage = _Stage.NEW
+    is_busy: bool = False
+    is_tap: bool = False
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether it is not ended for others."""
+        return monotonic() - self.progress < STALLED_SECONDS if self.is_tap else self.is_busy
+
+
 class Connections:
     """Those that are open, and how many each host may have. Thread-safe.
 
@@ -152,11 +169,7 @@ class Connections:
     """
 
     def __init__(self) -> None:
-        self._host: dict[socket.socket, str] = {}
-        self._progress: dict[socket.socket, float] = {}  # monotonic, s; longest without progress first
-        self._stage: dict[socket.socket, _Stage] = {}
-        self._busy: set[socket.socket] = set()
-        self._taps: set[socket.socket] = set()
+        self._open: dict[socket.socket, _Open] = {}  # longest without progress first
         self._lock = threading.Lock()
 
     def admit(self, connection: socket.socket, host: str) -> bool:
@@ -165,16 +178,13 @@ class Connections:
         Sleeps for EVICTION_SECONDS where another connection was ended.
         """
         with self._lock:
-            before = len(self._host)
-            is_own = host == OWN_COMPUTER
-            has_room = self._makes_room(self._of(lambda other: other == host), MAX_PER_HOST) and (
-                is_own or self._makes_room(self._of(lambda other: other != OWN_COMPUTER), MAX_FROM_OTHERS)
+            before = len(self._open)
+            has_room = self._makes_room(MAX_PER_HOST, lambda other: other.host == host) and (
+                host == OWN_COMPUTER or self._makes_room(MAX_FROM_OTHERS, lambda other: other.host != OWN_COMPUTER)
             )
-            has_evicted = len(self._host) < before
+            has_evicted = len(self._open) < before
             if has_room:
-                self._host[connection] = host
-                self._progress[connection] = monotonic()
-                self._stage[connection] = _Stage.NEW
+                self._open[connection] = _Open(host, monotonic())
         if has_evicted:
             sleep(EVICTION_SECONDS)
         return has_room
@@ -182,9 +192,9 @@ class Connections:
     def admit_tap(self, connection: socket.socket) -> bool:
         """Return whether a connection may become a tap."""
         with self._lock:
-            if not self._makes_room(self._taps, MAX_TAPS):
+            if connection not in self._open or not self._makes_room(MAX_TAPS, lambda other: other.is_tap):
                 return False
-            self._taps.add(connection)
+            self._open[connection].is_tap = True
             return True
 
     def note_request(self, connection: socket.socket) -> bool:
@@ -197,59 +207,53 @@ class Connections:
 
     def _proceeds(self, connection: socket.socket, stage: _Stage) -> bool:
         with self._lock:
-            if self._progress.pop(connection, None) is None:
+            if (found := self._open.pop(connection, None)) is None:
                 return False
-            self._progress[connection] = monotonic()
-            self._stage[connection] = stage
+            found.progress, found.stage = monotonic(), stage
+            self._open[connection] = found
             return True
 
     @contextmanager
     def busy(self, connection: socket.socket) -> Iterator[None]:
         """Inside, the client waits for the router: the connection is not ended for others."""
-        with self._lock:
-            self._busy.add(connection)
+        self._set_busy(connection, True)
         try:
             yield
         finally:
-            with self._lock:
-                self._busy.discard(connection)
+            self._set_busy(connection, False)
+
+    def _set_busy(self, connection: socket.socket, is_busy: bool) -> None:
+        with self._lock:
+            if (found := self._open.get(connection)) is not None:
+                found.is_busy = is_busy
 
     def remove(self, connection: socket.socket) -> None:
         with self._lock:
-            self._forget(connection)
+            self._open.pop(connection, None)
 
     def end_all(self) -> None:
         with self._lock:
-            for each in self._host:
-                with suppress(OSError):  # the client has left already
-                    each.shutdown(socket.SHUT_RDWR)
+            for each in self._open:
+                _end(each)
 
-    def _of(self, is_meant: Callable[[str], bool]) -> frozenset[socket.socket]:
-        return frozenset(each for each, host in self._host.items() if is_meant(host))
-
-    def _makes_room(self, among: Collection[socket.socket], most: int) -> bool:
-        if len(among) < most:
+    def _makes_room(self, most: int, shares: Callable[[_Open], bool]) -> bool:
+        """Return whether fewer than `most` connections share a limit, if need be after one of them was ended."""
+        sharing = {connection: found for connection, found in self._open.items() if shares(found)}
+        if len(sharing) < most:
             return True
-        can_end = [each for each in self._progress if each in among and not self._is_kept(each)]
-        longest = min(can_end, key=self._stage.__getitem__, default=None)  # the first of equals
+        can_end = [connection for connection, found in sharing.items() if not found.is_kept]
+        longest = min(can_end, key=lambda connection: sharing[connection].stage, default=None)  # the first of equals
         if longest is None:
             return False
-        self._forget(longest)
+        del self._open[longest]
         _reset(longest)
-        with suppress(OSError):  # the client has left already
-            longest.shutdown(socket.SHUT_RDWR)
+        _end(longest)
         return True
 
-    def _is_kept(self, connection: socket.socket) -> bool:
-        if connection in self._taps:
-            return monotonic() - self._progress[connection] < STALLED_SECONDS
-        return connection in self._busy
 
-    def _forget(self, connection: socket.socket) -> None:
-        self._host.pop(connection, None)
-        self._progress.pop(connection, None)
-        self._stage.pop(connection, None)
-        self._taps.discard(connection)
+def _end(connection: socket.socket) -> None:
+    with suppress(OSError):  # the client has left already
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _reset(connection: socket.socket) -> None:

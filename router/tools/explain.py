@@ -58,7 +58,9 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
     yield from _settings(checked)
     for served in checked.targets:
         yield ""
-        yield from _topic(served) if served.topic else _destination(served, checked.route, table, "unchanged")
+        yield from (
+            _topic(served, served.topic) if served.topic else _destination(served, checked.route, table, "unchanged")
+        )
     for feed in checked.subscriptions:
         yield ""
         yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
@@ -85,8 +87,9 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
         )
     if deadman is not None:
         settings = deadman.settings
+        sent = f"{settings.case.value} {settings.fields}" if settings.fields.entries else settings.case.value
         yield (
-            f"  deadman: {_sent(route)} to {', '.join(to.value for to in settings.to)} when no command came for "
+            f"  deadman: {sent} to {', '.join(to.value for to in settings.to)} when no command came for "
             f"{duration(settings.timeout.value)}, again every {duration(settings.repeat.value)}, "
             f"{_at_start(settings.at_start)}"
         )
@@ -94,13 +97,6 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
     if route.no_deadman is not None:
         yield f"  no deadman: {route.no_deadman}"
-
-
-def _sent(route: Route) -> str:
-    """What the deadman of a route sends."""
-    assert route.deadman is not None  # noqa: S101 - the caller's choice
-    fields = route.deadman.fields
-    return f"{route.deadman.case.value} {fields}" if fields.entries else route.deadman.case.value
 
 
 def _source(name: str, table: RouteTable) -> str:
@@ -123,9 +119,7 @@ def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: st
     yield from _served(served)
 
 
-def _topic(served: CheckedTarget) -> Iterator[str]:
-    topic = served.topic
-    assert topic is not None  # noqa: S101 - the caller's choice
+def _topic(served: CheckedTarget, topic: Topic) -> Iterator[str]:
     yield f"  topic {served.label}: {topic.type.value}  ({served.span})"
     yield _quality(topic)
     if served.plan is not None:
@@ -274,15 +268,13 @@ def _inbound(entry: InboundPlan) -> Iterator[str]:
     if inbound.topic.max_rate is not None:
         yield f"    {phrases(inbound.topic)['max_rate']}"
     if inbound.deadman is not None and entry.deadman is not None:
-        timeout, repeat = duration(inbound.deadman.timeout.value), duration(inbound.deadman.repeat.value)
-        start = _at_start(inbound.deadman.at_start)
-        yield f"    deadman: {_constants(entry)} when no message came for {timeout}, again every {repeat}, {start}"
-
-
-def _constants(entry: InboundPlan) -> str:
-    assert entry.settings.deadman is not None  # noqa: S101 - the caller's choice
-    entries = entry.settings.deadman.fields.entries
-    return ", ".join(f"{'.'.join(each.path)} {each.value.text}" for each in entries) or "all fields at their defaults"
+        deadman = inbound.deadman
+        fields = [f"{'.'.join(each.path)} {each.value.text}" for each in deadman.fields.entries]
+        yield (
+            f"    deadman: {', '.join(fields) or 'all fields at their defaults'} when no message came for "
+            f"{duration(deadman.timeout.value)}, again every {duration(deadman.repeat.value)}, "
+            f"{_at_start(deadman.at_start)}"
+        )
 
 
 Topics = Mapping[str, str]
