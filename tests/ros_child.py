@@ -44,7 +44,7 @@ class ForkedProcess:
             self.returncode = _ask({"wait": self.pid})
         return self.returncode
 
-    def wait(self, timeout: float = 20) -> int:
+    def wait(self, timeout: float = 60) -> int:
         assert select.select([self._pidfd], [], [], timeout)[0], "it does not end"
         code = self.poll()
         assert code is not None

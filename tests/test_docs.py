@@ -187,13 +187,13 @@ def test_the_udp_client_that_sends_sends_a_packet_that_the_gateway_reads(tmp_pat
 
 def test_the_client_that_sends_sends_what_the_simulated_rover_lets_in(tmp_path: Path) -> None:
     table = check_table(ROVER.with_name("sim.yaml"), {})
-    [inbound] = table.gateways[0].inbound
+    [(topic, inbound)] = table.gateways[0].inbound.items()
     gateway = FakeGateway()
     try:
         with program(tmp_path, "drive.py", f"ws://127.0.0.1:{gateway.port}/"):
             sent = gateway.received.get(timeout=PATIENCE)
     finally:
         gateway.close()
-    assert (sent["op"], sent["topic"]) == ("publish", inbound.label)
+    assert (sent["op"], sent["topic"]) == ("publish", topic)
     assert isinstance(sent["time"], float)
     assert decoder(inbound.type, Style.PLAIN)(json.dumps(sent["data"]).encode())

@@ -7,7 +7,6 @@ a publisher, {"topic": ..., "message": {...}} for a message, {"result": ...} for
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import threading
 from collections.abc import Mapping
@@ -25,7 +24,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))  # a script is not started from the repository's root
 
 from tests.compiler.ros_objects import message_class, to_object, to_value
-from tests.ros_child import own_stdout, spin_until_stdin_ends
+from tests.ros_child import ForkedProcess, own_stdout, spin_until_stdin_ends
 
 PATIENCE = 60
 """Seconds that something may take on a busy machine."""
@@ -41,8 +40,7 @@ class RosPeer:
     """
 
     def __init__(self, topics: Mapping[str, str] | None = None) -> None:
-        command = [sys.executable, __file__, json.dumps(dict(topics or {}))]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._process = ForkedProcess(__file__, json.dumps(dict(topics or {})))
         self._arrivals: Queue[Arrival] = Queue()
         self._results: Queue[Any] = Queue()
         self._matches: Queue[str] = Queue()
@@ -56,14 +54,12 @@ class RosPeer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        assert self._process.stdin
         self._process.stdin.close()
         self._process.wait(PATIENCE)
         self._reader.join(PATIENCE)
         assert self._process.returncode == 0
 
     def _read(self) -> None:
-        assert self._process.stdout
         with self._process.stdout:
             for line in map(json.loads, self._process.stdout):
                 if "result" in line:
@@ -97,7 +93,6 @@ class RosPeer:
         while not all(map(self.heard_by, topics)):
             assert monotonic() < deadline, "nobody subscribes"
             sleep(0.01)
-        sleep(0.1)  # the subscriber learns of it later; what it misses until then takes DDS three seconds to repair
 
     def say(self, name: str, *messages: Mapping[str, Any], times: int = 1) -> None:
         """Publishes messages in this order, `times` times. A field that is left out has its default."""
@@ -111,7 +106,6 @@ class RosPeer:
         return int(self._ask("heard_by", name))
 
     def _ask(self, command: str, name: str, **details: object) -> Any:
-        assert self._process.stdin
         self._process.stdin.write(json.dumps({"command": command, "name": name, **details}) + "\n")
         self._process.stdin.flush()
         return self._results.get(timeout=PATIENCE)

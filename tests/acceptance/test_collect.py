@@ -23,7 +23,7 @@ TABLE = (
 routes:
   detected_object:
     source: [left, right]
-    collect: {{by: frame_id, count: total_count, order: index, timeout: 1s}}
+    collect: {{by: frame_id, count: total_count, order: index, timeout: 2s}}
     topics:
       - topic: objects
         type: comms/msg/DetectedObjectArray

@@ -54,10 +54,10 @@ class Monitor:
 
 @contextmanager
 def monitored(folder: Path) -> Iterator[tuple[Site, Monitor]]:
-    """The rover with boards that are stale after half a second."""
+    """The rover with boards that are stale after a second."""
     with site(folder) as place:
         table = place.table(TABLE)
-        table.write_text(table.read_text().replace("kind: board}", "kind: board, stale_after: 500ms}"))
+        table.write_text(table.read_text().replace("kind: board}", "kind: board, stale_after: 1s}"))
         with RouterProcess(folder, table), closing(TopicListener("/diagnostics", TYPE)) as listener:
             yield place, Monitor(listener)
 

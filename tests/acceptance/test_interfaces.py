@@ -43,8 +43,8 @@ routes:
   manual_drive:
     source: basestation
     destinations: [driving_board]
-    ttl: 200ms
-    deadman: {{timeout: 300ms, send: {{manual_brake: {{brake: true}}}}, to: [driving_board], repeat: 10s}}
+    ttl: 1s
+    deadman: {{timeout: 1200ms, send: {{manual_brake: {{brake: true}}}}, to: [driving_board], repeat: 10s}}
   drive_diag: {{source: driving_board, destinations: [basestation]}}
   arm_diag: {{source: anywhere, destinations: [basestation]}}
   imu_info: {{source: any, destinations: [basestation]}}

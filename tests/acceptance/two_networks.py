@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.acceptance.payloads import WIRE
+from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import ROOT, RouterProcess, key
 from tests.namespaces import Computer, cable, computers
 
@@ -44,7 +45,7 @@ class Rover:
 
     def samples(self) -> dict[str, float]:
         def ask() -> str:
-            with urllib.request.urlopen("http://127.0.0.1:9108/metrics", timeout=5) as answer:
+            with urllib.request.urlopen("http://127.0.0.1:9108/metrics", timeout=PATIENCE) as answer:
                 return str(answer.read().decode())
 
         lines = (line.rpartition(" ") for line in self.rover.inside(ask).splitlines() if line.startswith("router_"))
@@ -57,6 +58,7 @@ class Rover:
         with suppress(TimeoutError):
             while True:
                 found.append(self.board.recv(1000))
+        self.board.settimeout(PATIENCE)
         return [datagram for datagram in found if datagram != BRAKE]
 
     def count(self, metric: str, **labels: str) -> float:
@@ -72,7 +74,7 @@ class Rover:
 def udp(computer: Computer, address: tuple[str, int]) -> socket.socket:
     opened = computer.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     opened.bind(address)
-    opened.settimeout(5)
+    opened.settimeout(PATIENCE)
     return opened
 
 
