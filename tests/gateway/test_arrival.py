@@ -143,16 +143,15 @@ async def test_what_zenoh_hears_while_the_loop_is_away_is_as_old_as_that() -> No
     async with opened(ZenohTransport(ZenohSettings(key, "peer", (), (where,)), events, 1000)):
         with zenoh.open(config) as far:
 
-            def put() -> None:
-                far.put(f"{key.value}/inbound/cmd_vel", b"stop")
+            def put(what: bytes) -> None:
+                far.put(f"{key.value}/inbound/cmd_vel", what)
 
-            await until(lambda: put() or events.said)  # type: ignore[func-returns-value]
+            await until(lambda: put(b"go") or events.said)  # type: ignore[func-returns-value]
             await asyncio.sleep(0.3)
-            events.arrivals.clear()
             left = wall_ns()
-            late = threading.Timer(2 * AWAY_NS / 1e9, put)
+            late = threading.Timer(2 * AWAY_NS / 1e9, put, [b"stop"])
             late.start()
             time.sleep(6 * AWAY_NS / 1e9)
-            await until(lambda: events.arrivals)
+            await until(lambda: events.said[-1] == b"stop")
             assert events.arrivals[-1] <= left
             late.join()

@@ -89,7 +89,8 @@ async def listening(served: Serving) -> AsyncIterator[list[tuple[str, bytes]]]:
             f"{KEY}/**", lambda sample: heard.append((str(sample.key_expr), sample.payload.to_bytes()))
         )
         await until(is_heard)  # the wish to hear has to arrive first
-        await asyncio.sleep(0.1)
+        served.client.write([data(b"go on", "/hello")])
+        await until(lambda: heard[-1][1] == b"go on")
         heard.clear()
         yield heard
 
@@ -104,8 +105,10 @@ async def sending(served: Serving) -> AsyncIterator[zenoh.Session]:
 
     with session("peer", connect=served.where) as far:
         await until(is_heard)
-        await asyncio.sleep(0.1)
-        served.events.said.clear()
+        far.put(f"{KEY}/inbound/hello", b"go on")
+        await until(lambda: served.events.said[-1] == b"go on")
+        for told in (served.events.said, served.events.said_by, served.events.refusals):
+            told.clear()
         yield far
 
 
@@ -152,8 +155,8 @@ async def test_what_is_put_under_inbound_is_heard() -> None:
 
 @asynchronous
 async def test_samples_that_come_faster_than_they_are_taken_are_refused_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gateway_zenoh, "MOST_RECEIVED", 5)
     async with serving() as served, sending(served) as far:
+        monkeypatch.setattr(gateway_zenoh, "MOST_RECEIVED", 5)
         events = served.events
         for number in range(2000):
             far.put(f"{KEY}/inbound/cmd_vel", str(number), congestion_control=zenoh.CongestionControl.BLOCK)
