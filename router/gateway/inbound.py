@@ -152,14 +152,16 @@ class InboundPublisher:
     def _check_age(self, topic: _Topic, ttl: int, sent: float, arrived_ns: int, now: int) -> None:
         """The age counts from when the client says that it sent the message, or from its arrival if that is earlier.
 
-        So a client whose clock is ahead gets its messages published up to that much later than `ttl` allows.
+        So a client whose clock is ahead gets its messages published up to that much later than `ttl` allows. How far
+        ahead it is counts from now, as `arrived_ns` is the earliest possible arrival where the gateway stood still.
         """
+        wall = self._outputs.wall_ns()
         stamp = round(min(max(sent, 0.0), arrived_ns / 1e9) * 1e9)
-        age = now - self._freshness.born(stamp, self._outputs.wall_ns(), now)
+        age = now - self._freshness.born(stamp, wall, now)
         if age > ttl:
             detail = f"{age / 1e9:.3f} s old, and older than {ttl / 1e9:g} s; are both clocks right?"
             raise self._dropped(topic, "stale", detail)
-        if (ahead := sent - arrived_ns / 1e9) * 1e9 > CLOCK_TOLERANCE_NS:
+        if (ahead := sent - wall / 1e9) * 1e9 > CLOCK_TOLERANCE_NS:
             self._counts[self._clock_ahead] += 1
             self.log.note(
                 topic.plan.label,

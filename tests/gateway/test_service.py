@@ -195,18 +195,22 @@ async def test_only_what_is_allowed_is_decompressed(
         assert asked == ([] if topic == "/other" else [64 << 10])
 
 
-@pytest.mark.parametrize(("ahead", "counted"), [(0.0, 0), (-0.2, 0), (0.01, 0), (0.1, 1), (60.0, 1)])
+@pytest.mark.parametrize(
+    ("ahead", "waited", "counted"),
+    [(0.0, 0.0, 0), (-0.2, 0.0, 0), (0.01, 0.0, 0), (1.0, 0.0, 1), (60.0, 0.0, 1), (0.0, 0.2, 0), (1.0, 0.2, 1)],
+)
 @asynchronous
 async def test_a_clients_clock_that_is_ahead_is_counted_and_its_message_published(
-    tmp_path: Path, ahead: float, counted: int
+    tmp_path: Path, ahead: float, waited: float, counted: int
 ) -> None:
     async with Stage(program(tmp_path, f"it: {{{TCP}, {TIMED}}}"), Graph({})) as stage:
         played = stage.played["it"]
         await played.start()
         now = time.time_ns()
+        arrived = now - int(waited * 1e9)
         with capture_logs() as lines:
             for _ in range(3):
-                played.service.received(played.client, publish("/said", "a", time=now / 1e9 + ahead), now)
+                played.service.received(played.client, publish("/said", "a", time=now / 1e9 + ahead), arrived)
             await played.close()
         assert len(stage.published) == 3
         assert stage.count("gateway_client_clock_ahead", "it") == 3 * counted
