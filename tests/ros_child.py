@@ -42,10 +42,11 @@ class ForkedProcess:
     def poll(self) -> int | None:
         if self.returncode is None and select.select([self._pidfd], [], [], 0)[0]:
             self.returncode = _ask({"wait": self.pid})
+            os.close(self._pidfd)
         return self.returncode
 
     def wait(self, timeout: float = 60) -> int:
-        assert select.select([self._pidfd], [], [], timeout)[0], "it does not end"
+        assert self.returncode is not None or select.select([self._pidfd], [], [], timeout)[0], "it does not end"
         code = self.poll()
         assert code is not None
         return code
@@ -91,7 +92,7 @@ class RosProcess:
 @cache
 def _forker() -> socket.socket:
     ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # a process with threads is not to be forked
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # of its threads, a fork would lose those of numpy
     subprocess.Popen([sys.executable, __file__, str(its.fileno())], pass_fds=[its.fileno()], env=environment)
     its.close()
     return ours

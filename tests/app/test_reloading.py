@@ -538,6 +538,7 @@ def test_what_a_program_counted_that_was_abandoned_is_nobodys() -> None:
     assert counts.total("datagrams_received") == 0
 
 
+@pytest.mark.slow
 def test_a_gateway_in_a_zenoh_network_goes_on_unless_its_config_changes(site: Site) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
     settings = f"{{key: rovers/one, listen: [tcp/127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}], config: zenoh.json5}}"
