@@ -295,7 +295,7 @@ def main() -> int:
         storm(flood, arguments.port) if flood.closes else attack(flood, arguments.port, arguments.clients)
     PROGRAMS.mkdir(parents=True, exist_ok=True)
     for program in ("load", "sink"):
-        command = ["gcc", "-O2", "-std=gnu11", PEER / f"{program}.c", "-o", PROGRAMS / program]
+        command = ["gcc", "-O2", "-std=gnu11", str(PEER / f"{program}.c"), "-o", str(PROGRAMS / program)]
         subprocess.run(command, check=True)
     good = [run(name, arguments.clients, arguments.seconds, arguments.most) for name in arguments.floods or FLOODS]
     return 0 if all(good) else 1

@@ -136,8 +136,10 @@ def run(seconds: int, rates: Sequence[int]) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--seconds", type=int, default=10, help="for each input rate; default 10")
+    parser.add_argument("--seconds", type=int, default=10, help="for each input rate, at least 2; default 10")
     arguments = parser.parse_args()
+    if arguments.seconds < 2:
+        parser.error("--seconds: a rate is counted in each whole second, so at least 2")
     return 0 if run(arguments.seconds, INPUT_HERTZ) else 1
 
 
