@@ -124,14 +124,5 @@ def test_no_module_imports_private_names_of_another_package() -> None:
     assert wrong == []
 
 
-def test_the_router_imports_nothing_of_the_tests() -> None:
-    assert [
-        where(path, line)
-        for path, tree in MODULES.items()
-        for name, _, line in imports(tree)
-        if name.startswith("tests")
-    ] == []
-
-
 def test_every_module_has_a_docstring() -> None:
     assert [str(path) for path, tree in MODULES.items() if tree.body and not ast.get_docstring(tree)] == []
