@@ -30,7 +30,7 @@ HERE = Path(__file__).parent
 RESULTS = HERE.parent / "benchmarks" / "results.json"
 WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
-_BOOKS = """\
+_COUNTERS = """\
 Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route
 and target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames, the queue of a
 budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element is a message. What a
@@ -72,7 +72,7 @@ def metrics_page() -> str:
     lines += [
         "| `router_build_info` | gauge | version, table_sha256, protos_sha256 | Always 1; says what is running. |",
         "",
-        fill(_BOOKS, WIDTH),
+        fill(_COUNTERS, WIDTH),
         "",
         "`route` is the payload case, and where a case has several routes its first source as well:",
         "[names](table.md#several-routes-of-one-case).",
