@@ -397,9 +397,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         if self.command == "HEAD":
             return
-        self._send()
-        self._out = BytesIO()
         with closing(Tap(running.mirror, is_wanted)) as tap:
+            self._send()  # now, so that whoever has the response misses nothing that is sent after it
+            self._out = BytesIO()
             self._stream(tap.stream())
 
     def _stream(self, pieces: Iterator[bytes]) -> None:
