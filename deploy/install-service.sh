@@ -59,7 +59,7 @@ if checked.program is None:
     sys.exit(78)
 table = checked.program.table
 for listener in checked.program.listeners:
-    print("socket", listener.address, listener.interface or "-")
+    print("socket", listener.address.value, listener.interface or "-")
 if table.record is not None and (directory := table.record.directory.resolve()) != Path("/var/lib/rover-router"):
     print("write", directory)
 read = {Path(sys.argv[1]), Path(sys.base_prefix), *(file.resolve().parent for file in table.files)}
