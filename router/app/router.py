@@ -9,8 +9,6 @@ from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from prometheus_client.metrics_core import Metric as Family
-
 from router.app.reloading import Reloader
 from router.app.runtime import Change, Runtime
 from router.app.timers import Timers
@@ -22,15 +20,17 @@ from router.compiler.topics import DIAGNOSTICS
 from router.engine import MAX_DATAGRAM
 from router.log import logger
 from router.net.udp import Listener
-from router.observe.metrics import Asked, CountersCollector
 from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
 from router.threads import DaemonThread, background_threads
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # prometheus_client would take a tenth of the time until the ports are bound
+    from prometheus_client.metrics_core import Metric as Family
+
     from router.gateway.clients import ClientQueue
+    from router.observe.metrics import Asked, CountersCollector
     from router.recording.recorder import Recorder
 
 _TOTALS = (
@@ -64,7 +64,7 @@ class Router:
         self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
         self._watcher: Watcher | None = None
         self._interfaces: InterfaceWatcher | None = None
-        self._collector = self._new_collector()
+        self._collector: tuple[Program, CountersCollector] | None = None
         self._open = ExitStack()
 
     def __enter__(self) -> Router:
@@ -134,7 +134,10 @@ class Router:
         return self._runtime.turns + self.total("datagrams_received")
 
     def collect(self) -> Iterator[Family]:
-        return self._collector.collect()
+        if (made := self._collector) is None or made[0] is not self.program:
+            program = self.program
+            made = self._collector = (program, self._new_collector(program))
+        return made[1].collect()
 
     def reload(self) -> ReloadResult:
         """Read the table again and adopt it between two datagrams; an invalid one changes nothing."""
@@ -159,7 +162,6 @@ class Router:
             self._services.deadman_tripped(route)
 
     def _program_replaced(self) -> None:
-        self._collector = self._new_collector()
         self._watch()
 
     def _watch(self) -> None:
@@ -196,8 +198,9 @@ class Router:
             "gateway_client_dropped": of_clients(lambda client: client.dropped),
         }
 
-    def _new_collector(self) -> CountersCollector:
-        program = self.program
+    def _new_collector(self, program: Program) -> CountersCollector:
+        from router.observe.metrics import CountersCollector
+
         build = {
             "version": _version(),
             "table_sha256": program.table.sha256,
