@@ -481,7 +481,7 @@ def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
         assert [site.basestation.recv(1000) for _ in range(2)] == [numbered(2), DRIVE]
 
 
-@pytest.mark.parametrize("late", ["router.app.wiring.Counters.settle", "router.app.router.CountersCollector"])
+@pytest.mark.parametrize("late", ["router.app.wiring.Counters.settle", "router.app.router.Router._watch"])
 def test_what_fails_when_the_table_runs_already_is_not_told_as_if_nothing_had_changed(
     site: Site, monkeypatch: pytest.MonkeyPatch, late: str
 ) -> None:
