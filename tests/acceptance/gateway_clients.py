@@ -17,20 +17,10 @@ from backports import zstd
 from websockets.sync.client import connect
 
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
-from tests.acceptance.site import RouterProcess, Site, key, site, wait_until
+from tests.acceptance.site import ROVER, RouterProcess, Site, key, site, wait_until
 from tests.ports import free_port
 
-HEAD = """\
-version: 1
-extends: {root}/tests/acceptance/patient.yaml
-metrics:
-  address: 127.0.0.1:{metrics}
-listen:
-  rover:
-    address: 127.0.0.5:{listen}
-endpoints:
-{endpoints}gateways:
-"""
+HEAD = ROVER + "gateways:\n"
 
 
 def packet(data: bytes) -> tuple[float, int, str, str, bytes]:
