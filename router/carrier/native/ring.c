@@ -1,0 +1,112 @@
+#include "ring.h"
+
+#include <poll.h>
+#include <stdlib.h>
+#include <sys/eventfd.h>
+#include <unistd.h>
+
+enum { WORD = sizeof(uint64_t) };
+
+struct ring *ring_open(size_t capacity) {
+    struct ring *ring = calloc(1, sizeof *ring);
+    if (!ring) return NULL;
+    ring->capacity = capacity;
+    ring->words = calloc(capacity / WORD, WORD);
+    ring->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    if (!ring->words || ring->wake < 0) {
+        ring_close(ring);
+        return NULL;
+    }
+    return ring;
+}
+
+void ring_close(struct ring *ring) {
+    if (ring->wake >= 0) close(ring->wake);
+    free((void *)ring->words);
+    free(ring);
+}
+
+static _Atomic uint64_t *word_at(struct ring *ring, uint64_t position) {
+    return &ring->words[(position & (ring->capacity - 1)) / WORD];
+}
+
+/* The words are atomic because the reader may copy a record while the writer, having dropped it, writes the next one
+ * there. What it copied is void then. */
+static void copy_out(struct ring *ring, uint64_t position, void *to, size_t size) {
+    uint64_t *words = to;
+    for (size_t done = 0; done < size; done += WORD)
+        *words++ = atomic_load_explicit(word_at(ring, position + done), memory_order_relaxed);
+}
+
+static uint32_t size_at(struct ring *ring, uint64_t position) {
+    union { uint64_t word; uint32_t size; } head = {atomic_load_explicit(word_at(ring, position), memory_order_relaxed)};
+    return head.size;
+}
+
+bool ring_put(struct ring *ring, const void *record, uint32_t size) {
+    uint64_t written = atomic_load_explicit(&ring->written, memory_order_relaxed);
+    uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
+    if (written - taken + size > ring->capacity) return false;
+    const uint64_t *words = record;
+    /* A reader that sees one of these words also sees that the record that was there is gone. */
+    atomic_thread_fence(memory_order_release);
+    for (uint32_t done = 0; done < size; done += WORD)
+        atomic_store_explicit(word_at(ring, written + done), *words++, memory_order_relaxed);
+    /* Sequentially consistent, as is `is_waited_for`: either the reader sees the record, or we see that it waits. */
+    atomic_store(&ring->written, written + size);
+    if (atomic_load(&ring->is_waited_for)) ring_wake(ring);
+    return true;
+}
+
+bool ring_drop(struct ring *ring, void *record, size_t limit) {
+    uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
+    if (taken == atomic_load_explicit(&ring->written, memory_order_relaxed)) return false;
+    uint32_t size = size_at(ring, taken);
+    copy_out(ring, taken, record, size < limit ? size : limit);
+    return atomic_compare_exchange_strong(&ring->taken, &taken, taken + size);
+}
+
+static size_t take_ready(struct ring *ring, void *records, size_t limit) {
+    uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
+    size_t copied = 0;
+    while (atomic_load_explicit(&ring->written, memory_order_acquire) != taken) {
+        uint32_t size = size_at(ring, taken);
+        /* A size that was read while the record was overwritten may be anything. */
+        bool is_valid = size >= WORD && size % WORD == 0 && size <= ring->capacity;
+        if (is_valid && size > limit - copied) {
+            if (atomic_load(&ring->taken) == taken) return copied;
+            is_valid = false;
+        }
+        if (is_valid) copy_out(ring, taken, (char *)records + copied, size);
+        atomic_thread_fence(memory_order_acquire);
+        uint64_t expected = taken;
+        if (is_valid && atomic_compare_exchange_strong(&ring->taken, &expected, taken + size)) {
+            copied += size;
+            taken += size;
+        } else {
+            taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
+        }
+    }
+    return copied;
+}
+
+size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms) {
+    size_t copied = take_ready(ring, records, limit);
+    if (copied || !timeout_ms) return copied;
+    atomic_store(&ring->is_waited_for, 1);
+    copied = take_ready(ring, records, limit);
+    if (!copied) {
+        struct pollfd wake = {ring->wake, POLLIN, 0};
+        uint64_t times;
+        if (poll(&wake, 1, timeout_ms) > 0 && read(ring->wake, &times, sizeof times) < 0) return 0;
+        copied = take_ready(ring, records, limit);
+    }
+    atomic_store(&ring->is_waited_for, 0);
+    return copied;
+}
+
+void ring_wake(struct ring *ring) { eventfd_write(ring->wake, 1); }
+
+uint64_t ring_written(struct ring *ring) { return atomic_load(&ring->written); }
+
+uint64_t ring_taken(struct ring *ring) { return atomic_load(&ring->taken); }

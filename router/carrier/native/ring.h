@@ -1,0 +1,41 @@
+/* A queue of records from one thread to another that drops its oldest record when it is full.
+ *
+ * The writing thread never waits: it takes the oldest record away from the reader when it needs the room. The reader
+ * copies records out and then claims them; a claim fails if the record was dropped meanwhile, and the copy is void.
+ * Records are multiples of 8 bytes, and start with their size as a uint32_t. */
+#ifndef RING_H
+#define RING_H
+
+#include <stdatomic.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+struct ring {
+    _Atomic uint64_t written; /* bytes, since the ring was opened */
+    _Atomic uint64_t taken;   /* bytes that were taken or dropped */
+    _Atomic uint32_t is_waited_for;
+    int wake; /* eventfd */
+    size_t capacity;
+    _Atomic uint64_t *words;
+};
+
+/* Return a ring for `capacity` bytes, a power of two, or NULL for lack of memory or descriptors. */
+struct ring *ring_open(size_t capacity);
+void ring_close(struct ring *ring);
+
+/* For the writer. `ring_put` returns false without room; `ring_drop` copies up to `limit` bytes of the oldest record
+ * to `record`, drops it and returns true, or returns false if the reader was faster. */
+bool ring_put(struct ring *ring, const void *record, uint32_t size);
+bool ring_drop(struct ring *ring, void *record, size_t limit);
+
+/* For the reader. Copy as many whole records as fit and return their size in bytes. If there are none, wait for up to
+ * `timeout_ms` (-1: for ever), and return 0 after that, or after `ring_wake`. A record longer than `limit` is never
+ * taken: buffers have to be as long as the longest record. */
+size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms);
+void ring_wake(struct ring *ring);
+
+uint64_t ring_written(struct ring *ring);
+uint64_t ring_taken(struct ring *ring);
+
+#endif
