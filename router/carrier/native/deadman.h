@@ -13,6 +13,7 @@
 #include <stdint.h>
 
 #include "counters.h"
+#include "events.h"
 #include "ring.h"
 #include "sender.h"
 
@@ -32,22 +33,12 @@ struct deadman;
 struct deadmen {
     pthread_mutex_t lock;
     counter *counters;
-    struct ring *events;       /* may be NULL */
+    struct ring *events;       /* of struct deadman_event; may be NULL */
     int timer;                 /* timerfd, readable when a deadman is due */
     int64_t timer_set_for;     /* monotonic, ns; NEVER while it is not set */
     _Atomic int64_t next_due;  /* NEVER if nothing is due; may be read without the lock */
     struct deadman *first;     /* a linked list */
 };
-
-/* What a deadman tells Python, through `events`. */
-struct deadman_event {
-    uint32_t size;             /* of this record */
-    uint32_t kind;             /* one of EVENT_... */
-    uint32_t deadman, destination; /* ids; `destination` only of an error */
-    int32_t error;             /* errno */
-    uint32_t reserved;
-};
-enum { EVENT_TRIPPED = 1, EVENT_RELEASED = 2, EVENT_DEADMAN_ERROR = 3 };
 
 /* What a command does to a deadman before it is sent. */
 struct feed {

@@ -1,0 +1,43 @@
+/* What native threads tell Python for its log, as records of a ring. Each begins with `size` and `kind`. Ids stand for
+ * names that Python knows. At most so many are written per window of time; counters count everything. */
+#ifndef EVENTS_H
+#define EVENTS_H
+
+#include <stdint.h>
+
+enum event_kind { EVENT_TRIPPED = 1, EVENT_RELEASED, EVENT_DEADMAN_ERROR, EVENT_REJECTED, EVENT_LOST };
+
+struct deadman_event {
+    uint32_t size, kind;           /* EVENT_TRIPPED, EVENT_RELEASED or EVENT_DEADMAN_ERROR */
+    uint32_t deadman, destination; /* `destination` only of an error */
+    int32_t error;                 /* errno */
+    uint32_t reserved;
+};
+
+struct rejected_event {
+    uint32_t size, kind;      /* EVENT_REJECTED; the datagram follows, cut to MAX_DATAGRAM bytes */
+    uint32_t listener, reason; /* enum reason */
+    uint32_t address, port;   /* of the sender, host byte order */
+    uint32_t length;          /* of the datagram */
+    uint32_t reserved;
+};
+
+struct lost_event {
+    uint32_t size, kind; /* EVENT_LOST */
+    uint32_t route, target;
+    uint32_t reason;     /* enum loss */
+    int32_t error;       /* errno, of LOSS_SEND_BUFFER_FULL and LOSS_SEND_ERROR */
+};
+
+/* Why a target did not get a message, by the names of DROP_REASONS in compiler/metrics.py. */
+enum loss {
+    LOSS_MAPPING_ERROR,
+    LOSS_NON_FINITE,
+    LOSS_STALE,
+    LOSS_RATE_LIMITED,
+    LOSS_QUEUE_FULL,
+    LOSS_SEND_BUFFER_FULL,
+    LOSS_SEND_ERROR
+};
+
+#endif
