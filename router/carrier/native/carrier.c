@@ -1,0 +1,117 @@
+/* The carrier's threads: start, stop, and what other threads ask of them. */
+#include "carrier_internal.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdlib.h>
+#include <sys/epoll.h>
+#include <sys/eventfd.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include "clock.h"
+
+static const int64_t PYTHON_TIMEOUT = 30000000000; /* ns for which the watchdog is fed while Python is stuck */
+static const char ALIVE[] = "WATCHDOG=1";
+
+struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct ring *events) {
+    struct carrier *carrier = calloc(1, sizeof *carrier);
+    if (!carrier) return NULL;
+    carrier->deadmen = deadmen;
+    carrier->counters = counters;
+    carrier->events = events;
+    carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
+    carrier->closing = eventfd(0, EFD_CLOEXEC);
+    if (carrier->epoll < 0 || carrier->closing < 0) {
+        carrier_close(carrier);
+        return NULL;
+    }
+    return carrier;
+}
+
+/* Start a thread that gets no signals: those are Python's. */
+static int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), struct carrier *carrier) {
+    sigset_t all, usual;
+    sigfillset(&all);
+    pthread_sigmask(SIG_SETMASK, &all, &usual);
+    int error = pthread_create(thread, NULL, run, carrier);
+    pthread_sigmask(SIG_SETMASK, &usual, NULL);
+    if (!error) pthread_setname_np(*thread, name);
+    return error;
+}
+
+int carrier_start(struct carrier *carrier, const struct change *first, int notify, int64_t interval) {
+    carrier->notify = notify;
+    carrier->interval = interval;
+    carrier_pulse(carrier);
+    carrier_adopt_first(carrier, first);
+    int error = start_thread(&carrier->timing, "brakes", timer_thread, carrier);
+    if (error) return error;
+    error = start_thread(&carrier->receiving, "receive", receive_thread, carrier);
+    carrier->has_started = true;
+    carrier->has_stopped = error != 0;
+    return error;
+}
+
+void carrier_change(struct carrier *carrier, const struct change *change) {
+    atomic_store(&carrier->adopted, NULL);
+    atomic_store(&carrier->next, change);
+    while (atomic_load(&carrier->adopted) != change) usleep(200);
+}
+
+void carrier_resume(struct carrier *carrier) { atomic_store(&carrier->is_held, false); }
+
+void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost) {
+    carrier->mirror_lost = lost;
+    atomic_store_explicit(&carrier->mirror, mirror, memory_order_release);
+}
+
+void carrier_pulse(struct carrier *carrier) { atomic_store(&carrier->pulse, monotonic_ns()); }
+
+uint64_t carrier_turns(struct carrier *carrier) { return atomic_load_explicit(&carrier->turns, memory_order_relaxed); }
+
+/* Feed the service manager's watchdog while receiving makes progress and Python does something now and then. */
+static void feed_watchdog(struct carrier *carrier) {
+    uint64_t turns = carrier_turns(carrier);
+    if (turns == carrier->turns_seen || monotonic_ns() - atomic_load(&carrier->pulse) > PYTHON_TIMEOUT) return;
+    carrier->turns_seen = turns;
+    send(carrier->notify, ALIVE, sizeof ALIVE - 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+}
+
+/* Serves deadmen when nothing is received, and the watchdog. */
+void *timer_thread(void *of) {
+    struct carrier *carrier = of;
+    int64_t feeds_at = monotonic_ns() + carrier->interval;
+    while (!atomic_load(&carrier->is_closing)) {
+        struct pollfd waiting[] = {{carrier->deadmen->timer, POLLIN, 0}, {carrier->closing, POLLIN, 0}};
+        bool has_watchdog = carrier->notify >= 0;
+        int64_t wait = feeds_at - monotonic_ns();
+        poll(waiting, 2, has_watchdog ? (wait > 0 ? (int)(wait / 1000000) + 1 : 0) : -1);
+        if (waiting[0].revents) deadmen_serve(carrier->deadmen, monotonic_ns());
+        if (has_watchdog && monotonic_ns() >= feeds_at) {
+            feed_watchdog(carrier);
+            feeds_at = monotonic_ns() + carrier->interval;
+        }
+    }
+    return NULL;
+}
+
+void carrier_stop_receiving(struct carrier *carrier) {
+    if (!carrier->has_started || carrier->has_stopped) return;
+    atomic_store(&carrier->is_stopping, true);
+    pthread_join(carrier->receiving, NULL);
+    carrier->has_stopped = true;
+}
+
+void carrier_close(struct carrier *carrier) {
+    carrier_stop_receiving(carrier);
+    if (carrier->has_started) {
+        atomic_store(&carrier->is_closing, true);
+        eventfd_write(carrier->closing, 1);
+        pthread_join(carrier->timing, NULL);
+    }
+    if (carrier->epoll >= 0) close(carrier->epoll);
+    if (carrier->closing >= 0) close(carrier->closing);
+    free(carrier);
+}

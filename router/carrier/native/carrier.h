@@ -1,0 +1,164 @@
+/* The carrier: receives datagrams, forwards them, and hands to Python what only Python can do.
+ *
+ * It executes a program: immutable arrays that router/carrier/program.py makes of a compiled table. All arrays belong to
+ * the caller and must live until another program was adopted and the rings hold nothing that refers to them. */
+#ifndef CARRIER_H
+#define CARRIER_H
+
+#include <netinet/in.h>
+#include <stdatomic.h>
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "counters.h"
+#include "deadman.h"
+#include "envelope.h"
+#include "freshness.h"
+#include "limit.h"
+#include "ring.h"
+#include "sender.h"
+
+/* A destination to which a route forwards its datagrams. */
+struct destination {
+    struct sender *sender;
+    struct limit *limit; /* `max_rate`, or NULL */
+    const struct feed *feeds;
+    uint32_t feed_count;
+    uint32_t trims; /* it gets datagrams without their trailing zeros */
+    uint32_t id;    /* of the target, in events */
+    /* Counters: */
+    uint32_t sent, sent_bytes, stale, rate_limited, send_buffer_full, send_error;
+    uint32_t reserved;
+};
+
+/* A target that Python serves. */
+struct waiting {
+    uint32_t id;                            /* of the target, in events */
+    uint32_t waiting, queue_full, filtered; /* counters */
+};
+
+/* The targets of a route that one thread of Python serves. */
+struct part {
+    struct ring *ring;
+    const uint8_t *const *wanted; /* flags, not 0 while somebody subscribes to a topic */
+    const struct waiting *targets;
+    uint32_t wanted_count, target_count;
+    uint32_t is_always_wanted;
+    uint32_t handler; /* as Python knows it */
+    uint32_t route;   /* in events */
+    uint32_t reserved;
+};
+
+struct route {
+    int64_t ttl; /* ns, 0 for none */
+    const struct destination *destinations;
+    const struct part *parts;
+    uint32_t destination_count, part_count;
+    uint32_t id;                     /* in events */
+    uint32_t last_message, duration; /* counters; a histogram has HISTOGRAM_BOUNDS + 2 */
+    uint32_t reserved;
+};
+
+/* What a sender's messages of a payload case come to: the index of a route, or -1. */
+struct entry {
+    int32_t route;
+    uint32_t received; /* counter */
+};
+
+/* A field of the envelope's oneof. */
+struct payload_case {
+    uint32_t number;
+    int32_t row;        /* of the listener's entries; -1 for a case without a route */
+    uint32_t is_ignored;
+    uint32_t unhandled; /* counter */
+};
+
+/* An endpoint as a listener recognises it. */
+struct peer {
+    uint32_t address; /* host byte order */
+    uint32_t port;    /* 0: any */
+    uint32_t column;  /* of the listener's entries */
+    uint32_t last_seen; /* counter */
+};
+
+struct listener {
+    int32_t fd;
+    uint32_t id; /* in events, and in what is mirrored */
+    uint32_t repairs;
+    uint32_t keeps_input; /* what it holds at the stop is left for the next process */
+    const struct peer *peers; /* by address; of one address, those with a port first */
+    const struct entry *entries; /* `columns` for each row; the last one is for strangers */
+    uint32_t peer_count, columns;
+    uint32_t received, received_bytes, padded, rejected[REASONS]; /* counters */
+    uint32_t reserved;
+};
+
+struct program {
+    uint32_t generation;
+    uint32_t listener_count, case_count;
+    uint32_t unknown_case; /* counter */
+    const struct wire_schema *schema;
+    const struct listener *listeners;
+    const struct payload_case *cases; /* by number */
+    const struct route *routes;
+};
+
+/* What changes with a program, beside it: done between two datagrams. */
+struct change {
+    const struct program *program;
+    struct deadman *const *replaced; /* pairs: the next deadman, the earlier one */
+    struct deadman *const *ended;
+    uint32_t replaced_count, ended_count;
+    uint32_t holds; /* receive nothing after the change before `carrier_resume`, for at most 1 s */
+    uint32_t reserved;
+};
+
+/* A message for a part, as it stands in the ring. The bytes of the datagram follow, with the zeros that were put back. */
+struct message_record {
+    uint32_t size, generation;
+    const struct part *part;
+    int64_t received_at;  /* wall clock */
+    int64_t now, born;    /* monotonic: when it was received, and when it arrived */
+    uint32_t column;      /* of the sender */
+    uint32_t is_single;   /* the payload is the only field */
+    uint32_t length;      /* of the datagram */
+    uint32_t start, payload_length; /* of the payload, where it is the only field */
+    uint32_t reserved;
+};
+
+/* A received datagram in the mirror; up to MAX_DATAGRAM + 1 bytes of it follow. */
+struct mirror_record {
+    uint32_t size, listener;
+    int64_t at; /* wall clock */
+    uint32_t address, port; /* of the sender, host byte order */
+    uint32_t length, reserved;
+};
+
+struct carrier;
+
+/* Open a carrier that counts in `counters`; NULL for lack of memory. Losses and rejections go to `events`. */
+struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct ring *events);
+
+/* Start the threads. Return 0, or an errno. `notify` is a socket that is connected to a service manager whose watchdog
+ * is to be fed every `interval` ns, or -1. */
+int carrier_start(struct carrier *carrier, const struct change *first, int notify, int64_t interval);
+
+/* Adopt another program between two datagrams; return when that is done. Listeners that it does not have are emptied
+ * before. */
+void carrier_change(struct carrier *carrier, const struct change *change);
+void carrier_resume(struct carrier *carrier);
+
+/* Show received datagrams in `mirror` from now on; NULL for none. `lost` is the counter of those that had no room. */
+void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost);
+
+/* Python is alive: to be called every few seconds, or the watchdog is not fed. */
+void carrier_pulse(struct carrier *carrier);
+
+/* A number that grows at least every 50 ms unless the receive thread is stuck. */
+uint64_t carrier_turns(struct carrier *carrier);
+
+/* Handle what the kernel holds, and end the receive thread; then `carrier_close` ends the timer thread too. */
+void carrier_stop_receiving(struct carrier *carrier);
+void carrier_close(struct carrier *carrier);
+
+#endif

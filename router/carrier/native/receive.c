@@ -1,0 +1,386 @@
+/* The receive thread. It waits for datagrams and for nothing else: other threads get what they need by rings. */
+#include "carrier_internal.h"
+
+#include <errno.h>
+#include <string.h>
+#include <sys/epoll.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include "clock.h"
+#include "events.h"
+
+enum {
+    TURN_MS = 50,              /* the longest wait for a datagram */
+    MOST_DRAINED = 1 << 16,    /* datagrams: more than a receive buffer holds */
+    MOST_EVENTS = 32,          /* per EVENT_WINDOW: a flood is counted, not reported */
+    LISTENERS_PER_WAIT = 16,
+};
+static const int64_t EVENT_WINDOW = 10000000, LONGEST_HOLD = 1000000000;
+
+/* HISTOGRAM_BOUNDS_NS in compiler/metrics.py; a cell for what is slower and one for the sum follow. */
+enum { HISTOGRAM_BOUNDS = 12 };
+static const int64_t BOUNDS[HISTOGRAM_BOUNDS] = {10000,   20000,   50000,   100000,   200000,   500000,
+                                                 1000000, 2000000, 5000000, 10000000, 20000000, 50000000};
+
+/* A datagram that was received, with what is known about it. */
+struct received {
+    const struct listener *listener;
+    size_t length;
+    uint32_t address, port; /* of the sender */
+    uint32_t column;
+    int64_t received_at, now, born;
+    struct envelope envelope;
+};
+
+uint32_t histogram_cell(int64_t elapsed) {
+    uint32_t cell = 0;
+    while (cell < HISTOGRAM_BOUNDS && elapsed > BOUNDS[cell]) cell++;
+    return cell;
+}
+
+void count_duration(counter *counters, uint32_t histogram, int64_t elapsed) {
+    counter_add(counters, histogram + histogram_cell(elapsed), 1);
+    counter_add(counters, histogram + HISTOGRAM_BOUNDS + 1, elapsed);
+}
+
+/* ---- events ---- */
+
+static bool may_report(struct carrier *carrier, int64_t now) {
+    if (now - carrier->window_began > EVENT_WINDOW) {
+        carrier->window_began = now;
+        carrier->events_left = MOST_EVENTS;
+    }
+    if (!carrier->events_left) return false;
+    carrier->events_left--;
+    return true;
+}
+
+static void report_loss(struct carrier *carrier, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error) {
+    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error};
+    if (may_report(carrier, now)) ring_put(carrier->events, &event, sizeof event);
+}
+
+static uint32_t padded_to_word(size_t size) { return (uint32_t)((size + 7) & ~(size_t)7); }
+
+static void reject(struct carrier *carrier, const struct received *received, enum reason reason) {
+    const struct listener *listener = received->listener;
+    counter_add(carrier->counters, listener->rejected[reason], 1);
+    if (reason == IGNORED || !may_report(carrier, received->now)) return;
+    struct rejected_event *event = (struct rejected_event *)carrier->record;
+    size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
+    *event = (struct rejected_event){.size = padded_to_word(sizeof *event + kept),
+                                     .kind = EVENT_REJECTED,
+                                     .listener = listener->id,
+                                     .reason = reason,
+                                     .address = received->address,
+                                     .port = received->port,
+                                     .length = (uint32_t)received->length};
+    memcpy(event + 1, carrier->datagram, kept);
+    ring_put(carrier->events, event, event->size);
+}
+
+/* ---- the mirror ---- */
+
+static void mirror(struct carrier *carrier, struct ring *to, const struct received *received) {
+    struct mirror_record *record = (struct mirror_record *)carrier->record;
+    size_t kept = received->length < MAX_DATAGRAM + 1 ? received->length : MAX_DATAGRAM + 1;
+    *record = (struct mirror_record){.size = padded_to_word(sizeof *record + kept),
+                                     .listener = received->listener->id,
+                                     .at = received->received_at,
+                                     .address = received->address,
+                                     .port = received->port,
+                                     .length = (uint32_t)kept};
+    memcpy(record + 1, carrier->datagram, kept);
+    if (!ring_put(to, record, record->size)) counter_add(carrier->counters, carrier->mirror_lost, 1);
+}
+
+/* ---- targets ---- */
+
+static size_t without_trailing_zeros(const uint8_t *data, size_t size) {
+    while (size && !data[size - 1]) size--;
+    return size;
+}
+
+static enum loss loss_of(int error) {
+    bool is_full = error == EAGAIN || error == EWOULDBLOCK || error == ENOBUFS;
+    return is_full ? LOSS_SEND_BUFFER_FULL : LOSS_SEND_ERROR;
+}
+
+static void forward(struct carrier *carrier, const struct route *route, const struct received *received) {
+    counter *counters = carrier->counters;
+    int64_t expires = route->ttl ? received->born + route->ttl : NEVER;
+    for (uint32_t index = 0; index < route->destination_count; index++) {
+        const struct destination *to = &route->destinations[index];
+        if (route->ttl && monotonic_ns() > expires) {
+            counter_add(counters, to->stale, 1);
+            continue;
+        }
+        if (to->limit && !limit_passes(to->limit, received->now)) {
+            counter_add(counters, to->rate_limited, 1);
+            continue;
+        }
+        size_t size = to->trims ? without_trailing_zeros(carrier->datagram, received->length) : received->length;
+        int error = command_send(carrier->deadmen, to->sender, carrier->datagram, size, expires, to->feeds, to->feed_count);
+        if (!error) {
+            counter_add(counters, to->sent, 1);
+            counter_add(counters, to->sent_bytes, (int64_t)size);
+        } else if (error == COMMAND_STALE) {
+            counter_add(counters, to->stale, 1);
+        } else {
+            enum loss reason = loss_of(error);
+            counter_add(counters, reason == LOSS_SEND_ERROR ? to->send_error : to->send_buffer_full, 1);
+            report_loss(carrier, received->now, route->id, to->id, reason, error);
+        }
+    }
+}
+
+static bool is_wanted(const struct part *part) {
+    if (part->is_always_wanted) return true;
+    for (uint32_t index = 0; index < part->wanted_count; index++)
+        if (__atomic_load_n(part->wanted[index], __ATOMIC_RELAXED)) return true;
+    return false;
+}
+
+static void drop_oldest(struct carrier *carrier, struct ring *ring, int64_t now) {
+    struct message_record oldest;
+    if (!ring_drop(ring, &oldest, sizeof oldest)) return;
+    for (uint32_t index = 0; index < oldest.part->target_count; index++) {
+        const struct waiting *target = &oldest.part->targets[index];
+        counter_add(carrier->counters, target->waiting, -1);
+        counter_add(carrier->counters, target->queue_full, 1);
+        report_loss(carrier, now, oldest.part->route, target->id, LOSS_QUEUE_FULL, 0);
+    }
+}
+
+static void hand_over(struct carrier *carrier, const struct part *part, const struct received *received) {
+    if (!is_wanted(part)) {
+        for (uint32_t index = 0; index < part->target_count; index++)
+            counter_add(carrier->counters, part->targets[index].filtered, 1);
+        return;
+    }
+    struct message_record *record = (struct message_record *)carrier->record;
+    size_t whole = received->envelope.size > received->length ? received->envelope.size : received->length;
+    *record = (struct message_record){.size = padded_to_word(sizeof *record + whole),
+                                      .generation = carrier->program->generation,
+                                      .part = part,
+                                      .received_at = received->received_at,
+                                      .now = received->now,
+                                      .born = received->born,
+                                      .column = received->column,
+                                      .is_single = received->envelope.is_single,
+                                      .length = (uint32_t)received->length,
+                                      .start = received->envelope.start,
+                                      .payload_length = received->envelope.length};
+    memcpy(record + 1, carrier->datagram, whole);
+    for (uint32_t index = 0; index < part->target_count; index++)
+        counter_add(carrier->counters, part->targets[index].waiting, 1);
+    while (!ring_put(part->ring, record, record->size)) drop_oldest(carrier, part->ring, received->now);
+}
+
+/* ---- routing ---- */
+
+/* Return the endpoint that has sent, or NULL for a stranger. One with a port is preferred to one without. */
+static const struct peer *find_peer(const struct listener *listener, uint32_t address, uint32_t port) {
+    uint32_t low = 0, high = listener->peer_count;
+    while (low < high) {
+        uint32_t middle = (low + high) / 2;
+        if (listener->peers[middle].address < address) low = middle + 1;
+        else high = middle;
+    }
+    for (; low < listener->peer_count && listener->peers[low].address == address; low++)
+        if (!listener->peers[low].port || listener->peers[low].port == port) return &listener->peers[low];
+    return NULL;
+}
+
+static const struct payload_case *find_case(const struct program *program, uint32_t number) {
+    uint32_t low = 0, high = program->case_count;
+    while (low < high) {
+        uint32_t middle = (low + high) / 2;
+        if (program->cases[middle].number < number) low = middle + 1;
+        else high = middle;
+    }
+    return &program->cases[low]; /* envelope_read returns no other number */
+}
+
+static void route(struct carrier *carrier, const struct payload_case *found, const struct received *received) {
+    const struct program *program = carrier->program;
+    const struct listener *listener = received->listener;
+    if (found->row < 0) {
+        if (!found->is_ignored) counter_add(carrier->counters, found->unhandled, 1);
+        reject(carrier, received, found->is_ignored ? IGNORED : UNHANDLED);
+        return;
+    }
+    const struct entry *entry = &listener->entries[(uint32_t)found->row * listener->columns + received->column];
+    if (entry->route < 0) {
+        reject(carrier, received, SOURCE_MISMATCH);
+        return;
+    }
+    const struct route *chosen = &program->routes[entry->route];
+    counter_add(carrier->counters, entry->received, 1);
+    forward(carrier, chosen, received);
+    for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(carrier, &chosen->parts[index], received);
+    counter_set(carrier->counters, chosen->last_message, received->received_at);
+    count_duration(carrier->counters, chosen->duration, monotonic_ns() - received->now);
+}
+
+static void handle(struct carrier *carrier, struct received *received, int64_t arrived_at) {
+    const struct listener *listener = received->listener;
+    counter *counters = carrier->counters;
+    received->now = monotonic_ns();
+    received->received_at = wall_ns();
+    received->born = freshness_born(&carrier->freshness, arrived_at ? arrived_at : received->received_at,
+                                    received->received_at, received->now);
+    counter_add(counters, listener->received, 1);
+    counter_add(counters, listener->received_bytes, (int64_t)received->length);
+    const struct peer *peer = find_peer(listener, received->address, received->port);
+    received->column = peer ? peer->column : listener->columns - 1;
+    if (peer) counter_set(counters, peer->last_seen, received->received_at);
+    struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
+    if (observed) mirror(carrier, observed, received);
+    int reason = envelope_read(carrier->program->schema, carrier->datagram, received->length, listener->repairs,
+                               &received->envelope);
+    if (received->envelope.is_repaired) counter_add(counters, listener->padded, 1);
+    if (reason >= 0) {
+        if (reason == UNKNOWN_CASE) counter_add(counters, carrier->program->unknown_case, 1);
+        reject(carrier, received, (enum reason)reason);
+        return;
+    }
+    route(carrier, find_case(carrier->program, received->envelope.case_number), received);
+}
+
+/* ---- receiving ---- */
+
+/* The time at which the kernel got a datagram, by the wall clock; 0 if it does not say. */
+static int64_t arrival(struct msghdr *message) {
+    for (struct cmsghdr *each = CMSG_FIRSTHDR(message); each; each = CMSG_NXTHDR(message, each))
+        if (each->cmsg_level == SOL_SOCKET && each->cmsg_type == SCM_TIMESTAMPNS) {
+            struct timespec stamp;
+            memcpy(&stamp, CMSG_DATA(each), sizeof stamp);
+            return (int64_t)stamp.tv_sec * 1000000000 + stamp.tv_nsec;
+        }
+    return 0;
+}
+
+/* Receive and handle a datagram. Return whether there was one. */
+static bool receive_one(struct carrier *carrier, const struct listener *listener, int flags) {
+    struct sockaddr_in sender;
+    union { struct cmsghdr aligned; char bytes[CMSG_SPACE(sizeof(struct timespec))]; } control;
+    struct iovec into = {carrier->datagram, MAX_DATAGRAM + 1};
+    struct msghdr message = {.msg_name = &sender, .msg_namelen = sizeof sender, .msg_iov = &into, .msg_iovlen = 1,
+                             .msg_control = &control, .msg_controllen = sizeof control};
+    ssize_t length = recvmsg(listener->fd, &message, flags | MSG_TRUNC); /* returns the true length */
+    if (length < 0) {
+        if (errno != EAGAIN && errno != EINTR) usleep(1000); /* an error of the network: it is not to keep us busy */
+        return false;
+    }
+    if (!message.msg_namelen) { /* input has ended; an empty datagram has a sender */
+        if (!(flags & MSG_DONTWAIT)) usleep(1000);
+        return false;
+    }
+    struct received received = {.listener = listener, .length = (size_t)length,
+                                .address = ntohl(sender.sin_addr.s_addr), .port = ntohs(sender.sin_port)};
+    handle(carrier, &received, arrival(&message));
+    return true;
+}
+
+static void brake(struct carrier *carrier) {
+    int64_t due = atomic_load_explicit(&carrier->deadmen->next_due, memory_order_relaxed);
+    if (due == NEVER) return;
+    int64_t now = monotonic_ns();
+    if (due <= now) deadmen_serve(carrier->deadmen, now);
+}
+
+static void drain(struct carrier *carrier, const struct listener *listener) {
+    for (int left = MOST_DRAINED; left && receive_one(carrier, listener, MSG_DONTWAIT); left--) brake(carrier);
+}
+
+/* ---- changes of the program ---- */
+
+static bool has_listener(const struct program *program, int fd) {
+    for (uint32_t index = 0; index < program->listener_count; index++)
+        if (program->listeners[index].fd == fd) return true;
+    return false;
+}
+
+static void wait_for_resume(struct carrier *carrier) {
+    int64_t until = monotonic_ns() + LONGEST_HOLD;
+    while (atomic_load(&carrier->is_held) && monotonic_ns() < until) {
+        brake(carrier);
+        usleep(200);
+    }
+    atomic_store(&carrier->is_held, false);
+}
+
+static void adopt(struct carrier *carrier, const struct change *change) {
+    const struct program *earlier = carrier->program;
+    if (earlier)
+        for (uint32_t index = 0; index < earlier->listener_count; index++)
+            if (!has_listener(change->program, earlier->listeners[index].fd)) drain(carrier, &earlier->listeners[index]);
+    for (uint32_t index = 0; index < change->replaced_count; index++)
+        deadman_replace(carrier->deadmen, change->replaced[2 * index], change->replaced[2 * index + 1]);
+    for (uint32_t index = 0; index < change->ended_count; index++) deadman_end(carrier->deadmen, change->ended[index]);
+    struct timeval turn = {0, TURN_MS * 1000};
+    for (uint32_t index = 0; index < change->program->listener_count; index++)
+        setsockopt(change->program->listeners[index].fd, SOL_SOCKET, SO_RCVTIMEO, &turn, sizeof turn);
+    carrier->program = change->program;
+    if (change->holds) atomic_store(&carrier->is_held, true);
+    atomic_store(&carrier->adopted, change);
+}
+
+/* Adopt the next program if there is one. Return whether there was one. */
+static bool has_changed(struct carrier *carrier) {
+    const struct change *next = atomic_load_explicit(&carrier->next, memory_order_acquire);
+    if (!next) return false;
+    atomic_store(&carrier->next, NULL);
+    adopt(carrier, next);
+    wait_for_resume(carrier);
+    return true;
+}
+
+static bool is_stopping(struct carrier *carrier) {
+    return atomic_load_explicit(&carrier->is_stopping, memory_order_relaxed);
+}
+
+static bool goes_on(struct carrier *carrier) {
+    brake(carrier);
+    atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_relaxed);
+    return !is_stopping(carrier) && !has_changed(carrier);
+}
+
+/* With one system call per datagram: a receive that blocks. */
+static void receive_from_one(struct carrier *carrier) {
+    const struct listener *listener = carrier->program->listeners;
+    do receive_one(carrier, listener, 0);
+    while (goes_on(carrier));
+}
+
+/* One datagram of each listener that has some per turn, so that none starves the others. */
+static void receive_from_many(struct carrier *carrier, int waiting) {
+    const struct program *program = carrier->program;
+    for (uint32_t index = 0; index < program->listener_count; index++) {
+        struct epoll_event interest = {.events = EPOLLIN, .data.u32 = index};
+        epoll_ctl(waiting, EPOLL_CTL_ADD, program->listeners[index].fd, &interest);
+    }
+    do {
+        struct epoll_event ready[LISTENERS_PER_WAIT];
+        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, TURN_MS);
+        for (int index = 0; index < count; index++)
+            receive_one(carrier, &program->listeners[ready[index].data.u32], MSG_DONTWAIT);
+    } while (goes_on(carrier));
+    for (uint32_t index = 0; index < program->listener_count; index++)
+        epoll_ctl(waiting, EPOLL_CTL_DEL, program->listeners[index].fd, NULL);
+}
+
+void *receive_thread(void *of) {
+    struct carrier *carrier = of;
+    while (!is_stopping(carrier)) {
+        if (carrier->program->listener_count == 1) receive_from_one(carrier);
+        else receive_from_many(carrier, carrier->epoll);
+    }
+    for (uint32_t index = 0; index < carrier->program->listener_count; index++)
+        if (!carrier->program->listeners[index].keeps_input) drain(carrier, &carrier->program->listeners[index]);
+    return NULL;
+}
+
+void carrier_adopt_first(struct carrier *carrier, const struct change *first) { adopt(carrier, first); }

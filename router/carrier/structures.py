@@ -1,0 +1,198 @@
+"""The C structures that Python fills and reads, field by field as in `native/`. `library` compares their sizes."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, c_int32, c_int64, c_uint32, c_void_p
+
+REASONS = 8
+"""Reasons to reject a datagram: those of REJECT_REASONS, in the same order."""
+
+
+class Limit(ctypes.Structure):
+    """`struct limit` in limit.h."""
+
+    _fields_ = (("period", c_int64), ("late", c_int64), ("next_pass", c_int64))
+
+
+class Feed(ctypes.Structure):
+    """`struct feed` in deadman.h."""
+
+    _fields_ = (("deadman", c_void_p), ("disarms", c_uint32), ("reserved", c_uint32))
+
+
+class Destination(ctypes.Structure):
+    """`struct destination` in carrier.h."""
+
+    _fields_ = (
+        ("sender", c_void_p),
+        ("limit", POINTER(Limit)),
+        ("feeds", POINTER(Feed)),
+        ("feed_count", c_uint32),
+        ("trims", c_uint32),
+        ("id", c_uint32),
+        ("sent", c_uint32),
+        ("sent_bytes", c_uint32),
+        ("stale", c_uint32),
+        ("rate_limited", c_uint32),
+        ("send_buffer_full", c_uint32),
+        ("send_error", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+class Waiting(ctypes.Structure):
+    """`struct waiting` in carrier.h."""
+
+    _fields_ = (("id", c_uint32), ("waiting", c_uint32), ("queue_full", c_uint32), ("filtered", c_uint32))
+
+
+class Part(ctypes.Structure):
+    """`struct part` in carrier.h."""
+
+    _fields_ = (
+        ("ring", c_void_p),
+        ("wanted", POINTER(c_void_p)),
+        ("targets", POINTER(Waiting)),
+        ("wanted_count", c_uint32),
+        ("target_count", c_uint32),
+        ("is_always_wanted", c_uint32),
+        ("handler", c_uint32),
+        ("route", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+class Route(ctypes.Structure):
+    """`struct route` in carrier.h."""
+
+    _fields_ = (
+        ("ttl", c_int64),
+        ("destinations", POINTER(Destination)),
+        ("parts", POINTER(Part)),
+        ("destination_count", c_uint32),
+        ("part_count", c_uint32),
+        ("id", c_uint32),
+        ("last_message", c_uint32),
+        ("duration", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+class Entry(ctypes.Structure):
+    """`struct entry` in carrier.h."""
+
+    _fields_ = (("route", c_int32), ("received", c_uint32))
+
+
+class Case(ctypes.Structure):
+    """`struct payload_case` in carrier.h."""
+
+    _fields_ = (("number", c_uint32), ("row", c_int32), ("is_ignored", c_uint32), ("unhandled", c_uint32))
+
+
+class Peer(ctypes.Structure):
+    """`struct peer` in carrier.h."""
+
+    _fields_ = (("address", c_uint32), ("port", c_uint32), ("column", c_uint32), ("last_seen", c_uint32))
+
+
+class Listener(ctypes.Structure):
+    """`struct listener` in carrier.h."""
+
+    _fields_ = (
+        ("fd", c_int32),
+        ("id", c_uint32),
+        ("repairs", c_uint32),
+        ("keeps_input", c_uint32),
+        ("peers", POINTER(Peer)),
+        ("entries", POINTER(Entry)),
+        ("peer_count", c_uint32),
+        ("columns", c_uint32),
+        ("received", c_uint32),
+        ("received_bytes", c_uint32),
+        ("padded", c_uint32),
+        ("rejected", c_uint32 * REASONS),
+        ("reserved", c_uint32),
+    )
+
+
+class Program(ctypes.Structure):
+    """`struct program` in carrier.h."""
+
+    _fields_ = (
+        ("generation", c_uint32),
+        ("listener_count", c_uint32),
+        ("case_count", c_uint32),
+        ("unknown_case", c_uint32),
+        ("schema", c_void_p),
+        ("listeners", POINTER(Listener)),
+        ("cases", POINTER(Case)),
+        ("routes", POINTER(Route)),
+    )
+
+
+class Change(ctypes.Structure):
+    """`struct change` in carrier.h."""
+
+    _fields_ = (
+        ("program", POINTER(Program)),
+        ("replaced", POINTER(c_void_p)),
+        ("ended", POINTER(c_void_p)),
+        ("replaced_count", c_uint32),
+        ("ended_count", c_uint32),
+        ("holds", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+class MessageRecord(ctypes.Structure):
+    """`struct message_record` in carrier.h; the datagram follows."""
+
+    _fields_ = (
+        ("size", c_uint32),
+        ("generation", c_uint32),
+        ("part", POINTER(Part)),
+        ("received_at", c_int64),
+        ("now", c_int64),
+        ("born", c_int64),
+        ("column", c_uint32),
+        ("is_single", c_uint32),
+        ("length", c_uint32),
+        ("start", c_uint32),
+        ("payload_length", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+class MirrorRecord(ctypes.Structure):
+    """`struct mirror_record` in carrier.h; the datagram follows."""
+
+    _fields_ = (
+        ("size", c_uint32),
+        ("listener", c_uint32),
+        ("at", c_int64),
+        ("address", c_uint32),
+        ("port", c_uint32),
+        ("length", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+__all__ = [
+    "REASONS",
+    "Case",
+    "Change",
+    "Destination",
+    "Entry",
+    "Feed",
+    "Limit",
+    "Listener",
+    "MessageRecord",
+    "MirrorRecord",
+    "Part",
+    "Peer",
+    "Program",
+    "Route",
+    "Waiting",
+]
