@@ -20,7 +20,7 @@ from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan, Program
 from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import EngineContext, State, TimerGroup
-from router.engine.deadman import Deadman, FeedMaker, feeder
+from router.engine.deadman import Deadman, FeedMaker, commander, feeder
 from router.engine.dispatch import Receive, Take
 from router.engine.pacing import Pacer
 from router.log import logger
@@ -155,7 +155,7 @@ def wire(
         wall_ns=wall_ns,
         pacing=TimerGroup(counts.pacing, timers.pacing.locked),
         collecting=TimerGroup(counts.collecting, timers.collecting.locked),
-        feed=feeder(deadmen, timers.deadman.locked),
+        command=commander(send, deadmen, timers.deadman.locked, monotonic_ns),
         publish_errors=ros.publish_errors if ros else (),
         pacers=pacers,
         state=state,
@@ -218,7 +218,7 @@ def _pacers(program: Program, pacing: TimerThread, send: Mapping[str, Send], sta
     for endpoint in program.senders:
         if endpoint.budget:
             sending, budget = send[endpoint.name], endpoint.budget
-            pacer = state.keep(("pacer", endpoint.name, budget, sending), partial(Pacer, budget, sending))
+            pacer = state.keep(("pacer", endpoint.name, budget, sending), partial(Pacer, budget))
             pacing.add(pacer)  # before the timers that pass on to it, as they have to end first
             pacers[endpoint.name] = pacer
     return pacers

@@ -2,7 +2,8 @@
 
 The function takes a message and calls what the engine binds for each target NAME: `send_NAME` or `publish_NAME`
 and `wanted_NAME`, or `deliver_NAME` where that may be later; `limit_NAME` for a `max_rate`, and `lost_NAME` for
-whatever fails. It counts in a flat list. `router explain` prints it.
+whatever fails. With a `ttl` or deadmen, `send_NAME` is told when the message expires, checks that again and feeds
+the deadmen. It counts in a flat list. `router explain` prints it.
 """
 
 from __future__ import annotations
@@ -104,6 +105,10 @@ class HandlerSource:
     def _expires(self) -> None:
         if self.route.ttl:
             self.out.line(f"expires = born + {self.route.ttl.value}", self.route.ttl.span)
+
+    @property
+    def _expiry(self) -> str:
+        return "expires" if self.route.ttl else "None"
 
     # frames
 
@@ -232,11 +237,11 @@ class HandlerSource:
         return f"{data}.rstrip(ZERO)" if target.endpoint is not None and target.endpoint.trim_trailing_zeros else data
 
     def _send(self, name: str, target: CheckedTarget) -> None:
-        data = self._data(name, target)
-        if target.deadmen:  # before the command is sent, so that no datagram of a deadman can follow it
-            self.out.line(f"feed_{name}(now)", target.span)
+        arguments = self._data(name, target)
+        if self.route.ttl or target.deadmen:
+            arguments += f", {self._expiry}"
         index = self.counters.index("sent_bytes", self.route.name, target.label)
-        self.out.line(f"counts[{index}] += send_{name}({data})  # sent_bytes", target.span)
+        self.out.line(f"counts[{index}] += send_{name}({arguments})  # sent_bytes", target.span)
         self._count("datagrams_sent", target)
 
     def _publish(self, name: str, target: CheckedTarget) -> None:
@@ -245,6 +250,4 @@ class HandlerSource:
 
     def _deliver(self, name: str, target: CheckedTarget) -> None:
         """Sent or published now or later. What delivers it then counts it and feeds the deadmen."""
-        data = self._data(name, target)
-        expires = "expires" if self.route.ttl else "None"
-        self.out.line(f"deliver_{name}(now, {data}, {expires})", target.span)
+        self.out.line(f"deliver_{name}(now, {self._data(name, target)}, {self._expiry})", target.span)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import FunctionType
 from typing import Any, TypeVar, cast
@@ -10,7 +10,8 @@ from typing import Any, TypeVar, cast
 from router.compiler.metrics import Counters
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
-from router.engine.delivery import MAPPING_FAILURES, Deliver, Feed, FrameOutcome, Outcome, Report, immediately
+from router.engine.deadman import CommandMaker
+from router.engine.delivery import MAPPING_FAILURES, Deliver, FrameOutcome, Outcome, Report, Stale, immediately
 from router.engine.freshness import Freshness
 from router.engine.pacing import Latest, Pacer, RateLimit
 from router.engine.timers import Locked
@@ -63,11 +64,11 @@ class TimerGroup:
 class EngineContext:
     """What an engine's handlers use of the running router. Clocks in ns.
 
-    `send` takes a datagram, by endpoint, and may raise OSError. `publish` takes CDR bytes, by topic, and may raise
+    `send` takes a datagram, by endpoint, and may raise OSError; `command(endpoint, route, names)` returns what sends a
+    message that has a `ttl` or deadmen (see engine.deadman). `publish` takes CDR bytes, by topic, and may raise
     `publish_errors`. `wanted`, by topic, is a list of one that its owner keeps up to date: whether anybody subscribes.
-    `report` is called for losses only. `counts` belong to the thread that calls the handlers. `feed(route, names)`
-    returns what feeds a command's deadmen (see engine.deadman). `pacers` are those of the endpoints with a budget, in
-    the group `pacing`; frames are collected in the group `collecting`.
+    `report` is called for losses only. `counts` belong to the thread that calls the handlers. `pacers` are those of
+    the endpoints with a budget, in the group `pacing`; frames are collected in the group `collecting`.
     """
 
     counts: list[int]
@@ -79,7 +80,7 @@ class EngineContext:
     wall_ns: Callable[[], int]
     pacing: TimerGroup
     collecting: TimerGroup
-    feed: Callable[[str, Sequence[str]], Feed]
+    command: CommandMaker
     publish_errors: tuple[type[Exception], ...] = ()
     pacers: Mapping[str, Pacer] = field(default_factory=dict)
     state: State = field(default_factory=State)
@@ -90,7 +91,7 @@ def bind(handler: Handler, counters: Counters, context: EngineContext, freshness
     namespace: dict[str, Any] = {
         **handler.constants,
         "counts": context.counts,
-        "FAILURES": (*MAPPING_FAILURES, OSError, *context.publish_errors),
+        "FAILURES": (*MAPPING_FAILURES, Stale, OSError, *context.publish_errors),
         "clock_ns": context.clock_ns,
         "monotonic": freshness.born,
     }
@@ -120,9 +121,10 @@ def _target_names(target: TargetPlan, handler: Handler, counters: Counters, cont
     elif target.is_topic:
         names[f"publish_{name}"] = context.publish[target.label]
     else:
-        names[f"send_{name}"] = context.send[target.label]
-        if target.deadmen:
-            names[f"feed_{name}"] = context.feed(route, target.deadmen)
+        is_command = handler.ttl is not None or target.deadmen
+        names[f"send_{name}"] = (
+            context.command(target.label, route, target.deadmen) if is_command else context.send[target.label]
+        )
     if target.max_rate is not None and target.keep is Keep.FIRST:
         rate = target.max_rate
         names[f"limit_{name}"] = context.state.keep(("limit", *place), lambda: RateLimit(rate)).may_pass
@@ -150,17 +152,17 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
     Deadmen are fed when a message leaves: their lock is taken while that of `pacing` is held, never in reverse order.
     """
     (route, _, target), locked = place, context.pacing.locked
-    feed = context.feed(route, target.deadmen) if target.deadmen else None
     destination: object
     pacer = None if target.is_topic else context.pacers.get(target.label)
     if pacer is not None:
-        destination, deliver = pacer, pacer.queue(target.priority, outcome, feed)
+        command = context.command(target.label, route, target.deadmen)
+        destination, deliver = pacer, pacer.queue(target.priority, outcome, command)
     elif target.is_topic:
         destination = publish = context.publish[target.label]
-        deliver = immediately(publish, outcome, context.publish_errors)
+        deliver = immediately(lambda data, _: publish(data), outcome, context.publish_errors)
     else:
-        destination = send = context.send[target.label]
-        deliver = immediately(send, outcome, feed=feed)
+        destination = context.send[target.label]
+        deliver = immediately(context.command(target.label, route, target.deadmen), outcome)
     if target.keep is Keep.LATEST and target.max_rate is not None:
         rate = target.max_rate
         latest = context.state.keep(("latest", *place, destination), lambda: Latest(rate, deliver, outcome))

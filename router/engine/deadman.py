@@ -7,11 +7,14 @@ from dataclasses import dataclass
 
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
-from router.engine.delivery import Feed, Report
+from router.engine.delivery import Command, Feed, Report, Stale
 from router.engine.timers import Locked, Timer
 
 FeedMaker = Callable[[str, Sequence[str]], Feed]
 """Returns for a route and the names in its TargetPlan.deadmen the call that feeds or disarms all of these at once."""
+
+CommandMaker = Callable[[str, str, Sequence[str]], Command]
+"""Returns the Command for an endpoint, a route and the names in its TargetPlan.deadmen."""
 
 _NEVER = 1 << 63
 
@@ -186,13 +189,51 @@ def feeder(deadmen: Mapping[str, Deadman], locked: Locked) -> FeedMaker:
     """`deadmen` are by route; `locked` has one lock for all of them. A deadman is served once its route has a feed."""
 
     def feed(route: str, names: Sequence[str]) -> Feed:
-        calls = [deadmen[name].feed if name == route else deadmen[name].disarm for name in names]
-        first, *others = calls
-
-        def call_all(now: int) -> None:
-            for call in calls:
-                call(now)
-
-        return locked(deadmen[names[0]], call_all if others else first)
+        return locked(deadmen[names[0]], _feed(deadmen, route, names))
 
     return feed
+
+
+def commander(
+    send: Mapping[str, Callable[[bytes], int]],
+    deadmen: Mapping[str, Deadman],
+    locked: Locked,
+    clock_ns: Callable[[], int],
+) -> CommandMaker:
+    """`send` is by endpoint; `deadmen` and `locked` are as in `feeder`. Without deadmen, no lock is taken."""
+
+    def command(endpoint: str, route: str, names: Sequence[str]) -> Command:
+        send_one = send[endpoint]
+        if not names:
+
+            def send_fresh(data: bytes, expires: int | None) -> int:
+                if expires is not None and clock_ns() > expires:
+                    raise Stale
+                return send_one(data)
+
+            return send_fresh
+        feed = _feed(deadmen, route, names)
+
+        def send_fed(data: bytes, expires: int | None) -> int:
+            now = clock_ns()
+            if expires is not None and now > expires:
+                raise Stale
+            feed(now)
+            return send_one(data)
+
+        return locked(deadmen[names[0]], send_fed)
+
+    return command
+
+
+def _feed(deadmen: Mapping[str, Deadman], route: str, names: Sequence[str]) -> Feed:
+    """Return what feeds the deadman of `route` and disarms the others; to be called under their lock."""
+    calls = [deadmen[name].feed if name == route else deadmen[name].disarm for name in names]
+    if len(calls) == 1:
+        return calls[0]
+
+    def call_all(now: int) -> None:
+        for call in calls:
+            call(now)
+
+    return call_all

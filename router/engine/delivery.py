@@ -28,6 +28,18 @@ Monotonic times in ns. The message is counted before or after the return; losses
 Feed = Callable[[int], None]
 """Called right before a command is sent, with the monotonic time in ns: restarts the timeouts of its deadmen."""
 
+Command = Callable[[bytes, int | None], int]
+"""Sends a datagram and returns its size; called with the datagram and the monotonic time in ns after which it is stale
+(None: never).
+
+Checks that, feeds or disarms the deadmen of the command and sends it, all under their lock: so no command leaves
+behind the datagram of a deadman that replaces it. Raises Stale or OSError.
+"""
+
+
+class Stale(Exception):
+    """A message is older than `ttl`, and was not sent."""
+
 
 @dataclass(frozen=True, slots=True)
 class Report:
@@ -80,7 +92,10 @@ class Outcome:
 
     def failed(self, error: Exception) -> None:
         """Count a message as lost because mapping it or handing it over raised `error`."""
-        self.dropped(_reason(error, self._is_topic), error)
+        if isinstance(error, Stale):
+            self.dropped("stale")
+        else:
+            self.dropped(_reason(error, self._is_topic), error)
 
     def filtered(self) -> None:
         self._counts[self._filtered] += 1
@@ -111,18 +126,15 @@ def _reason(error: Exception, is_topic: bool) -> str:
 
 
 def immediately(
-    hand_over: Callable[[bytes], object],
+    hand_over: Callable[[bytes, int | None], object],
     outcome: Outcome,
-    failures: tuple[type[Exception], ...] = (OSError,),
-    feed: Feed | None = None,
+    failures: tuple[type[Exception], ...] = (Stale, OSError),
 ) -> Deliver:
-    """Return a Deliver that calls `feed` and then `hand_over`, which may raise `failures`."""
+    """Return a Deliver that calls `hand_over`, a Command or a function like it that may raise `failures`."""
 
     def deliver(now: int, data: bytes, expires: int | None) -> None:
-        if feed is not None:
-            feed(now)
         try:
-            hand_over(data)
+            hand_over(data, expires)
         except failures as error:
             outcome.failed(error)
         else:

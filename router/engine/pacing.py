@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Container
+from collections.abc import Container
 from math import ceil
 from typing import NamedTuple
 
-from router.engine.delivery import Deliver, Feed, Outcome, Place, immediately, is_stale
+from router.engine.delivery import Command, Deliver, Outcome, Place, immediately, is_stale
 from router.engine.timers import Timer
 from router.table.model import Priority
 
@@ -111,15 +111,13 @@ class Pacer(Timer):
     at most: it waits for commands only, and all others wait until the overdraft is paid.
 
     Waiting datagrams leave by priority, then by age. When more waits than the queue holds, the oldest of the lowest
-    priority is dropped as `queue_full`; what expires in the queue is dropped as `stale`.
-
-    `send` may raise OSError; the datagram is charged all the same.
+    priority is dropped as `queue_full`; what expires in the queue is dropped as `stale`. A datagram is charged also if
+    sending it fails.
     """
 
-    def __init__(self, bytes_per_second: int, send: Callable[[bytes], int]) -> None:
+    def __init__(self, bytes_per_second: int) -> None:
         self.next_due: int | None = None
         self._rate = bytes_per_second
-        self._send = send
         self._overdraft = max(OVERDRAFT, self._cost(LEAST_OVERDRAFT))
         self._lanes: dict[Priority, deque[_Waiting]] = {priority: deque() for priority in Priority}
         self._commands = self._lanes[Priority.COMMAND]
@@ -127,9 +125,9 @@ class Pacer(Timer):
         self._room = max(bytes_per_second * QUEUE // NS, LEAST_QUEUE)
         self._paid_at = -BURST  # when the budget has paid for all that was sent; what lies before now is saved up
 
-    def queue(self, priority: Priority, outcome: Outcome, feed: Feed | None = None) -> Deliver:
-        """Return the Deliver of one target, which sends now or later, or drops. `feed` is as in `immediately`."""
-        lane, send = self._lanes[priority], immediately(self._send, outcome, feed=feed)
+    def queue(self, priority: Priority, outcome: Outcome, command: Command) -> Deliver:
+        """Return the Deliver of one target, which sends by `command` now or later, or drops."""
+        lane, send = self._lanes[priority], immediately(command, outcome)
 
         def deliver(now: int, data: bytes, expires: int | None) -> None:
             self._limit_savings(now)

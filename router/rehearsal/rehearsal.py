@@ -13,7 +13,7 @@ from router.compiler.metrics import Series
 from router.compiler.program import Program
 from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import EngineContext, TimerGroup
-from router.engine.deadman import Deadman, feeder
+from router.engine.deadman import Deadman, commander
 from router.engine.delivery import Report
 from router.engine.dispatch import Peer
 from router.engine.pacing import Pacer
@@ -174,7 +174,7 @@ class Rehearsal:
             plan.route: Deadman(plan, program.counters, counts, send, self._report, self._deadman_changed)
             for plan in program.deadmen
         }
-        pacers = {to.name: Pacer(to.budget, send[to.name]) for to in program.senders if to.budget}
+        pacers = {to.name: Pacer(to.budget) for to in program.senders if to.budget}
         self._timers += pacers.values()  # before what hands on to them
         group = TimerGroup(counts, self._locked)
         return EngineContext(
@@ -187,7 +187,7 @@ class Rehearsal:
             wall_ns=lambda: self.now,
             pacing=group,
             collecting=group,
-            feed=feeder(deadmen, self._locked),
+            command=commander(send, deadmen, self._locked, lambda: self.now),
             pacers=pacers,
         )
 

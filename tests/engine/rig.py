@@ -16,7 +16,7 @@ from router.compiler.metrics import DROP_REASONS, HISTOGRAM_CELLS, Counters
 from router.compiler.program import Handler, Program, TargetPlan
 from router.engine import InboundEngine, OutboundEngine, Report
 from router.engine.binding import EngineContext, TimerGroup
-from router.engine.deadman import Deadman, feeder
+from router.engine.deadman import Deadman, commander
 from router.engine.delivery import FrameOutcome, Outcome
 from router.engine.pacing import Pacer
 from router.engine.timers import Timer
@@ -145,7 +145,7 @@ class Rig:
         self.timers: list[Timer] = []
         group = TimerGroup(self.counts, self._locked)
         send = {plan.name: self._sender(plan.name) for plan in made.senders}
-        pacers = {plan.name: Pacer(plan.budget, send[plan.name]) for plan in made.senders if plan.budget}
+        pacers = {plan.name: Pacer(plan.budget) for plan in made.senders if plan.budget}
         deadmen = {
             plan.route: Deadman(plan, made.counters, self.counts, send, self.reports.append, self._changed)
             for plan in made.deadmen
@@ -161,7 +161,7 @@ class Rig:
             wall_ns=lambda: self.WALL + self.now,
             pacing=group,
             collecting=group,
-            feed=feeder(deadmen, self._locked),
+            command=commander(send, deadmen, self._locked, lambda: self.now),
             publish_errors=(PublishError,),
             pacers=pacers,
         )

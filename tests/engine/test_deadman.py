@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan
-from router.engine.deadman import GREETING, START, Deadman, feeder
-from router.engine.delivery import Report
+from router.engine.deadman import GREETING, START, Deadman, commander, feeder
+from router.engine.delivery import Report, Stale
 from router.engine.timers import Timer
 
 P = ParamSpec("P")
@@ -165,6 +165,37 @@ def test_one_call_feeds_the_own_deadman_and_disarms_the_others(told: list[str], 
     feeder(deadmen, locked)("a", told)(TIMEOUT)
     assert served == [deadmen[told[0]]]
     assert {name for name in told if deadmen[name].next_due is not None} == armed
+
+
+def test_a_command_is_checked_fed_and_sent_under_the_lock() -> None:
+    watched, taken = Watched(), list[str]()
+
+    def locked(timer: Timer, call: Callable[P, R], /) -> Callable[P, R]:
+        def with_lock(*args: P.args, **kwargs: P.kwargs) -> R:
+            taken.append("lock")
+            try:
+                return call(*args, **kwargs)
+            finally:
+                taken.append("unlock")
+
+        return with_lock
+
+    def send(data: bytes) -> int:
+        taken.append(f"send, due at {watched.deadman.next_due}")
+        return len(data)
+
+    command = commander({"board": send}, {"drive": watched.deadman}, locked, lambda: watched.now)
+    send_command, send_other = command("board", "drive", ("drive",)), command("board", "status", ())
+    assert send_command(b"12", 0) == 2
+    assert taken == ["lock", f"send, due at {TIMEOUT}", "unlock"]
+    watched.now = 1
+    with pytest.raises(Stale):
+        send_command(b"12", 0)
+    assert (taken[3:], watched.deadman.next_due) == (["lock", "unlock"], TIMEOUT)
+    with pytest.raises(Stale):
+        send_other(b"12", 0)
+    assert send_other(b"123", None) == 3
+    assert taken[5:] == [f"send, due at {TIMEOUT}"]
 
 
 gaps = st.lists(st.integers(0, 5 * TIMEOUT), min_size=1, max_size=30)

@@ -88,7 +88,7 @@ class Held:
     def __init__(self, hertz: float) -> None:
         self.destination = Destination()
         self.arrived: list[tuple[int, int]] = []
-        hand_over = immediately(lambda _: None, self.destination.outcome)
+        hand_over = immediately(lambda *_: None, self.destination.outcome)
 
         def deliver(now: int, data: bytes, expires: int | None) -> None:
             self.arrived.append((now, int(data)))

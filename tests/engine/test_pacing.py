@@ -27,9 +27,9 @@ class Link:
         self.bytes_sent = 0
         self.error: OSError | None = None
         self.targets: list[Destination] = []
-        self.pacer = Pacer(budget, self._send)
+        self.pacer = Pacer(budget)
 
-    def _send(self, data: bytes) -> int:
+    def _send(self, data: bytes, expires: int | None) -> int:
         if self.error is not None:
             raise self.error
         self.sent.append((self.now, int.from_bytes(data, "little")))
@@ -40,7 +40,7 @@ class Link:
         """Returns the datagram's number: they count from 0."""
         number = len(self.targets)
         self.targets.append(Destination())
-        deliver = self.pacer.queue(priority, self.targets[-1].outcome)
+        deliver = self.pacer.queue(priority, self.targets[-1].outcome, self._send)
         deliver(self.now, number.to_bytes(size, "little"), expires)
         return number
 
@@ -67,13 +67,13 @@ def measured(budget: int, size: int, hertz: float, priority: Priority, late: int
     """The bytes that were sent in 10 s."""
     sent = 0
 
-    def send(data: bytes) -> int:
+    def send(data: bytes, expires: int | None) -> int:
         nonlocal sent
         sent += len(data)
         return len(data)
 
-    pacer = Pacer(budget, send)
-    deliver = pacer.queue(priority, Destination().outcome)
+    pacer = Pacer(budget)
+    deliver = pacer.queue(priority, Destination().outcome, send)
     datagram = bytes(size)
 
     def offer(now: int) -> None:

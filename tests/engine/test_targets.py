@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.compiler.program import Program
+from router.engine.delivery import Stale
 from tests.engine.rig import BASESTATION, DRIVING_BOARD, SENSOR_BOARD, STRANGER, PublishError, Rig, program
 from tests.engine.wire import I32, envelopes, framed, rover_envelope, tag
 
@@ -77,6 +78,15 @@ def test_a_destination_that_fails_is_counted_and_the_others_are_served(rig: Rig,
     [report] = rig.reports
     assert (report.kind, report.place, report.target) == ("drop", "imu_info", "basestation")
     assert (report.reason, report.error) == (reason, error)
+    rig.assert_counters_balance()
+
+
+def test_a_message_that_expires_when_it_is_sent_is_stale(rig: Rig) -> None:
+    rig.failures["basestation"] = Stale()
+    rig.receive(framed(IMU, b""))
+
+    assert rig.dropped("imu_info", "basestation") == {"stale": 1}
+    assert [(report.reason, report.error) for report in rig.reports] == [("stale", None)]
     rig.assert_counters_balance()
 
 
