@@ -161,7 +161,7 @@ class MessageRecord(ctypes.Structure):
         ("length", c_uint32),
         ("start", c_uint32),
         ("payload_length", c_uint32),
-        ("reserved", c_uint32),
+        ("handler", c_uint32),
     )
 
 

@@ -21,9 +21,10 @@ struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct 
     carrier->deadmen = deadmen;
     carrier->counters = counters;
     carrier->events = events;
+    carrier->notify = -1;
     carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
-    carrier->closing = eventfd(0, EFD_CLOEXEC);
-    if (carrier->epoll < 0 || carrier->closing < 0) {
+    carrier->wake = eventfd(0, EFD_CLOEXEC);
+    if (carrier->epoll < 0 || carrier->wake < 0) {
         carrier_close(carrier);
         return NULL;
     }
@@ -41,9 +42,7 @@ static int start_thread(pthread_t *thread, const char *name, void *(*run)(void *
     return error;
 }
 
-int carrier_start(struct carrier *carrier, const struct change *first, int notify, int64_t interval) {
-    carrier->notify = notify;
-    carrier->interval = interval;
+int carrier_start(struct carrier *carrier, const struct change *first) {
     carrier_pulse(carrier);
     carrier_adopt_first(carrier, first);
     int error = start_thread(&carrier->timing, "brakes", timer_thread, carrier);
@@ -76,25 +75,38 @@ static void feed_watchdog(struct carrier *carrier) {
     uint64_t turns = carrier_turns(carrier);
     if (turns == carrier->turns_seen || monotonic_ns() - atomic_load(&carrier->pulse) > PYTHON_TIMEOUT) return;
     carrier->turns_seen = turns;
-    send(carrier->notify, ALIVE, sizeof ALIVE - 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+    send(atomic_load(&carrier->notify), ALIVE, sizeof ALIVE - 1, MSG_DONTWAIT | MSG_NOSIGNAL);
+}
+
+/* Return how long to wait for the watchdog's next turn, in ms for `poll`. */
+static int until_turn(struct carrier *carrier, int64_t turn) {
+    if (atomic_load(&carrier->notify) < 0) return -1;
+    int64_t wait = turn - monotonic_ns();
+    return wait > 0 ? (int)(wait / 1000000) + 1 : 0;
 }
 
 /* Serves deadmen when nothing is received, and the watchdog. */
 void *timer_thread(void *of) {
     struct carrier *carrier = of;
-    int64_t feeds_at = monotonic_ns() + carrier->interval;
+    int64_t turn = 0;
     while (!atomic_load(&carrier->is_closing)) {
-        struct pollfd waiting[] = {{carrier->deadmen->timer, POLLIN, 0}, {carrier->closing, POLLIN, 0}};
-        bool has_watchdog = carrier->notify >= 0;
-        int64_t wait = feeds_at - monotonic_ns();
-        poll(waiting, 2, has_watchdog ? (wait > 0 ? (int)(wait / 1000000) + 1 : 0) : -1);
+        struct pollfd waiting[] = {{carrier->deadmen->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
+        poll(waiting, 2, until_turn(carrier, turn));
+        eventfd_t ignored;
+        if (waiting[1].revents) eventfd_read(carrier->wake, &ignored);
         if (waiting[0].revents) deadmen_serve(carrier->deadmen, monotonic_ns());
-        if (has_watchdog && monotonic_ns() >= feeds_at) {
+        if (atomic_load(&carrier->notify) >= 0 && monotonic_ns() >= turn) {
             feed_watchdog(carrier);
-            feeds_at = monotonic_ns() + carrier->interval;
+            turn = monotonic_ns() + atomic_load(&carrier->interval);
         }
     }
     return NULL;
+}
+
+void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval) {
+    atomic_store(&carrier->interval, interval);
+    atomic_store(&carrier->notify, notify);
+    eventfd_write(carrier->wake, 1);
 }
 
 void carrier_stop_receiving(struct carrier *carrier) {
@@ -108,10 +120,10 @@ void carrier_close(struct carrier *carrier) {
     carrier_stop_receiving(carrier);
     if (carrier->has_started) {
         atomic_store(&carrier->is_closing, true);
-        eventfd_write(carrier->closing, 1);
+        eventfd_write(carrier->wake, 1);
         pthread_join(carrier->timing, NULL);
     }
     if (carrier->epoll >= 0) close(carrier->epoll);
-    if (carrier->closing >= 0) close(carrier->closing);
+    if (carrier->wake >= 0) close(carrier->wake);
     free(carrier);
 }

@@ -123,7 +123,7 @@ struct message_record {
     uint32_t is_single;   /* the payload is the only field */
     uint32_t length;      /* of the datagram */
     uint32_t start, payload_length; /* of the payload, where it is the only field */
-    uint32_t reserved;
+    uint32_t handler;
 };
 
 /* A received datagram in the mirror; up to MAX_DATAGRAM + 1 bytes of it follow. */
@@ -139,9 +139,11 @@ struct carrier;
 /* Open a carrier that counts in `counters`; NULL for lack of memory. Losses and rejections go to `events`. */
 struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct ring *events);
 
-/* Start the threads. Return 0, or an errno. `notify` is a socket that is connected to a service manager whose watchdog
- * is to be fed every `interval` ns, or -1. */
-int carrier_start(struct carrier *carrier, const struct change *first, int notify, int64_t interval);
+/* Start the threads. Return 0, or an errno. */
+int carrier_start(struct carrier *carrier, const struct change *first);
+
+/* Feed the watchdog of a service manager every `interval` ns, by a socket that is connected to it. */
+void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval);
 
 /* Adopt another program between two datagrams; return when that is done. Listeners that it does not have are emptied
  * before. */

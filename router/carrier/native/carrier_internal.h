@@ -23,8 +23,9 @@ struct carrier {
     _Atomic uint64_t turns;
     _Atomic int64_t pulse; /* when Python was alive, monotonic */
     /* Of the timer thread: */
-    int notify, closing; /* a socket; an eventfd */
-    int64_t interval;
+    _Atomic int notify; /* a socket, or -1 */
+    _Atomic int64_t interval;
+    int wake; /* eventfd */
     uint64_t turns_seen;
     pthread_t receiving, timing;
     bool has_started, has_stopped;

@@ -171,7 +171,8 @@ static void hand_over(struct carrier *carrier, const struct part *part, const st
                                       .is_single = received->envelope.is_single,
                                       .length = (uint32_t)received->length,
                                       .start = received->envelope.start,
-                                      .payload_length = received->envelope.length};
+                                      .payload_length = received->envelope.length,
+                                      .handler = part->handler};
     memcpy(record + 1, carrier->datagram, whole);
     for (uint32_t index = 0; index < part->target_count; index++)
         counter_add(carrier->counters, part->targets[index].waiting, 1);

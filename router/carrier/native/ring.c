@@ -110,3 +110,8 @@ void ring_wake(struct ring *ring) { eventfd_write(ring->wake, 1); }
 uint64_t ring_written(struct ring *ring) { return atomic_load(&ring->written); }
 
 uint64_t ring_taken(struct ring *ring) { return atomic_load(&ring->taken); }
+
+int ring_watch(struct ring *ring) {
+    atomic_store(&ring->is_waited_for, 1);
+    return ring->wake;
+}

@@ -35,6 +35,10 @@ bool ring_drop(struct ring *ring, void *record, size_t limit);
 size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms);
 void ring_wake(struct ring *ring);
 
+/* Have each record wake the reader, and return the eventfd by which it does: for a reader that waits for several rings,
+ * and takes with a timeout of 0. */
+int ring_watch(struct ring *ring);
+
 uint64_t ring_written(struct ring *ring);
 uint64_t ring_taken(struct ring *ring);
 
