@@ -1,0 +1,39 @@
+"""Rings: bounded queues of records from a native thread to a Python one, which drop the oldest record when full."""
+
+from __future__ import annotations
+
+import ctypes
+
+from router.carrier.structures import MessageRecord
+from router.engine import MAX_DATAGRAM
+
+LONGEST_RECORD = ctypes.sizeof(MessageRecord) + MAX_DATAGRAM + 8
+
+
+class Ring:
+    """A ring for `capacity` bytes, a power of two. It is never closed: native threads may hold it until the end."""
+
+    def __init__(self, library: ctypes.CDLL, capacity: int) -> None:
+        """Raises MemoryError, also for a lack of descriptors."""
+        self._library = library
+        self.address: int = library.ring_open(capacity)
+        if not self.address:
+            raise MemoryError("a queue of the carrier cannot be opened")
+        self._records = ctypes.create_string_buffer(max(1 << 16, 2 * LONGEST_RECORD))
+        self._view = memoryview(self._records).cast("B")
+
+    def take(self, timeout_ms: int = 0) -> memoryview:
+        """Return whole records, the oldest first; none after the timeout (-1: never) or `wake`.
+
+        They are valid until the next call. For one thread.
+        """
+        size = self._library.ring_take(self.address, self._records, len(self._records), timeout_ms)
+        return self._view[:size]
+
+    def wake(self) -> None:
+        """End the wait of a reader."""
+        self._library.ring_wake(self.address)
+
+    def watch(self) -> int:
+        """Return an eventfd that each new record makes readable, from now on."""
+        return int(self._library.ring_watch(self.address))

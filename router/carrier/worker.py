@@ -1,0 +1,152 @@
+"""A Python thread that serves one part of the routes: it takes messages from a ring and calls their functions.
+
+Each message says of which program it is. So programs change in order: what the earlier one has received is served by
+its functions, then the thread switches, and goes on with the next one's.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from struct import Struct
+
+from router.carrier.ring import Ring
+from router.log import logger
+
+Function = Callable[["bytes | None", bytes, int, int, str, int], None]
+"""Called with the payload (None if there are several fields), the datagram, when it was received (wall clock), taken
+and born (monotonic), and its source; `born` last. Never raises for what was received."""
+
+_RECORD = Struct("@IIQqqqIIIIII")
+"""`struct message_record`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What a worker calls while a program runs: functions by handler, with the indexes at which their targets wait.
+
+    `switch` is called once, before the first message of this program.
+    """
+
+    generation: int
+    functions: Mapping[int, tuple[Function, Sequence[int]]]
+    sources: Sequence[str]
+    switch: Callable[[], None]
+
+
+class Worker:
+    """Serves the messages of `ring` in a thread of its own. `failed` is called with what a function raises.
+
+    `counts` belong to the thread, which takes what it has served off those that wait.
+    """
+
+    def __init__(self, name: str, ring: Ring, counts: list[int], failed: Callable[[Exception], None]) -> None:
+        self._ring = ring
+        self._counts = counts
+        self._failed = failed
+        self._stages: dict[int, Stage] = {}
+        self._stage: Stage | None = None
+        self._latest = 0
+        self._switched = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @property
+    def name(self) -> str:
+        return self._thread.name
+
+    def prepare(self, stage: Stage) -> None:
+        """Have messages of the stage's generation served by it. To be called before there are any."""
+        self._stages[stage.generation] = stage
+
+    def abandon(self, stage: Stage) -> None:
+        """Undo `prepare`, if nothing was received in that generation."""
+        self._stages.pop(stage.generation, None)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def advance(self, generation: int) -> None:
+        """Switch to that generation once all earlier messages are served: none of them can come any more."""
+        self._latest = generation
+        self._ring.wake()
+
+    def wait_for(self, generation: int, timeout: float) -> bool:
+        """Wait until the thread serves that generation. Return False after `timeout` s: it is stuck, or behind."""
+        with self._switched:
+            return self._switched.wait_for(lambda: self._stage and self._stage.generation >= generation, timeout)
+
+    def stop(self, timeout: float) -> bool:
+        """Serve what waits, and end. Return False if that takes longer than `timeout` s: the thread is left."""
+        self._stopping = True
+        self._ring.wake()
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            latest, is_stopping = self._latest, self._stopping
+            records = self._ring.take(0 if is_stopping else -1)
+            if records:
+                self._serve(records)
+            elif self._stage is None or latest > self._stage.generation:
+                self._switch(latest)
+            elif is_stopping:
+                return
+
+    def _switch(self, generation: int) -> None:
+        if (stage := self._stages.get(generation)) is None:
+            return
+        try:
+            stage.switch()
+        except Exception as error:  # noqa: BLE001 a bug of the router is reported, and serving goes on
+            self._failed(error)
+        with self._switched:
+            self._stage = stage
+            self._switched.notify_all()
+        for earlier in [each for each in self._stages if each < generation]:
+            del self._stages[earlier]
+
+    def _serve(self, records: memoryview) -> None:
+        counts, position, end, head = self._counts, 0, len(records), _RECORD.size
+        stage = self._stage
+        while position < end:
+            (
+                size,
+                generation,
+                _,
+                received_at,
+                now,
+                born,
+                column,
+                is_single,
+                length,
+                start,
+                payload_length,
+                number,
+            ) = _RECORD.unpack_from(records, position)
+            if stage is None or generation != stage.generation:
+                self._switch(generation)
+                stage = self._stage
+            assert stage is not None  # noqa: S101 - each generation is prepared before its first message
+            function, waiting = stage.functions[number]
+            data = position + head
+            payload = bytes(records[data + start : data + start + payload_length]) if is_single else None
+            datagram = bytes(records[data : data + length])
+            try:
+                function(payload, datagram, received_at, now, stage.sources[column], born)
+            except Exception as error:  # noqa: BLE001 as above
+                self._failed(error)
+            for index in waiting:
+                counts[index] -= 1
+            position += size
+
+
+def left_behind(workers: Sequence[Worker], generation: int, timeout: float) -> list[str]:
+    """Wait until the workers serve that generation; return the names of those that do not within `timeout` s each."""
+    late = [worker.name for worker in workers if not worker.wait_for(generation, timeout)]
+    if late:
+        logger.error("a thread is stuck, and what it uses stays open", threads=late)
+    return late
