@@ -24,14 +24,15 @@ IMPORTS = {
     "compiler": "errors assets table types",
     "engine": LANGUAGE,
     "net": f"{GROUND} {LANGUAGE} engine",
+    "carrier": f"{GROUND} {LANGUAGE} engine net",
     "ros": f"{GROUND} {LANGUAGE} engine",
     "gateway": f"{GROUND} {LANGUAGE} engine net ros",
     "recording": f"{GROUND} {LANGUAGE} engine net",
     "observe": f"{GROUND} {LANGUAGE} values engine net recording",
     "rehearsal": f"{LANGUAGE} values engine recording",
-    "tools": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe rehearsal",
-    "app": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe",
-    "cli": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe rehearsal tools app",
+    "tools": f"{GROUND} {LANGUAGE} values engine net carrier ros gateway recording observe rehearsal",
+    "app": f"{GROUND} {LANGUAGE} values engine net carrier ros gateway recording observe",
+    "cli": f"{GROUND} {LANGUAGE} values engine net ros gateway recording observe rehearsal tools carrier app",
 }
 """Package -> the packages that it may import. `docs/architecture.md` shows the same."""
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from router.app.python_datapath import PythonDatapath
 from router.app.reloading import Reloader
 from router.app.runtime import Change, Runtime
 from router.app.timers import Timers
@@ -59,7 +61,7 @@ class Router:
         self._counts = ThreadCounts(program.counters)
         self.mirror = Mirror(MAX_DATAGRAM, self._observers_changed, self._reporter.failed)
         context = RouterContext(self._counts, Timers(self._reporter.failed), self._reporter, self._deadman_changed)
-        self._runtime = Runtime(context, ros_args, self.mirror.tee)
+        self._runtime = Runtime(context, ros_args, partial(PythonDatapath, context, self.mirror))
         self._services = Services(self)
         self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
         self._watcher: Watcher | None = None
@@ -131,7 +133,7 @@ class Router:
         return totals | {"kernel_drops": sum(dropped for _, dropped in self._runtime.drops.totals())}
 
     def progress(self) -> int:
-        return self._runtime.turns + self.total("datagrams_received")
+        return self._runtime.datapath.turns + self.total("datagrams_received")
 
     def collect(self) -> Iterator[Family]:
         if (made := self._collector) is None or made[0] is not self.program:
@@ -154,7 +156,7 @@ class Router:
 
     def _observers_changed(self) -> None:
         """Called when the first observer of received datagrams attaches or the last one detaches."""
-        self._runtime.rewire()
+        self._runtime.datapath.observe(is_observed=self.mirror.is_observed)
 
     def _deadman_changed(self, route: str, active: bool) -> None:
         self._reporter.deadman_changed(route, active)

@@ -13,15 +13,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from router.app.sockets import KernelDrops, SocketChange, Sockets
-from router.app.wiring import RouterContext, Wiring, start_deadmen, wire
+from router.app.wiring import Datapath, RouterContext, Wiring
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS, resolved
-from router.engine import MAX_DATAGRAM
-from router.engine.binding import State
-from router.engine.dispatch import Receive
 from router.errors import SourceSpan, StartError
 from router.log import logger
-from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, ReceiveThread
 from router.ros.environment import check_environment, ros_remedy
 from router.threads import background_threads
 
@@ -43,26 +39,20 @@ class Change:
 
 
 class Runtime:
-    """The sockets, ROS node, gateways and threads of the running program.
+    """The sockets, ROS node, gateways and threads of the running program."""
 
-    `tee` may wrap the function that takes a listener's datagrams.
-    """
-
-    def __init__(self, context: RouterContext, ros_args: Sequence[str], tee: Callable[[str, Receive], Receive]) -> None:
+    def __init__(
+        self, context: RouterContext, ros_args: Sequence[str], datapath: Callable[[Callable[[], bool]], Datapath]
+    ) -> None:
         self.wiring: Wiring | None = None
+        self.datapath = datapath(self._is_subscribed)
         self.drops = KernelDrops()
-        self.sockets = Sockets(self.drops)
+        self.sockets = Sockets(self.drops, self.datapath.open_sender)
         self.gateways: GatewayThread | None = None
         self._context = context
         self._ros_args = ros_args
-        self._tee = tee
         self._ros: RouterNode | None = None
-        self._receiving = ReceiveThread(MAX_DATAGRAM, self._coalescing_target, context.reporter.failed)
-
-    @property
-    def turns(self) -> int:
-        """A number that grows unless the receive thread is stuck, even if nothing comes."""
-        return self._receiving.turns
+        self._unfinished: list[Callable[[], None]] = []
 
     @property
     def node_name(self) -> str:
@@ -77,8 +67,8 @@ class Runtime:
         self._swap(change)
         with background_threads():
             self._finish(change, None)
-        self._receiving.start(self._replace_receivers)  # an observer may have attached during the swap
-        closing.callback(self._receiving.stop)
+        self.datapath.start()
+        closing.callback(lambda: self.datapath.stop(list(self.sockets.listeners.values())))
 
     def close_with(self, closing: ExitStack) -> None:
         """Have `closing` close sockets and ROS, after the services that use them."""
@@ -88,12 +78,9 @@ class Runtime:
 
     def end_with(self, closing: ExitStack) -> None:
         """Have `closing` stop gateways, then open frames, waiting messages and last deadmen, which send once more."""
+        closing.callback(self.datapath.close)
         closing.callback(self._context.timers.stop)
         closing.callback(self._stop_gateways)
-
-    def rewire(self) -> None:
-        """Apply `tee` again."""
-        self._receiving.call_between(self._replace_receivers)
 
     def prepare(self, program: Program) -> Change:
         """Open what `program` needs and is not open yet. Raises StartError, with nothing changed.
@@ -107,12 +94,13 @@ class Runtime:
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
             self._context.counts.make_room(program.counters)
-            state = State(self.wiring.state if self.wiring else None)
+            states = self.datapath.states(self.wiring)
+            undo.callback(lambda: self._context.timers.release(states.added()))
             if self.wiring is None:
-                start_deadmen(program, self._context, sockets, state)
+                self.datapath.start_deadmen(program, sockets, states)
             topics = self._prepare_topics(program, undo)
-            undo.callback(lambda: self._context.timers.release(list(state.added())))
-            wiring = wire(program, self._context, sockets, self._ros, topics, state)
+            wiring = self.datapath.wire(program, sockets, self._ros, topics, states)
+            undo.callback(self.datapath.abandon, wiring)
             if self.wiring is None:
                 wiring.start(self._context.timers)
             gateways = self._prepare_gateways(program, wiring, undo)
@@ -127,7 +115,7 @@ class Runtime:
         try:
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
-            self._receiving.call_between(lambda: self._swap(change))
+            self.datapath.between(lambda: self._swap(change))
         except BaseException:
             change.undo.close()
             raise
@@ -140,31 +128,44 @@ class Runtime:
             )
 
     def _swap(self, change: Change) -> None:
-        """Replace the program: called by the receive thread, while that of ROS is paused."""
+        """Replace the program, while the thread of ROS is paused."""
         with self._ros.paused() if self._ros else nullcontext():
             if self._ros is not None and change.topics is not None:
                 self._ros.apply(change.topics, change.wiring.take)  # first: it may still fail
-            for listener in self.sockets.left(change.sockets):
-                self._receiving.finish(listener)
-            change.wiring.succeed(self.wiring, self._context.timers)
-            self.wiring = change.wiring
+            left = self.sockets.left(change.sockets)
             self.sockets.apply(change.sockets)
-            self._receiving.serve(list(self.sockets.listeners.values()), self._teed())
+            self.datapath.adopt(change.wiring, self.wiring, left, list(change.sockets.listeners.values()))
+            self.wiring = change.wiring
 
     def _finish(self, change: Change, earlier: Wiring | None) -> None:
-        """Close what only the earlier program used, all of it even if one step raises."""
+        """Close what only the earlier program used, all of it even if one step raises.
+
+        If a thread is stuck there, as in the middleware, that stays open until it goes on.
+        """
         change.undo.pop_all()  # discarded
         with ExitStack() as last_first:
-            if earlier is not None:
-                last_first.callback(earlier.free)
-            last_first.callback(self._context.counts.replace, change.wiring.program.counters)
-            last_first.callback(change.sockets.left.close)
-            if self._ros is not None and change.topics is not None:
-                last_first.callback(self._ros.finish, change.topics)
-            last_first.callback(change.wiring.state.forget_previous)
+            if self.datapath.has_passed(change.wiring):
+                last_first.callback(self._context.counts.replace, change.wiring.program.counters)
+                for finish in self._unfinished:
+                    last_first.callback(finish)
+                self._unfinished = []
+                last_first.callback(self._close_left, change, earlier)
+            else:
+                last_first.callback(self._context.counts.adopt, change.wiring.program.counters)
+                self._unfinished.append(lambda: self._close_left(change, earlier))
             if self.gateways is not None and change.gateways is not None:
                 last_first.callback(self.gateways.finish, change.gateways)
                 last_first.callback(self._follow_drops, self.gateways, change.gateways)
+
+    def _close_left(self, change: Change, earlier: Wiring | None) -> None:
+        with ExitStack() as last_first:
+            if earlier is not None:
+                last_first.callback(earlier.free)
+            last_first.callback(change.sockets.left.close)
+            if self._ros is not None and change.topics is not None:
+                last_first.callback(self._ros.finish, change.topics)
+            last_first.callback(change.wiring.states.forget_previous)
+            last_first.callback(change.wiring.settle_pacers, self._context.timers)
 
     def _prepare_topics(self, program: Program, undo: ExitStack) -> RosChange | None:
         if self._ros is None and not _needs_ros(program):
@@ -210,15 +211,9 @@ class Runtime:
         if self.wiring is not None:
             self.wiring.subscriber_joined(topic, self._context.timers)
 
-    def _coalescing_target(self) -> int:
-        return FOR_SUBSCRIBERS if self._ros is not None and self._ros.subscribed else FOR_SOCKETS
-
-    def _replace_receivers(self) -> None:
-        self._receiving.replace_receivers(self._teed())
-
-    def _teed(self) -> dict[str, Receive]:
-        receive = self.wiring.receive if self.wiring else {}
-        return {name: self._tee(name, each) for name, each in receive.items()}
+    def _is_subscribed(self) -> bool:
+        """Whether a topic has subscribers."""
+        return self._ros is not None and bool(self._ros.subscribed)
 
     def _stop_gateways(self) -> None:
         if self.gateways is not None:

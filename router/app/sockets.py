@@ -10,6 +10,7 @@ from router.compiler.program import Program
 from router.net.kernel import interface_is_up
 from router.net.udp import Listener, Sender
 from router.table.addresses import Address
+from router.table.model import Endpoint
 
 
 @dataclass(slots=True)
@@ -57,9 +58,13 @@ class KernelDrops:
 
 
 class Sockets:
-    """Open listeners by name, and senders by endpoint; none before the first change is applied."""
+    """Open listeners by name, and senders by endpoint; none before the first change is applied.
 
-    def __init__(self, drops: KernelDrops) -> None:
+    `open_sender` opens a socket to an endpoint, or raises StartError.
+    """
+
+    def __init__(self, drops: KernelDrops, open_sender: Callable[[Endpoint], Sender]) -> None:
+        self._open_sender = open_sender
         self.listeners: dict[str, Listener] = {}
         self._bound: dict[str, Listener] = {}  # by the address and interface in the table
         self._senders: dict[str, tuple[Address, Sender]] = {}
@@ -79,7 +84,7 @@ class Sockets:
             for to in program.senders:
                 address, sender = self._senders.get(to.name, (None, None))
                 if sender is None or address != to.address.value:
-                    sender = Sender(to)
+                    sender = self._open_sender(to)
                     opening.callback(sender.close)
                 senders[to.name] = sender
             return SocketChange(program, listeners, senders, opening.pop_all())

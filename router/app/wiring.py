@@ -1,30 +1,30 @@
-"""Binds a program to the open sockets, topics and timer threads.
+"""What a program's functions need of the running router, and what the threads need of them.
 
-`wire` is the seam between the compiled program and the outside world: it passes plain callables into the engines
-(`send` by endpoint, `publish` by topic, clocks, counts) and gets back plain callables for the threads (`receive` by
-listener, `take` by topic, `feed`). Neither side refers to the other in any other way, so that either may be replaced,
-for example by a compiled carrier that receives, forwards, publishes and brakes.
+`wiring` has what is the same however datagrams are received. The rest is a datapath: `python_datapath` calls generated
+handlers for everything, `native_datapath` has the carrier do what it can. Nothing else brings compiled handlers
+together with sockets and topics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from router.app.sockets import SocketChange
 from router.app.timers import Timers, TimerThread
 from router.clock import monotonic_ns, wall_ns
 from router.compiler.metrics import Counters
 from router.compiler.program import DeadmanPlan, Program
-from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import EngineContext, State, TimerGroup
-from router.engine.deadman import Deadman, FeedMaker, commander, feeder
-from router.engine.dispatch import Receive, Take
+from router.engine.deadman import CommandMaker, Deadman, FeedMaker
+from router.engine.dispatch import Take
 from router.engine.pacing import Pacer
 from router.log import logger
+from router.net.udp import Listener, Sender
 from router.observe.reports import Reporter
+from router.table import model
 
 if TYPE_CHECKING:
     from router.ros.endpoints import RosChange
@@ -41,9 +41,9 @@ class ThreadCounts:
 
     def __init__(self, counters: Counters) -> None:
         self.counters = counters
-        self.lists = [counters.fresh_counts() for _ in range(8)]
-        self.receive, self.ros, self.deadman, self.pacing, self.collecting = self.lists[:5]
-        self.gateways, self.events, self.own = self.lists[5:]
+        self.lists = [counters.fresh_counts() for _ in range(9)]
+        self.receive, self.ros, self.deadman, self.gateway_deadmen, self.pacing, self.collecting = self.lists[:6]
+        self.gateways, self.events, self.own = self.lists[6:]
 
     def total(self, metric: str) -> int:
         """The sum of a counter over all its labels."""
@@ -62,6 +62,10 @@ class ThreadCounts:
     def replace(self, counters: Counters) -> None:
         """Adopt `counters`, once no thread counts by the earlier ones."""
         counters.settle(self.lists)
+        self.adopt(counters)
+
+    def adopt(self, counters: Counters) -> None:
+        """As `replace`, while a thread may still count by the earlier ones, whose indexes stay taken."""
         self.counters = counters  # from here on read by other threads, and no longer changed
 
 
@@ -78,142 +82,206 @@ class RouterContext:
     deadman_changed: Callable[[str, bool], None]
 
 
+class States:
+    """What a program keeps from one message to the next, by who uses it; `previous` are those of the program before."""
+
+    def __init__(self, users: Sequence[str], previous: States | None) -> None:
+        self._by_user = {user: State(previous[user] if previous else None) for user in users}
+
+    def __getitem__(self, user: str) -> State:
+        return self._by_user[user]
+
+    def added(self) -> list[object]:
+        """The objects that the previous program does not have."""
+        return [each for state in self._by_user.values() for each in state.added()]
+
+    def forget_previous(self) -> None:
+        for state in self._by_user.values():
+            state.forget_previous()
+
+
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """A program's functions: `receive` by listener, `take` by topic, `feed` for commands of gateway clients."""
+    """A program's functions: `take` by topic, `feed` for commands of gateway clients.
+
+    `gateway_deadmen` are those of what gateways let in, by name.
+    """
 
     program: Program
-    receive: Mapping[str, Receive]
     take: Mapping[str, Take]
     feed: FeedMaker
-    state: State
-    deadmen: Mapping[str, Deadman]
+    states: States
+    gateway_deadmen: Mapping[str, Deadman]
     pacers: Mapping[str, Pacer]
-    engines: Sequence[InboundEngine | OutboundEngine]
+    engines: Sequence[Closable]
 
     def start(self, timers: Timers) -> None:
         """Have deadmen behind gateways publish to each subscriber that is discovered shortly after the start."""
-        for plan in _inbound_deadmen(self.program):
-            deadman = self.deadmen[plan.route]
+        for deadman in self.gateway_deadmen.values():
             timers.inbound_deadman.locked(deadman, deadman.await_subscribers)(monotonic_ns())
 
     def subscriber_joined(self, topic: str, timers: Timers) -> None:
-        for plan in _inbound_deadmen(self.program):
+        for plan in inbound_deadmen(self.program):
             if topic in dict(plan.datagrams):
-                deadman = self.deadmen[plan.route]
-                _log_start(plan.route, timers.inbound_deadman.locked(deadman, deadman.greet)(monotonic_ns()))
+                deadman = self.gateway_deadmen[plan.route]
+                log_start(plan.route, timers.inbound_deadman.locked(deadman, deadman.greet)(monotonic_ns()))
 
     def free(self) -> None:
         """Free the functions, which are in reference cycles. None may be called afterwards."""
         for engine in self.engines:
             engine.close()
 
-    def succeed(self, earlier: Wiring | None, timers: Timers) -> None:
-        """Take over from `earlier`, while nothing is received: deadmen with other settings inherit their state.
-
-        Timers that only `earlier` had end, so that messages that waited are sent before any that comes.
-        """
-        inbound = {plan.route for plan in _inbound_deadmen(self.program)}
-        for route, deadman in self.deadmen.items():
-            before = earlier.deadmen.get(route) if earlier else None
-            if before is not None and before is not deadman:
-                thread = timers.inbound_deadman if route in inbound else timers.deadman
-                thread.locked(deadman, deadman.replace)(before)
-        timers.release(list(self.state.left()))
+    def settle_pacers(self, timers: Timers) -> None:
+        """Send what waits in pacers for targets that the program does not have."""
         places = {(each.route, target.label) for each in self.program.handlers for target in each.targets}
         for pacer in self.pacers.values():
             timers.pacing.locked(pacer, pacer.keep_only)(monotonic_ns(), places)
 
+    def succeed_gateways(self, earlier: Wiring | None, timers: Timers) -> None:
+        """Have deadmen of gateways with other settings inherit the state of those in `earlier`."""
+        for name, deadman in self.gateway_deadmen.items():
+            before = earlier.gateway_deadmen.get(name) if earlier else None
+            if before is not None and before is not deadman:
+                timers.inbound_deadman.locked(deadman, deadman.replace)(before)
 
-def start_deadmen(program: Program, context: RouterContext, sockets: SocketChange, state: State) -> None:
-    """Have the deadmen of routes send at the start. Needs the sockets only, because ROS takes seconds to open."""
-    for plan in program.deadmen:
-        deadman = _deadman(plan, program, context, _checked_senders(sockets), state)
-        _log_start(plan.route, context.timers.deadman.locked(deadman, deadman.start)())
+
+class Closable(Protocol):
+    def close(self) -> None: ...
 
 
-def wire(
+class Datapath(Protocol):
+    """Receives the datagrams of listeners, forwards them, feeds deadmen and brakes."""
+
+    @property
+    def turns(self) -> int:
+        """A number that grows unless the thread that receives is stuck, even if nothing comes."""
+
+    def open_sender(self, endpoint: model.Endpoint) -> Sender:
+        """Open a socket to an endpoint. Raises StartError."""
+
+    def states(self, earlier: Wiring | None) -> States: ...
+
+    def start_deadmen(self, program: Program, sockets: SocketChange, states: States) -> None:
+        """Have the deadmen of routes send at the start. Needs the sockets only, because ROS takes seconds to open."""
+
+    def wire(
+        self,
+        program: Program,
+        sockets: SocketChange,
+        ros: RouterNode | None,
+        topics: RosChange | None,
+        states: States,
+    ) -> Wiring:
+        """Bind `program` to the sockets and topics that it is to have."""
+
+    def abandon(self, wiring: Wiring) -> None:
+        """Undo `wire`, for a program that will not run."""
+
+    def between(self, swap: Callable[[], None]) -> None:
+        """Call `swap`, which calls `adopt`, when no function of the running program is called by the datapath."""
+
+    def adopt(self, wiring: Wiring, earlier: Wiring | None, left: Sequence[Listener], now: Sequence[Listener]) -> None:
+        """Receive with another program from the listeners `now`, and no longer from `left`, which are emptied.
+
+        Deadmen with other settings inherit their state. Timers that only `earlier` had end, so that messages that
+        waited are sent before any that comes.
+        """
+
+    def start(self) -> None:
+        """Begin to receive with the program that was adopted."""
+
+    def has_passed(self, wiring: Wiring) -> bool:
+        """Wait until nothing of an earlier program is in use. Return False where that takes longer than a second."""
+
+    def observe(self, *, is_observed: bool) -> None:
+        """Begin or cease to show received datagrams to the mirror."""
+
+    def watch(self, notify: int, interval: int) -> bool:
+        """Feed a watchdog by a connected socket, every `interval` ns. Return False where the caller has to do it."""
+
+    def stop(self, listeners: Sequence[Listener]) -> None:
+        """End all input, handle what the kernel holds and what waits, and end the threads.
+
+        What is in an inherited socket stays there, for the next process.
+        """
+
+    def close(self) -> None:
+        """Have deadmen send a last time. Nothing is sent afterwards."""
+
+
+def engine_context(
     program: Program,
     context: RouterContext,
-    sockets: SocketChange,
-    ros: RouterNode | None,
     topics: RosChange | None,
-    state: State,
-) -> Wiring:
-    """Bind `program` to the sockets and topics that it is to have."""
+    publish_errors: tuple[type[Exception], ...],
+    send: Mapping[str, Send],
+    command: CommandMaker,
+    pacers: Mapping[str, Pacer],
+) -> EngineContext:
+    """What engines share; `counts` and `state` have to be replaced by those of each engine."""
     counts, timers = context.counts, context.timers
-    send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in sockets.senders.items()}
-    deadmen = _deadmen(program, context, _checked_senders(sockets), ros, state)
-    pacers = _pacers(program, timers.pacing, send, state)
-    engine_context = EngineContext(
+    publications = topics.publications if topics else {}
+    return EngineContext(
         counts=counts.receive,
         send=send,
-        publish={topic: each.publish for topic, each in topics.publications.items()} if topics else {},
-        wanted={topic: each.wanted for topic, each in topics.publications.items()} if topics else {},
+        publish={topic: each.publish for topic, each in publications.items()},
+        wanted={topic: each.wanted for topic, each in publications.items()},
         report=context.reporter.report,
         clock_ns=monotonic_ns,
         wall_ns=wall_ns,
         pacing=TimerGroup(counts.pacing, timers.pacing.locked),
         collecting=TimerGroup(counts.collecting, timers.collecting.locked),
-        command=commander(send, deadmen, timers.deadman.locked, monotonic_ns),
-        publish_errors=ros.publish_errors if ros else (),
+        command=command,
+        publish_errors=publish_errors,
         pacers=pacers,
-        state=state,
-    )
-    inbound = InboundEngine(
-        program, engine_context, {name: each.arrived_at for name, each in sockets.listeners.items()}
-    )
-    outbound = OutboundEngine(program, replace(engine_context, counts=counts.ros))
-    return Wiring(
-        program=program,
-        receive={name: inbound.receiver(name) for name in sockets.listeners},
-        take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},
-        feed=feeder(deadmen, timers.inbound_deadman.locked),
-        state=state,
-        deadmen=deadmen,
-        pacers=pacers,
-        engines=(inbound, outbound),
     )
 
 
-def _deadmen(
-    program: Program, context: RouterContext, send: Mapping[str, Send], ros: RouterNode | None, state: State
+def gateway_deadmen(
+    program: Program, context: RouterContext, ros: RouterNode | None, state: State
 ) -> dict[str, Deadman]:
-    """The deadmen by route; those behind gateways send to topics."""
-    inbound = _inbound_deadmen(program)
-    destinations = dict(send)
-    if ros is not None:
-        for topic in {topic for plan in inbound for topic, _ in plan.datagrams}:
-            destinations[topic] = state.keep(("sender to topic", topic), partial(_sender_to, ros, topic))
-    return {plan.route: _deadman(plan, program, context, destinations, state) for plan in (*program.deadmen, *inbound)}
+    """The deadmen of what gateways let in, by name: they publish."""
+    if ros is None:
+        return {}
+    deadmen = {}
+    for plan in inbound_deadmen(program):
+        destinations = {
+            topic: state.keep(("sender to topic", topic), partial(_sender_to, ros, topic))
+            for topic, _ in plan.datagrams
+        }
+        counts = context.counts.gateway_deadmen
+        deadmen[plan.route] = python_deadman(plan, program, context, counts, destinations, state)
+    return deadmen
 
 
-def _deadman(
-    plan: DeadmanPlan, program: Program, context: RouterContext, destinations: Mapping[str, Send], state: State
+def python_deadman(
+    plan: DeadmanPlan,
+    program: Program,
+    context: RouterContext,
+    counts: list[int],
+    destinations: Mapping[str, Send],
+    state: State,
 ) -> Deadman:
+    """The deadman of a plan, by Python; `destinations` by endpoint or topic."""
+
     def deadman() -> Deadman:
-        counts = context.counts.deadman
         return Deadman(plan, program.counters, counts, destinations, context.reporter.report, context.deadman_changed)
 
     return state.keep(("deadman", plan, tuple(destinations[name] for name, _ in plan.datagrams)), deadman)
 
 
-def _checked_senders(sockets: SocketChange) -> dict[str, Send]:
-    """What deadmen send by, by endpoint: errors of a datagram are raised with it."""
-    return {endpoint: sender.send_checked for endpoint, sender in sockets.senders.items()}
-
-
-def _inbound_deadmen(program: Program) -> list[DeadmanPlan]:
+def inbound_deadmen(program: Program) -> list[DeadmanPlan]:
     """The deadmen of what gateways let in."""
     return [each.deadman for gateway in program.gateways for each in gateway.inbound.values() if each.deadman]
 
 
-def _log_start(route: str, sent_to: Sequence[str]) -> None:
+def log_start(route: str, sent_to: Sequence[str]) -> None:
     if sent_to:
         logger.info("the deadman has sent its payload, since the router starts", route=route, to=list(sent_to))
 
 
-def _pacers(program: Program, pacing: TimerThread, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
+def open_pacers(program: Program, pacing: TimerThread, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
+    """The pacers of endpoints with a budget, by endpoint."""
     pacers = {}
     for endpoint in program.senders:
         if endpoint.budget:

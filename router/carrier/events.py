@@ -40,8 +40,8 @@ _PULSE_MS = 5000
 class EventThread:
     """Reads the events of `rings`, and calls `pulse` every few seconds to say that Python is alive.
 
-    `report` gets losses, `changed` a route and whether its deadman has tripped. `detail(listener, data, length)` returns why a
-    datagram was rejected, in words.
+    `report` gets losses, `changed` a route and whether its deadman has tripped. `detail(listener, data, length)`
+    returns in words why a datagram was rejected.
     """
 
     def __init__(
@@ -96,9 +96,7 @@ class EventThread:
             place, data = self._name(listener), bytes(record[_REJECT.size : _REJECT.size + length])
             sender = f"from {inet_ntoa(address.to_bytes(4, 'big'))}:{port}"
             what = self._detail(place, data, length)
-            self._report(
-                Report("reject", place, "", _REASONS[reason], None, f"{sender}: {what}" if what else sender)
-            )
+            self._report(Report("reject", place, "", _REASONS[reason], None, f"{sender}: {what}" if what else sender))
         elif kind == _LOST:
             _, _, route, target, loss, number = _LOSS.unpack_from(record)
             error = OSError(number, os.strerror(number)) if number else None

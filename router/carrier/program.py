@@ -9,15 +9,17 @@ import ctypes
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from router.carrier import structures as c
-from router.carrier.schema import WireSchema
 from router.compiler.metrics import REJECT_REASONS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
 from router.compiler.program import STRANGER, Handler, Program, TargetPlan, source_label
 from router.net.udp import Listener
 from router.table.model import Framing
+
+if TYPE_CHECKING:
+    from router.carrier.schema import WireSchema
 
 
 class Names:

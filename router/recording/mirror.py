@@ -68,6 +68,11 @@ class Mirror:
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
+    @property
+    def is_observed(self) -> bool:
+        """Whether a consumer is attached."""
+        return bool(self._consumers)
+
     def attach(self, consumer: Consumer) -> Callable[[], None]:
         """Call `consumer` with all that is received from now on. Returns a function that detaches it.
 
