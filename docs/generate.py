@@ -32,9 +32,9 @@ WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 _COUNTERS = """\
 Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route
-and target, accepted = delivered + dropped + filtered + collected, and what still waits: open frames, the queue of a
-budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element is a message. What a
-deadman sends is in its own metrics alone, and its bytes in none."""
+and target, accepted = delivered + dropped + filtered + collected + waiting, and what the router holds back: open
+frames, the queue of a budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element
+is a message. What a deadman sends is in its own metrics alone, and its bytes in none."""
 _GATEWAYS = """\
 A [gateway](table.md#gateways) has its name as `listener` and as `route`. What it sends has `clients` as its target, and
 its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
@@ -48,6 +48,10 @@ _LOG = """\
 The log writes the first drop of a kind (route, target, reason) at once, then at most a line in 10 s. That line shows
 the last one, and how many there were: `more`, in the `in_seconds` before the line. So a flood may have ended when its
 last line comes; metrics are up to date."""
+_DURATION = """\
+`router_route_duration_seconds` ends when a datagram is forwarded. Where the carrier does that, all other targets have
+it in their queues by then; with `ROUTER_CARRIER=python`, and for messages from ROS, all targets are served. Its upper
+bounds, in microseconds:"""
 
 
 def functions_page() -> str:
@@ -97,7 +101,7 @@ def metrics_page() -> str:
         "",
         fill(_LOG, WIDTH),
         "",
-        fill(f"Upper bounds of `router_route_duration_seconds`, in microseconds: {bounds}.", WIDTH),
+        fill(f"{_DURATION} {bounds}.", WIDTH),
         "",
     ]
     return "\n".join(lines)

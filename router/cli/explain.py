@@ -11,6 +11,7 @@ from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import positive
 from router.compiler import Checked, check_table
 from router.compiler.checked import CheckedRoute
+from router.compiler.executors import Executors, executors
 from router.compiler.link import compile_handlers
 from router.compiler.lookup import Definitions
 from router.compiler.metrics import Counters
@@ -54,10 +55,11 @@ def run(args: argparse.Namespace) -> int:
     for name in args.names:
         if name not in known:
             raise UsageError(f"{args.table} has no route or gateway '{name}'; {did_you_mean(name, known)}")
+    executed_by = executors(checked.routes)
     topics = known_topics(checked.table) if args.live is None else seen_topics(checked.table, args.live)
     for name in args.names or known:
         for route in routes.get(name, ()):
-            _print_route(route, checked, args.no_code)
+            _print_route(route, checked, executed_by, args.no_code)
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:
@@ -77,11 +79,11 @@ def _diff(old: Path, new: Path) -> int:
     return OK
 
 
-def _print_route(route: CheckedRoute, checked: Checked, no_code: bool) -> None:
+def _print_route(route: CheckedRoute, checked: Checked, executed_by: Executors, no_code: bool) -> None:
     assert checked.table is not None  # noqa: S101 - a table without errors is one
-    print(*explained_route(route, checked), sep="\n")
+    print(*explained_route(route, checked, executed_by), sep="\n")
     if not no_code and not route.route.ignore:
-        for handler in compile_handlers(route, checked.table, Counters()):
+        for handler in compile_handlers(route, checked.table, Counters(), executed_by):
             _print_code(handler.source)
     print()
 

@@ -8,9 +8,9 @@ the deadmen. It counts in a flat list. `router explain` prints it.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import compress, count
 
 from router.compiler.cdr import write_message
 from router.compiler.checked import CheckedCollect, CheckedSubscription, CheckedTarget
@@ -45,9 +45,17 @@ class HandlerSource:
         self.out = Source()
         self.targets: list[TargetPlan] = []
 
-    def inbound(self, targets: Sequence[CheckedTarget], collect: CheckedCollect | None) -> None:
-        """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames."""
-        named = [self._named(target) for target in targets]
+    def inbound(
+        self,
+        targets: Sequence[CheckedTarget],
+        collect: CheckedCollect | None,
+        served: Sequence[CheckedTarget] | None = None,
+    ) -> None:
+        """Destinations come first, so that forwarding waits for no mapping. With `collect`, topics get whole frames.
+
+        `targets` are all of the route, `served` those that the function serves, None for all.
+        """
+        named = self._serving([self._named(target) for target in targets], targets if served is None else served)
         with self._function("m", "datagram"):
             self._expires()
             if collect is None:
@@ -134,6 +142,7 @@ class HandlerSource:
         for reason in DROP_REASONS:
             self.counters.index("messages_dropped", self.route.name, target.label, reason)
         self.counters.index("messages_filtered", self.route.name, target.label)
+        self.counters.index("messages_waiting", self.route.name, target.label)
         delivered = ("messages_published",) if target.topic else ("datagrams_sent", "sent_bytes")
         for metric in delivered:
             self.counters.index(metric, self.route.name, target.label)
@@ -152,10 +161,16 @@ class HandlerSource:
         )
         return name, target
 
+    def _serving(self, named: Sequence[NamedTarget], served: Sequence[CheckedTarget]) -> list[NamedTarget]:
+        """Return those that are served, and forget the others, whose names stay taken."""
+        kept = [any(target is each for each in served) for _, target in named]
+        self.targets = list(compress(self.targets, kept))
+        return list(compress(named, kept))
+
     def _unique(self, base: str) -> str:
         """Return a Python name that no other target has: `a/b` and `a_b` are different topics."""
         taken = {plan.identifier for plan in self.targets}
-        candidates = (f"{base}_{number}" if number > 1 else base for number in itertools.count(1))
+        candidates = (f"{base}_{number}" if number > 1 else base for number in count(1))
         return next(name for name in candidates if name not in taken)
 
     def _serve(self, targets: Sequence[NamedTarget], when: Typed | None = None) -> None:

@@ -6,9 +6,11 @@ Expects a table without errors: nothing here is checked.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman, CheckedRoute
 from router.compiler.deadmen import deadman_plan
+from router.compiler.executors import Executors, executors
 from router.compiler.handlers import HandlerSource
 from router.compiler.lookup import layout
 from router.compiler.metrics import (
@@ -31,6 +33,7 @@ from router.compiler.program import (
     DeadmanPlan,
     GatewayPlan,
     Handler,
+    Part,
     Program,
     TopicPlan,
     source_label,
@@ -59,10 +62,11 @@ def link(
     _open_counters(counters, table, envelope)
     _open_own_counters(counters, table)
     served = [checked for checked in routes if not checked.route.ignore]
+    executed_by = executors(served)
     inbound: dict[int, tuple[Handler, ...]] = {}
     outbound: dict[str, tuple[Handler, ...]] = {}
     for checked in served:
-        for handler in compile_handlers(checked, table, counters):
+        for handler in compile_handlers(checked, table, counters, executed_by):
             if handler.topic is None:
                 number = handler.case.number
                 inbound[number] = (*inbound.get(number, ()), handler)
@@ -87,6 +91,7 @@ def link(
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos=schema,
+        executors=executed_by,
         gateways=tuple(gateways),
     )
 
@@ -146,28 +151,53 @@ def _open_own_counters(counters: Counters, table: RouteTable) -> None:
         _open_each(counters, "record_dropped", last=RECORD_DROP_REASONS)
 
 
-def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[Handler]:
+def compile_handlers(
+    checked: CheckedRoute, table: RouteTable, counters: Counters, executed_by: Executors
+) -> Iterator[Handler]:
     """Generate and compile the functions of one route, and open its series in the counters.
 
-    A route from UDP has one function, a route from ROS one for each of its topics.
+    A route from UDP has one function, a route from ROS one for each of its topics. `executed_by` are all targets of the
+    table.
     """
     route, case = checked.route, checked.case
     _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route.name)
     for topic in route.topics:
         _open_each(counters, "qos_incompatible", route.name, topic.topic.value, last=QOS_POLICIES)
     if not route.is_outbound:
-        generator = HandlerSource(route, case, counters)
-        generator.inbound(checked.targets, checked.collect)
         sources: list[str | None] = [source.value for source in route.sources]
         if ANY in sources:
             sources = [*table.endpoints, STRANGER]
         _open_each(counters, "messages_received", route.name, last=map(source_label, sources))
-        spans = [target.span for target in checked.targets if target.topic]
-        yield _handler(generator, checked, (spans or [route.span])[0].file, frozenset(sources), None)
+        yield _inbound_handler(checked, counters, executed_by, frozenset(sources))
     for feed in checked.subscriptions:
         generator = HandlerSource(route, case, counters)
         generator.outbound(feed)
         yield _handler(generator, checked, feed.topic.span.file, frozenset(), feed.topic.topic.value)
+
+
+def _inbound_handler(
+    checked: CheckedRoute, counters: Counters, executed_by: Executors, sources: frozenset[str | None]
+) -> Handler:
+    """The handler of a route from UDP, and those of its parts once they are asked for."""
+    route = checked.route
+    spans = [target.span for target in checked.targets if target.topic]
+    file = (spans or [route.span])[0].file
+    generator = HandlerSource(route, checked.case, counters)
+    generator.inbound(checked.targets, checked.collect)
+
+    def compile_part(part: Part) -> Handler | None:
+        if part is Part.TOPICS:
+            served, collect = [target for target in checked.targets if target.topic], checked.collect
+        else:
+            forwarded, collect = [target for target in checked.targets if not target.topic], None
+            served = [to for to in forwarded if not executed_by[route.name, None, to.label].is_carrier]
+        if not served:
+            return None
+        generator = HandlerSource(route, checked.case, counters)
+        generator.inbound(checked.targets, collect, served)
+        return _handler(generator, replace(checked, collect=collect), file, sources, None)
+
+    return replace(_handler(generator, checked, file, sources, None), compile_part=compile_part)
 
 
 def _handler(
@@ -186,7 +216,7 @@ def _handler(
         sources=sources,
         topic=topic,
         ttl=route.ttl.value if route.ttl else None,
-        collect_timeout=route.collect.timeout.value if route.collect else None,
+        collect_timeout=route.collect.timeout.value if route.collect and checked.collect else None,
     )
 
 

@@ -12,7 +12,10 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One metric. `kind` is counter, histogram, number, or time (nanoseconds in the counters, seconds exported)."""
+    """One metric. `kind` is counter, histogram, number, level, or time (nanoseconds in the counters, seconds exported).
+
+    One thread sets a number or a time; several add to a level and subtract from it.
+    """
 
     name: str
     kind: str
@@ -35,7 +38,13 @@ METRICS = (
     Metric("messages_dropped", "counter", ("route", "target", "reason"), "Messages that a target should have got."),
     Metric("messages_filtered", "counter", ("route", "target"), "Messages that `when` held back, or nobody wanted."),
     Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
-    Metric("route_duration_seconds", "histogram", ("route",), "Time from message received to all targets served."),
+    Metric("messages_waiting", "level", ("route", "target"), "Messages that wait between two threads of the router."),
+    Metric(
+        "route_duration_seconds",
+        "histogram",
+        ("route",),
+        "Time from a message's receipt until it is forwarded, and served or queued for all other targets.",
+    ),
     Metric("route_last_message_timestamp_seconds", "time", ("route",), "When the route last took a message."),
     Metric("endpoint_last_seen_timestamp_seconds", "time", ("endpoint",), "When the endpoint last sent."),
     Metric("endpoint_stale_after_seconds", "number", ("endpoint",), "Silent for longer, it is stale."),
@@ -87,7 +96,7 @@ DROP_REASONS: Mapping[str, str] = {
     "non_finite": "NaN or infinity where an integer or a time is wanted",
     "stale": "older than `ttl`",
     "rate_limited": "more often than `max_rate`",
-    "queue_full": "the endpoint's `budget` was short for longer than the queue lasts",
+    "queue_full": "the endpoint's `budget` was short, or Python was behind, for longer than the queue lasts",
     "send_buffer_full": "the kernel's send buffer was full",
     "send_error": "the network refused it; `Connection refused`: nobody listens there",
     "publish_error": "the ROS middleware refused it",

@@ -5,11 +5,13 @@ A program is plain data and code objects; `engine` binds it to sockets, publishe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import Enum, auto
 from itertools import chain
 from types import CodeType
 
+from router.compiler.executors import Executors
 from router.compiler.metrics import Counters
 from router.table.model import Endpoint, Gateway, Inbound, Keep, Listener, Priority, RouteTable
 from router.types.model import MessageType
@@ -112,6 +114,14 @@ class GatewayPlan:
     inbound: Mapping[str, InboundPlan]
 
 
+class Part(Enum):
+    """Targets of a route from UDP that Python serves when the carrier receives. Each part has a queue of its own."""
+
+    TOPICS = auto()
+    DESTINATIONS = auto()
+    """Those that the carrier does not serve (see compiler.executors)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Handler:
     """One route as generated Python, for a route from ROS one for each of its topics.
@@ -120,6 +130,9 @@ class Handler:
     `targets` (see engine.binding). It serves one message: a parsed payload, or the CDR bytes from `topic`. `source` is
     its text. `sources` are the endpoints that may send the message, perhaps with STRANGER among them; a route from ROS
     has none. `ttl` and `collect_timeout` in ns, None for none.
+
+    It serves all targets of the route. `part` compiles a handler that serves some of them, with the same counters and
+    TargetPlans.
     """
 
     route: str
@@ -133,11 +146,16 @@ class Handler:
     topic: str | None = None
     ttl: int | None = None
     collect_timeout: int | None = None
+    compile_part: Callable[[Part], Handler | None] = field(default=lambda _: None, repr=False, compare=False)
+
+    def part(self, part: Part) -> Handler | None:
+        """Return the handler of these targets only; None if there are none, or for a route from ROS."""
+        return self.compile_part(part)
 
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A compiled table. `senders` are the endpoints that something is sent to.
+    """A compiled table. `senders` are the endpoints that something is sent to, `executors` say who does that.
 
     `inbound` has the handlers by envelope field number: several where a case has several routes, which differ
     in their sources. `outbound` has them by topic. `ignored` are the numbers of cases that the table ignores.
@@ -154,6 +172,7 @@ class Program:
     deadmen: tuple[DeadmanPlan, ...]
     ignored: frozenset[int]
     protos: ProtoSchema
+    executors: Executors
     gateways: tuple[GatewayPlan, ...] = ()
 
     @property

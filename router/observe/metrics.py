@@ -18,7 +18,7 @@ from router.observe.snapshot import BUCKETS, PREFIX
 SAMPLES_PER_REST = 16
 REST_SECONDS = 1e-4
 
-_EXPORTED_AS = {"time": "gauge", "number": "gauge"}
+_EXPORTED_AS = {"time": "gauge", "number": "gauge", "level": "gauge"}
 _BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 
 Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
@@ -28,7 +28,7 @@ Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
 class CountersCollector(Collector):
     """All series of the counters, each from its first scrape on, at 0 while nothing has happened.
 
-    `counts` has the list of each thread that counts: a counter is their sum, a number or a time the largest of them.
+    `counts` has the list of each thread that counts: a counter or level is their sum, a number or time their largest.
     `asked` has functions that are called at each scrape instead, by metric. `build`: the labels of `router_build_info`.
     """
 

@@ -12,6 +12,7 @@ from time import sleep
 from router.compiler import Checked
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
+from router.compiler.executors import Executors
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.program import GatewayPlan, InboundPlan
@@ -43,7 +44,8 @@ _WIDEST_CELL = 48
 # Routes
 
 
-def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]:
+def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Executors) -> Iterator[str]:
+    """Destinations that are not in `executed_by` are explained without their executor."""
     route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
     assert table is not None  # noqa: S101 - a table without errors is one
     assert envelope is not None  # noqa: S101 - and has one
@@ -58,9 +60,11 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
     yield from _settings(checked)
     for served in checked.targets:
         yield ""
-        yield from (
-            _topic(served, served.topic) if served.topic else _destination(served, checked.route, table, "unchanged")
-        )
+        if served.topic:
+            yield from _topic(served, served.topic)
+        else:
+            yield from _destination(served, route, table, "unchanged")
+            yield from _executor(route, None, served, executed_by)
     for feed in checked.subscriptions:
         yield ""
         yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
@@ -70,6 +74,7 @@ def explained_route(checked: CheckedRoute, everything: Checked) -> Iterator[str]
         for served in feed.targets:
             yield ""
             yield from _destination(served, route, table, f"from topic {feed.topic.topic.value}")
+            yield from _executor(route, feed.topic, served, executed_by)
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:
@@ -117,6 +122,14 @@ def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: st
     if others := [other for other in served.deadmen if other != route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
     yield from _served(served)
+
+
+def _executor(route: Route, topic: Topic | None, served: CheckedTarget, executed_by: Executors) -> Iterator[str]:
+    executor = executed_by.get((route.name, topic.topic.value if topic else None, served.label))
+    if executor is None:
+        return
+    place = f"  ({executor.span})" if executor.span else ""
+    yield "    by the carrier" if executor.is_carrier else f"    by Python: {executor.reason}{place}"
 
 
 def _topic(served: CheckedTarget, topic: Topic) -> Iterator[str]:
@@ -318,7 +331,8 @@ def _publishers(types: Iterable[str]) -> str:
 def diff(old: Checked, new: Checked) -> Iterator[str]:
     """A unified diff of what is said of two tables without errors, a hunk for each part that differs.
 
-    Places and the width of columns are not compared, addresses only where endpoints are.
+    Places and the width of columns are not compared, addresses only where endpoints are. Executors are not: they follow
+    from the rest, and one condition may change those of many routes.
     """
     before, after = _parts(old), _parts(new)
     for name in dict.fromkeys((*after, *before)):
@@ -349,7 +363,7 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
     parts |= {f"listener {name}": _settings_lines(each) for name, each in table.listeners.items()}
     parts |= {f"endpoint {name}": _settings_lines(each) for name, each in table.endpoints.items()}
     for route in checked.routes:
-        parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked))
+        parts[f"route {route.route.name}"] = _comparable(explained_route(route, checked, {}))
     for gateway in checked.gateways:
         parts[f"gateway {gateway.settings.name}"] = [
             *_comparable(explained_gateway(gateway, {})),

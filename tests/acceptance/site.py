@@ -221,7 +221,7 @@ def balance(counts: Mapping[str, int], topics: Iterable[str] = TOPICS_FROM_ROS) 
         for target in labels_of(counts, "messages_filtered", "target", route=route):
             delivered = total(counts, "datagrams_sent", route=route, destination=target)
             delivered += total(counts, "messages_published", route=route, topic=target)
-            others = ("messages_filtered", "messages_dropped", "messages_collected")
+            others = ("messages_filtered", "messages_dropped", "messages_collected", "messages_waiting")
             assert taken == delivered + sum(total(counts, metric, route=route, target=target) for metric in others)
 
 

@@ -92,7 +92,7 @@ class Ledger:
         return sum(count for key, count in self.counted(metric).items() if key[: 1 + len(labels)] == (metric, *labels))
 
     def imbalances(self) -> Iterator[str]:
-        """Expects that nothing waits: no frame is open, and nothing is held back for later."""
+        """Expects that no frame is open, and nothing is held back for later."""
         inbound = [handler for handlers in self._program.inbound.values() for handler in handlers]
         outbound = [handler for handlers in self._program.outbound.values() for handler in handlers]
         received, rejected = self.total("datagrams_received"), self.total("datagrams_rejected")
@@ -114,10 +114,10 @@ class Ledger:
         route, accepted = handler.route, self.total("messages_received", handler.route)
         for target in handler.targets:
             delivered = "messages_published" if target.is_topic else "datagrams_sent"
-            metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected")
+            metrics = (delivered, "messages_dropped", "messages_filtered", "messages_collected", "messages_waiting")
             fates = [self.total(metric, route, target.label) for metric in metrics]
             if accepted != sum(fates):
-                kinds = "delivered, dropped, filtered, collected"
+                kinds = "delivered, dropped, filtered, collected, waiting"
                 yield f"{route} to {target.label}: accepted {accepted}, but {kinds} {fates}"
 
 

@@ -82,7 +82,7 @@ def test_every_metric_is_there_from_the_start_at_zero(scraped: Scraped) -> None:
     values = scraped.values()
     for metric in METRICS:
         labels = frozenset((label, LABELS[label]) for label in metric.labels)
-        suffix = {"counter": "_total", "time": "", "number": "", "histogram": "_count"}[metric.kind]
+        suffix = {"counter": "_total", "time": "", "number": "", "level": "", "histogram": "_count"}[metric.kind]
         assert values[f"router_{metric.name}{suffix}", labels] == 0, metric.name
 
 
@@ -91,9 +91,12 @@ def test_a_counter_is_the_sum_over_threads_and_a_gauge_the_latest_of_them(scrape
     first[scraped.indexes["datagrams_sent"]], second[scraped.indexes["datagrams_sent"]] = 3, 4
     seen = scraped.indexes["endpoint_last_seen_timestamp_seconds"]
     first[seen], second[seen] = 1_500_000_000, 2_500_000_000
+    waiting = scraped.indexes["messages_waiting"]
+    first[waiting], second[waiting] = 5, -3
     second[scraped.indexes["qos_incompatible"]] = first[scraped.indexes["deadman_active"]] = 2
     assert scraped.value("router_datagrams_sent_total") == 7
     assert scraped.value("router_endpoint_last_seen_timestamp_seconds") == 2.5
+    assert scraped.value("router_messages_waiting") == 2
     assert scraped.value("router_qos_incompatible") == 2
     assert scraped.value("router_deadman_active") == 2
     first[scraped.indexes["deadman_active"]] = 0

@@ -1,0 +1,83 @@
+"""Who sends a datagram that comes from UDP: one executor for each endpoint, and why."""
+
+from __future__ import annotations
+
+import pytest
+
+from router.compiler.executors import executors
+from tests.compiler.conftest import CheckText
+
+ENDPOINTS = """{
+  board: {address: 127.0.0.2:8, kind: board},
+  base: {address: 127.0.0.3:9000, kind: basestation},
+  tool: {address: 127.0.0.4:9000, kind: tool, trim_trailing_zeros: true},
+  slow: {address: 127.0.0.5:9000, kind: tool, budget: 10kB/s}}"""
+
+
+def told(check_text: CheckText, routes: str) -> dict[str, str]:
+    """`route > endpoint` and the reason with its line, empty for the carrier."""
+    checked = check_text(routes, endpoints=" ".join(ENDPOINTS.split()))
+    assert not checked.has_errors, checked.diagnostics
+    return {
+        f"{route} > {endpoint}": f"{executor.reason} at line {executor.span.line}" if executor.span else ""
+        for (route, _, endpoint), executor in executors(checked.routes).items()
+    }
+
+
+def test_what_is_forwarded_unchanged_is_carried(check_text: CheckText) -> None:
+    routes = """\
+        routes:
+          manual_drive:
+            source: base
+            destinations: [{endpoint: board, max_rate: 10 Hz}, tool]
+            ttl: 200ms
+            deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [board]}
+          imu_info:
+            source: board
+            destinations: [base]
+            topics: [{topic: imu, type: std_msgs/msg/Float32, fields: {data: accel_x}, when: accel_x > 1}]
+    """
+    assert told(check_text, routes) == {"manual_drive > board": "", "manual_drive > tool": "", "imu_info > base": ""}
+
+
+@pytest.mark.parametrize(
+    ("destination", "reason"),
+    [
+        ("{endpoint: base, when: accel_x > 1}", "`when: accel_x > 1` needs it at line 10"),
+        ("{endpoint: base, max_rate: 5 Hz, keep: latest}", "`keep: latest` needs it at line 10"),
+    ],
+)
+def test_one_that_needs_python_has_all_others_of_its_endpoint_go_there(
+    check_text: CheckText, destination: str, reason: str
+) -> None:
+    routes = f"""\
+        routes:
+          ph_info: {{source: board, destinations: [base, tool]}}
+          imu_info:
+            source: board
+            destinations: [{destination}]
+    """
+    assert told(check_text, routes) == {
+        "ph_info > base": "it shares 'base' with imu_info, which needs Python at line 10",
+        "ph_info > tool": "",
+        "imu_info > base": reason,
+    }
+
+
+def test_a_budget_needs_python(check_text: CheckText) -> None:
+    routes = "routes: {ph_info: {source: board, destinations: [slow]}}"
+    assert told(check_text, routes) == {"ph_info > slow": "the budget of 'slow' needs it at line 5"}
+
+
+def test_routes_from_ros_and_ignored_ones_have_no_part_in_it(check_text: CheckText) -> None:
+    routes = """\
+        routes:
+          ph_info: {ignore: nobody wants it}
+          imu_info:
+            source: ros
+            destinations: [{endpoint: tool, when: data > 1}]
+            topics: [{topic: imu, type: std_msgs/msg/Float32}]
+            fields: {accel_x: data}
+          gps_info: {source: board, destinations: [tool]}
+    """
+    assert told(check_text, routes) == {"gps_info > tool": ""}
