@@ -13,15 +13,20 @@ from google.protobuf.message import Message
 from router.compiler import STRANGER, source_label
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS
 from router.compiler.network import recognisers
-from router.compiler.program import Handler, Program
+from router.compiler.program import Handler, Part, Program
 from router.engine.binding import EngineContext, Handle, bind, unbind
-from router.engine.delivery import Report
+from router.engine.delivery import Outcome, Report
 from router.engine.freshness import Freshness
-from router.engine.slow_path import LEN, MAX_DATAGRAM, Rejected, SlowPath
+from router.engine.slow_path import LEN, MAX_DATAGRAM, Rejected, SlowPath, restored
 
 Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]
 Take = Callable[[bytes, int], None]
+
+ServePart = Callable[[bytes | None, bytes, int, int, str, int], None]
+"""Called with the payload, or None where it is not the envelope's only field; the datagram as it was received; the
+wall clock and the monotonic clock at its receipt; the sender's name in expressions; and the monotonic time of its
+arrival in the kernel. Times in ns."""
 
 _Addresses = Sequence[tuple[object, str]]
 """Keys by which endpoints are recognised (IP address, or IP address and port), each with the endpoint's name."""
@@ -183,6 +188,58 @@ class InboundEngine:
                 report(Report("reject", listener, "", reason, None, detail))
 
         return reject
+
+
+class PartEngine:
+    """One part of a program's routes from UDP, for datagrams that another thread has accepted and put into a queue.
+
+    That thread has counted them as received and as waiting. They are counted in `context.counts` from then on.
+    """
+
+    def __init__(self, program: Program, context: EngineContext, part: Part) -> None:
+        self._program = program
+        self._context = context
+        self._part = part
+        self._handles: list[FunctionType] = []
+
+    def close(self) -> None:
+        """Free the handlers. None of the functions may be called afterwards."""
+        for handle in self._handles:
+            unbind(handle)
+
+    def functions(self) -> Mapping[str, ServePart]:
+        """Compile and return the functions of all routes that have the part. They never raise for what was received."""
+        handlers = [handler for handlers in self._program.inbound.values() for handler in handlers]
+        parts = ((handler.route, handler.part(self._part)) for handler in handlers)
+        return {route: self._function(part) for route, part in parts if part is not None}
+
+    def _function(self, part: Handler) -> ServePart:
+        counters, counts, route = self._program.counters, self._context.counts, part.route
+        handle = bind(part, counters, self._context, Freshness())  # it has no use for the time stamps of ROS
+        self._handles.append(handle)
+        waiting = [counters.index("messages_waiting", route, target.label) for target in part.targets]
+        outcomes = [Outcome(counters, counts, route, target, self._context.report) for target in part.targets]
+        parse, parse_envelope = part.case.message_class.FromString, self._program.envelope.message_class.FromString
+        name, is_aged = part.case.name, part.ttl is not None
+
+        def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: int) -> None:
+            for index in waiting:
+                counts[index] -= 1
+            try:
+                if payload is not None:
+                    message = parse(payload)
+                else:
+                    message = getattr(parse_envelope(restored(data, MAX_DATAGRAM)), name)
+            except ProtobufError as error:
+                for outcome in outcomes:
+                    outcome.dropped("mapping_error", error)
+                return
+            if is_aged:
+                handle(message, data, received_at, now, source, born)
+            else:
+                handle(message, data, received_at, now, source)
+
+        return serve
 
 
 @dataclass(frozen=True, slots=True)
