@@ -14,40 +14,44 @@ enum { MAX_DATAGRAM = 16 * 1024 };
 /* Reasons to reject a datagram, in the order of REJECT_REASONS in compiler/metrics.py. */
 enum reason { TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD, UNKNOWN_CASE, UNHANDLED, IGNORED, SOURCE_MISMATCH, REASONS };
 
-/* The message types of an envelope, flattened. Type 0 is the envelope. */
+/* The message types of an envelope, flattened by carrier/schema.py. */
 struct wire_field {
     uint32_t number;
-    uint8_t kind;       /* one of enum wire_kind */
-    uint8_t is_packable; /* a repeated scalar: elements may come alone or packed */
-    uint16_t type;      /* of a message or group: index of its type */
+    uint8_t kind;  /* one of enum wire_kind */
+    uint8_t flags; /* of enum wire_flag */
+    uint16_t type; /* of a message or group: index of its type */
 };
 enum wire_kind { WIRE_VARINT, WIRE_I64, WIRE_I32, WIRE_BYTES, WIRE_STRING, WIRE_MESSAGE, WIRE_GROUP };
+enum wire_flag {
+    WIRE_PACKABLE = 1, /* a repeated scalar: its elements may come alone or packed */
+    WIRE_CASE = 2,     /* of the envelope: a payload case, which is always a message */
+    WIRE_ROUTED = 4,   /* a payload case that has a route */
+};
 
 struct wire_type {
     const struct wire_field *fields; /* by ascending number */
     uint32_t count;
+    uint32_t accepts_zero; /* has neither fields nor extensions: protobuf does not look at field numbers there */
 };
 
 struct wire_schema {
-    const struct wire_type *types;
+    const struct wire_type *types; /* the first one is the envelope */
     uint32_t count;
-    const uint32_t *cases; /* field numbers of the oneof, ascending */
-    uint32_t case_count;
 };
 
 struct envelope {
     uint32_t case_number;
     uint32_t size;          /* with the trailing zeros that were put back, without those that were padding */
     uint32_t start, length; /* of the payload, where it is the only field */
-    bool is_single;
-    bool is_repaired;       /* `size` is not that of the datagram */
+    bool is_single;         /* the payload is the only field */
+    bool is_repaired;       /* `size` is not that of the datagram; counted as padded, also if there is no payload */
 };
 
 /* Find the payload case of a datagram of `size` bytes. `data` has room for MAX_DATAGRAM bytes; zeros that were left
  * out are written behind the datagram. `repairs`: the listener restores trimmed and padded frames.
  *
- * Return -1, or one of TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD and UNKNOWN_CASE (`case_number` is then the unknown
- * field's). */
+ * Return -1, or one of TRUNCATED, EMPTY, MALFORMED, NO_PAYLOAD and UNKNOWN_CASE. `case_number` is then the unknown
+ * field's; if MALFORMED, that of a payload case that came as something else than a message, or 0. */
 int envelope_read(const struct wire_schema *schema, uint8_t *data, size_t size, bool repairs, struct envelope *envelope);
 
 #endif

@@ -1,0 +1,354 @@
+/* The wire format of protobuf, as far as it decides whether the protobuf library (upb) parses a message.
+ *
+ * A message is a sequence of fields. A field starts with a tag, `number << 3 | wire type`, then comes its value:
+ *
+ *     0  VARINT     7 bits per byte, the lowest first; the high bit says that another byte follows
+ *     1  I64        8 bytes
+ *     2  LEN        a varint with the size, then so many bytes: a string, bytes, a message, or packed scalars
+ *     3  GROUP      fields, up to
+ *     4  GROUP_END  with the same number
+ *     5  I32        4 bytes
+ *
+ * A field whose number or wire type is not the declared one is unknown: it is skipped, and has to be well formed. */
+#include "envelope.h"
+
+#include <string.h>
+
+enum { VARINT, I64, LEN, GROUP, GROUP_END, I32 };
+enum {
+    LONGEST_VARINT = 10,
+    LONGEST_TAG = 5,  /* bytes; the tag itself has 32 bits */
+    LONGEST_SIZE = 5,
+    MOST_LEVELS = 100 /* of messages and groups within a message, known or unknown */
+};
+
+/* What is left to read. */
+struct bytes {
+    const uint8_t *at, *end;
+};
+
+static inline size_t left(const struct bytes *bytes) { return (size_t)(bytes->end - bytes->at); }
+
+/* Read a varint of at most `longest` bytes. It may be longer than it needs to be; bits beyond 64 are dropped. */
+static inline bool read_varint(struct bytes *bytes, unsigned longest, uint64_t *value) {
+    uint64_t read = 0;
+    for (unsigned index = 0; index < longest && bytes->at < bytes->end; index++) {
+        uint8_t byte = *bytes->at++;
+        read |= (uint64_t)(byte & 0x7F) << (7 * index);
+        if (byte < 0x80) {
+            *value = read;
+            return true;
+        }
+    }
+    return false;
+}
+
+static inline bool read_tag(struct bytes *bytes, uint32_t *tag) {
+    uint64_t value;
+    if (!read_varint(bytes, LONGEST_TAG, &value) || value > UINT32_MAX) return false;
+    *tag = (uint32_t)value;
+    return true;
+}
+
+static inline bool skip(struct bytes *bytes, uint64_t size) {
+    if (size > left(bytes)) return false;
+    bytes->at += size;
+    return true;
+}
+
+/* Read the size of a LEN field, and skip the bytes. */
+static inline bool read_len(struct bytes *bytes, struct bytes *value) {
+    uint64_t size;
+    if (!read_varint(bytes, LONGEST_SIZE, &size)) return false;
+    value->at = bytes->at;
+    if (!skip(bytes, size)) return false;
+    value->end = bytes->at;
+    return true;
+}
+
+/* Skip the value of a field that is neither LEN nor a group. */
+static inline bool skip_scalar(struct bytes *bytes, uint32_t wire_type) {
+    uint64_t number;
+    switch (wire_type) {
+    case VARINT: return read_varint(bytes, LONGEST_VARINT, &number);
+    case I64: return skip(bytes, 8);
+    case I32: return skip(bytes, 4);
+    default: return false;
+    }
+}
+
+static const struct wire_field *find_field(const struct wire_type *type, uint32_t number) {
+    const struct wire_field *fields = type->fields;
+    /* Most types number their fields from 1 without gaps. For 0 the index wraps around. */
+    if (number - 1 < type->count && fields[number - 1].number == number) return &fields[number - 1];
+    uint32_t low = 0, high = type->count;
+    while (low < high) {
+        uint32_t middle = low + (high - low) / 2;
+        if (fields[middle].number == number) return &fields[middle];
+        if (fields[middle].number < number) {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
+    }
+    return NULL;
+}
+
+static inline bool is_continuation(uint8_t byte) { return (byte & 0xC0) == 0x80; }
+
+/* The size in bytes of the UTF-8 character at `at`, whose first byte is not ASCII, or 0 if it is none: too long for its
+ * code point, a surrogate, or beyond U+10FFFF. The second byte's lowest and highest values say so. */
+static size_t utf8_size(const uint8_t *at, size_t size) {
+    uint8_t first = at[0], low = 0x80, high = 0xBF;
+    size_t needed = first < 0xC2 ? 0 : first < 0xE0 ? 2 : first < 0xF0 ? 3 : first < 0xF5 ? 4 : 0;
+    if (needed == 0 || needed > size) return 0;
+    if (first == 0xE0) low = 0xA0;
+    if (first == 0xED) high = 0x9F;
+    if (first == 0xF0) low = 0x90;
+    if (first == 0xF4) high = 0x8F;
+    if (at[1] < low || at[1] > high) return 0;
+    for (size_t index = 2; index < needed; index++) {
+        if (!is_continuation(at[index])) return 0;
+    }
+    return needed;
+}
+
+static bool is_utf8(struct bytes text) {
+    while (text.at < text.end) {
+        size_t size = *text.at < 0x80 ? 1 : utf8_size(text.at, left(&text));
+        if (size == 0) return false;
+        text.at += size;
+    }
+    return true;
+}
+
+/* Whether packed scalars are whole. */
+static bool is_packed(uint8_t kind, struct bytes values) {
+    if (kind == WIRE_I64) return left(&values) % 8 == 0;
+    if (kind == WIRE_I32) return left(&values) % 4 == 0;
+    uint64_t value;
+    while (values.at < values.end) {
+        if (!read_varint(&values, LONGEST_VARINT, &value)) return false;
+    }
+    return true;
+}
+
+/* A message or group whose fields are being read. */
+struct level {
+    const uint8_t *end;           /* of a group: of the message around it */
+    const struct wire_type *type; /* NULL in an unknown group */
+    int64_t group;                /* the group's number, or NO_GROUP */
+};
+enum { NO_GROUP = -1 };
+
+struct walk {
+    const struct wire_schema *schema;
+    struct bytes rest; /* of the innermost level */
+    unsigned depth;
+    struct level levels[MOST_LEVELS + 1];
+};
+
+static bool enter(struct walk *walk, const uint8_t *end, const struct wire_type *type, int64_t group) {
+    if (walk->depth == MOST_LEVELS) return false;
+    walk->levels[++walk->depth] = (struct level){end, type, group};
+    walk->rest.end = end;
+    return true;
+}
+
+static void leave(struct walk *walk) { walk->rest.end = walk->levels[--walk->depth].end; }
+
+/* Read the value of a LEN field. That of a message is entered. */
+static bool read_known_len(struct walk *walk, const struct wire_type *type, uint32_t number) {
+    struct bytes value;
+    if (!read_len(&walk->rest, &value)) return false;
+    const struct wire_field *field = type ? find_field(type, number) : NULL;
+    if (field == NULL) return true;
+    if (field->kind == WIRE_MESSAGE) {
+        walk->rest.at = value.at;
+        return enter(walk, value.end, &walk->schema->types[field->type], NO_GROUP);
+    }
+    if (field->kind == WIRE_STRING) return is_utf8(value);
+    if (field->flags & WIRE_PACKABLE) return is_packed(field->kind, value);
+    return true;
+}
+
+static bool enter_group(struct walk *walk, const struct wire_type *type, uint32_t number) {
+    const struct wire_field *field = type ? find_field(type, number) : NULL;
+    bool is_known = field != NULL && field->kind == WIRE_GROUP;
+    return enter(walk, walk->rest.end, is_known ? &walk->schema->types[field->type] : NULL, number);
+}
+
+static bool read_field(struct walk *walk) {
+    const struct level *level = &walk->levels[walk->depth];
+    uint32_t tag;
+    if (!read_tag(&walk->rest, &tag)) return false;
+    uint32_t number = tag >> 3, wire_type = tag & 7;
+    /* protobuf does not look at field numbers in unknown groups and empty messages. */
+    if (number == 0 && level->type != NULL && !level->type->accepts_zero) return false;
+    if (wire_type == LEN) return read_known_len(walk, level->type, number);
+    if (wire_type == GROUP) return enter_group(walk, level->type, number);
+    if (wire_type == GROUP_END) {
+        if (level->group != number) return false;
+        leave(walk);
+        return true;
+    }
+    return skip_scalar(&walk->rest, wire_type);
+}
+
+static bool is_well_formed(const struct wire_schema *schema, const struct wire_type *type, struct bytes message) {
+    struct walk walk; /* not initialized as a whole: only levels that were entered are read */
+    walk.schema = schema;
+    walk.rest = message;
+    walk.depth = 0;
+    walk.levels[0] = (struct level){message.end, type, NO_GROUP};
+    for (;;) {
+        if (walk.rest.at < walk.rest.end) {
+            if (!read_field(&walk)) return false;
+        } else if (walk.levels[walk.depth].group != NO_GROUP) {
+            return false;
+        } else if (walk.depth > 0) {
+            leave(&walk);
+        } else {
+            return true;
+        }
+    }
+}
+
+/* Read the value of a field of a well-formed message: `value` is all of it, of a group with its end. */
+static bool read_value(struct bytes *bytes, uint32_t wire_type, struct bytes *value) {
+    if (wire_type == LEN) return read_len(bytes, value);
+    value->at = bytes->at;
+    unsigned open = wire_type == GROUP;
+    if (open == 0 && !skip_scalar(bytes, wire_type)) return false;
+    while (open > 0) {
+        uint32_t tag;
+        struct bytes inner;
+        if (!read_tag(bytes, &tag)) return false;
+        switch (tag & 7) {
+        case GROUP: open++; break;
+        case GROUP_END: open--; break;
+        case LEN:
+            if (!read_len(bytes, &inner)) return false;
+            break;
+        default:
+            if (!skip_scalar(bytes, tag & 7)) return false;
+        }
+    }
+    value->end = bytes->at;
+    return true;
+}
+
+/* Whether an envelope's field has the wire type that is declared. */
+static bool is_known(const struct wire_field *field, uint32_t wire_type) {
+    if (field == NULL) return false;
+    switch (wire_type) {
+    case VARINT: return field->kind == WIRE_VARINT;
+    case I64: return field->kind == WIRE_I64;
+    case I32: return field->kind == WIRE_I32;
+    case GROUP: return field->kind == WIRE_GROUP;
+    default:
+        return field->kind == WIRE_BYTES || field->kind == WIRE_STRING || field->kind == WIRE_MESSAGE ||
+               (field->flags & WIRE_PACKABLE) != 0;
+    }
+}
+
+/* Find the payload case of an envelope that is well formed: the last one that is there. */
+static int find_case(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
+    struct bytes rest = {data, data + envelope->size};
+    uint32_t fields = 0, unknown = 0, no_message = 0;
+    bool has_unknown = false;
+    while (rest.at < rest.end) {
+        uint32_t tag;
+        struct bytes value;
+        if (!read_tag(&rest, &tag) || !read_value(&rest, tag & 7, &value)) return MALFORMED;
+        uint32_t number = tag >> 3, wire_type = tag & 7;
+        const struct wire_field *field = find_field(&schema->types[0], number);
+        bool is_case = field != NULL && (field->flags & WIRE_CASE);
+        fields++;
+        if (is_case && wire_type == LEN) {
+            envelope->case_number = number;
+            envelope->start = (uint32_t)(value.at - data);
+            envelope->length = (uint32_t)left(&value);
+        } else if (!is_known(field, wire_type)) {
+            if (!has_unknown) unknown = number;
+            has_unknown = true;
+            if (is_case && no_message == 0) no_message = number;
+        }
+    }
+    if (envelope->case_number != 0) {
+        envelope->is_single = fields == 1;
+        return -1;
+    }
+    if (!has_unknown) return NO_PAYLOAD;
+    envelope->case_number = no_message ? no_message : unknown;
+    return no_message ? MALFORMED : UNKNOWN_CASE;
+}
+
+/* Whether the datagram is nothing but the payload of a routed case, with a tag and a size of at most two bytes. The
+ * payload is then parsed alone, and may have one level more than within the envelope. This is the usual datagram. */
+static bool is_usual(const struct wire_schema *schema, const uint8_t *data, struct envelope *envelope) {
+    struct bytes rest = {data, data + envelope->size};
+    uint64_t tag, size;
+    if (!read_varint(&rest, 2, &tag) || (tag & 7) != LEN) return false;
+    const struct wire_field *field = find_field(&schema->types[0], (uint32_t)tag >> 3);
+    if (field == NULL || !(field->flags & WIRE_ROUTED)) return false;
+    if (!read_varint(&rest, 2, &size) || size != left(&rest)) return false;
+    if (!is_well_formed(schema, &schema->types[field->type], rest)) return false;
+    envelope->case_number = field->number;
+    envelope->start = (uint32_t)(rest.at - data);
+    envelope->length = (uint32_t)size;
+    envelope->is_single = true;
+    return true;
+}
+
+static bool is_zeros(const struct bytes *bytes) {
+    for (const uint8_t *at = bytes->at; at < bytes->end; at++) {
+        if (*at != 0) return false;
+    }
+    return true;
+}
+
+/* The size that the envelope had when it was encoded. The protocol lets a sender leave out the zeros at the end, and
+ * boards may send frames of a fixed size, padded with zeros. Both can be undone, because a tag is never zero and the
+ * last field states its length.
+ *
+ * It is the size of the datagram if that is complete, or cannot be such an envelope: a cut tag or length, groups, or a
+ * field that would make it longer than MAX_DATAGRAM. */
+static size_t restored_size(const uint8_t *data, size_t size) {
+    struct bytes rest = {data, data + size};
+    while (rest.at < rest.end) {
+        uint64_t tag, value;
+        if (*rest.at == 0) return is_zeros(&rest) ? (size_t)(rest.at - data) : size;
+        if (!read_varint(&rest, LONGEST_VARINT, &tag)) return size;
+        switch (tag & 7) {
+        case I64: value = 8; break;
+        case I32: value = 4; break;
+        case VARINT:
+        case LEN:
+            if (rest.at == rest.end) return size < MAX_DATAGRAM ? size + 1 : size; /* the value or length was zero */
+            if (!read_varint(&rest, LONGEST_VARINT, &value)) return size;
+            if ((tag & 7) == VARINT) value = 0;
+            break;
+        default: return size;
+        }
+        if (!skip(&rest, value)) {
+            uint64_t missing = value - left(&rest);
+            return missing <= MAX_DATAGRAM - size ? size + (size_t)missing : size;
+        }
+    }
+    return size;
+}
+
+int envelope_read(const struct wire_schema *schema, uint8_t *data, size_t size, bool repairs,
+                  struct envelope *envelope) {
+    *envelope = (struct envelope){.size = (uint32_t)size};
+    if (size > MAX_DATAGRAM) return TRUNCATED;
+    if (size == 0) return EMPTY;
+    if (is_usual(schema, data, envelope)) return -1;
+    size_t whole = repairs ? restored_size(data, size) : size;
+    if (whole > size) memset(data + size, 0, whole - size);
+    if (!is_well_formed(schema, &schema->types[0], (struct bytes){data, data + whole})) return MALFORMED;
+    envelope->size = (uint32_t)whole;
+    envelope->is_repaired = whole != size;
+    return find_case(schema, data, envelope);
+}

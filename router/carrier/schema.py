@@ -1,0 +1,185 @@
+"""An envelope's message types as the arrays that `envelope_read` parses by."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Container, Iterator, Mapping, Sequence
+from ctypes import POINTER, c_uint8, c_uint16, c_uint32
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessageClass
+
+from router.compiler.payload import varint
+from router.engine.slow_path import LEN
+from router.types.descriptors import container, message_of
+from router.types.protobuf import Envelope
+
+_MOST_TYPES = 65536
+
+
+class CannotCarry(Exception):
+    """The carrier cannot decide what protobuf decides about these messages; Python has to parse them."""
+
+
+class WireKind(IntEnum):
+    """`enum wire_kind` in envelope.h."""
+
+    VARINT = 0
+    I64 = 1
+    I32 = 2
+    BYTES = 3
+    STRING = 4
+    MESSAGE = 5
+    GROUP = 6
+
+
+class WireFlag(IntFlag):
+    """`enum wire_flag` in envelope.h."""
+
+    PACKABLE = 1
+    CASE = 2
+    ROUTED = 4
+
+
+class WireField(ctypes.Structure):
+    """`struct wire_field` in envelope.h."""
+
+    _fields_ = (("number", c_uint32), ("kind", c_uint8), ("flags", c_uint8), ("type", c_uint16))
+
+
+class WireType(ctypes.Structure):
+    """`struct wire_type` in envelope.h."""
+
+    _fields_ = (("fields", POINTER(WireField)), ("count", c_uint32), ("accepts_zero", c_uint32))
+
+
+class WireSchema(ctypes.Structure):
+    """`struct wire_schema` in envelope.h."""
+
+    _fields_ = (("types", POINTER(WireType)), ("count", c_uint32))
+
+
+@dataclass(frozen=True, slots=True)
+class LoweredSchema:
+    """A `struct wire_schema`, and the arrays that it points to. C may use it as long as this object lives."""
+
+    schema: WireSchema
+    types: ctypes.Array[WireType]
+    fields: Sequence[ctypes.Array[WireField]]
+
+
+_KINDS: Mapping[int, WireKind] = {
+    FieldDescriptor.TYPE_BOOL: WireKind.VARINT,
+    FieldDescriptor.TYPE_ENUM: WireKind.VARINT,
+    FieldDescriptor.TYPE_INT32: WireKind.VARINT,
+    FieldDescriptor.TYPE_INT64: WireKind.VARINT,
+    FieldDescriptor.TYPE_SINT32: WireKind.VARINT,
+    FieldDescriptor.TYPE_SINT64: WireKind.VARINT,
+    FieldDescriptor.TYPE_UINT32: WireKind.VARINT,
+    FieldDescriptor.TYPE_UINT64: WireKind.VARINT,
+    FieldDescriptor.TYPE_DOUBLE: WireKind.I64,
+    FieldDescriptor.TYPE_FIXED64: WireKind.I64,
+    FieldDescriptor.TYPE_SFIXED64: WireKind.I64,
+    FieldDescriptor.TYPE_FLOAT: WireKind.I32,
+    FieldDescriptor.TYPE_FIXED32: WireKind.I32,
+    FieldDescriptor.TYPE_SFIXED32: WireKind.I32,
+    FieldDescriptor.TYPE_BYTES: WireKind.BYTES,
+    FieldDescriptor.TYPE_STRING: WireKind.STRING,
+    FieldDescriptor.TYPE_MESSAGE: WireKind.MESSAGE,
+    FieldDescriptor.TYPE_GROUP: WireKind.GROUP,
+}
+
+
+def wire_schema(envelope: Envelope, routed: Container[int]) -> LoweredSchema:
+    """Return the types of an envelope and its payloads. `routed` are the numbers of the cases that have a route.
+
+    Raises CannotCarry.
+    """
+    descriptor: Descriptor = envelope.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's, which is the same
+    flags = {case.number: _case_flags(case.number, routed) for case in envelope.cases.values()}
+    _check_envelope(descriptor, flags)
+    indexes = _all_types(descriptor)
+    arrays = [_lowered(each, indexes, {} if index else flags) for each, index in indexes.items()]
+    types = (WireType * len(arrays))(
+        *(
+            WireType(fields, len(fields), not fields and not each.is_extendable)
+            for fields, each in zip(arrays, indexes, strict=True)
+        )
+    )
+    return LoweredSchema(WireSchema(types, len(types)), types, arrays)
+
+
+def _check_envelope(envelope: Descriptor, cases: Container[int]) -> None:
+    """Refuse what makes an envelope's fields unknown for other reasons than their wire type.
+
+    Where there is no payload, the reason depends on the unknown fields. Inside of payloads it does not matter.
+    """
+    for field in _fields(envelope):
+        if field.number in cases and field.type == FieldDescriptor.TYPE_GROUP:
+            raise CannotCarry(f"the payload case {field.name} is a group")
+        if field.enum_type is not None and field.enum_type.is_closed:
+            raise CannotCarry(f"{field.full_name} beside the payload is a closed enum")
+        if field.message_type is not None and field.message_type.GetOptions().map_entry:
+            raise CannotCarry(f"{field.full_name} beside the payload is a map")
+
+
+def _all_types(envelope: Descriptor) -> dict[Descriptor, int]:
+    """The envelope and all types that its fields lead to, with their indexes."""
+    indexes, pending = {envelope: 0}, [envelope]
+    while pending:
+        descriptor = pending.pop()
+        if descriptor.GetOptions().message_set_wire_format:
+            raise CannotCarry(f"{descriptor.full_name} is a message set")
+        for field in _fields(descriptor):
+            if field.message_type is not None and field.message_type not in indexes:
+                indexes[field.message_type] = len(indexes)
+                pending.append(field.message_type)
+    if len(indexes) > _MOST_TYPES:
+        raise CannotCarry(f"{envelope.full_name} leads to {len(indexes)} types of messages")
+    return indexes
+
+
+def _fields(descriptor: Descriptor) -> Iterator[FieldDescriptor]:
+    """The fields of a message and the extensions that its pool knows: protobuf parses both alike."""
+    yield from descriptor.fields
+    if descriptor.is_extendable:
+        yield from descriptor.file.pool.FindAllExtensions(descriptor)
+
+
+def _case_flags(number: int, routed: Container[int]) -> WireFlag:
+    return WireFlag.CASE | WireFlag.ROUTED if number in routed else WireFlag.CASE
+
+
+def _lowered(
+    descriptor: Descriptor, indexes: Mapping[Descriptor, int], flags: Mapping[int, WireFlag]
+) -> ctypes.Array[WireField]:
+    fields = sorted(_fields(descriptor), key=lambda field: field.number)
+    lowered = [_lowered_field(field, indexes, flags.get(field.number, WireFlag(0))) for field in fields]
+    return (WireField * len(lowered))(*lowered)
+
+
+def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], flags: WireFlag) -> WireField:
+    kind = _kind(field)
+    if kind in {WireKind.MESSAGE, WireKind.GROUP}:
+        return WireField(field.number, kind, flags, indexes[message_of(field)])
+    is_packable = field.is_repeated and kind in {WireKind.VARINT, WireKind.I64, WireKind.I32}
+    return WireField(field.number, kind, WireFlag.PACKABLE if is_packable else WireFlag(0), 0)
+
+
+def _kind(field: FieldDescriptor) -> WireKind:
+    if field.type == FieldDescriptor.TYPE_STRING and not _checks_utf8(field):
+        return WireKind.BYTES
+    return _KINDS[field.type]
+
+
+def _checks_utf8(field: FieldDescriptor) -> bool:
+    """Whether protobuf refuses text that is no UTF-8. That depends on syntax and features, so protobuf is asked."""
+    encoded = varint(field.number << 3 | LEN) + b"\x01\xff"
+    try:
+        GetMessageClass(container(field)).FromString(encoded)
+    except DecodeError:
+        return True
+    return False

@@ -1,0 +1,164 @@
+"""Datagrams made of pieces of the wire format, by a schema, mostly well formed; and damage to them."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+
+from benchmarks.fuzz_engine import MUTATIONS
+from tests.engine.wire import I32, I64, LEN, VARINT, tag, varint
+
+GROUP, GROUP_END = 3, 4
+
+_FIXED32 = {FieldDescriptor.TYPE_FLOAT, FieldDescriptor.TYPE_FIXED32, FieldDescriptor.TYPE_SFIXED32}
+_FIXED64 = {FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64, FieldDescriptor.TYPE_SFIXED64}
+_LENGTHY = {FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_BYTES, FieldDescriptor.TYPE_MESSAGE}
+
+_TEXTS = (b"", b"\0", b"a", b"abcdefgh" * 5, *(text.encode() for text in ("\x80", "\u07ff", "\u0800", "\uffff")))
+_EDGES = (
+    "\ud7ff".encode(), "\ue000".encode(), "\U00010000".encode(), "\U0010ffff".encode(),
+    b"\xc1\xbf", b"\xe0\x9f\xbf", b"\xed\xa0\x80", b"\xf0\x8f\xbf\xbf", b"\xf4\x90\x80\x80", b"\xf5\x80\x80\x80",
+    b"\x80", b"\xc2", b"\xe1\x80", b"\xf1\x80\x80", b"\xff", b"a\xe2\x82", b"\xc2\x80\x80", b"\xe2\x28\xa1",
+)  # fmt: skip
+
+
+class Maker:
+    """Makes datagrams for an envelope, by what `noise` says."""
+
+    def __init__(self, envelope: Descriptor, noise: random.Random) -> None:
+        self._envelope = envelope
+        self._noise = noise
+        self._room = 0
+
+    def datagram(self) -> bytes:
+        """An envelope, in most cases with one payload and nothing else; damaged at times."""
+        data = self.envelope()
+        other = data
+        for _ in range(self._noise.choice((0, 0, 0, 1, 1, 2))):
+            if not data:
+                break
+            if self._noise.random() < 0.3:
+                other = self.envelope() or b"\0"
+            data = self._noise.choice(MUTATIONS)(self._noise, data, other)
+        return data
+
+    def envelope(self) -> bytes:
+        self._room = self._noise.choice((5, 30, 120))
+        oneof = [field for field in self._envelope.fields if field.containing_oneof is not None]
+        parts = [self._known(self._noise.choice(oneof)) for _ in range(self._noise.choice((0, 1, 1, 1, 1, 1, 2)))]
+        if self._noise.random() < 0.3:
+            parts.append(self._message(self._envelope))
+        self._noise.shuffle(parts)
+        return b"".join(parts)
+
+    def _message(self, descriptor: Descriptor) -> bytes:
+        """Some of its fields, in any order, and now and then an unknown one."""
+        parts = []
+        fields = [*descriptor.fields]
+        if descriptor.is_extendable:
+            fields += descriptor.file.pool.FindAllExtensions(descriptor)
+        for _ in range(self._noise.choice((0, 1, 2, 3, 6))):
+            if self._room <= 0:
+                break
+            self._room -= 1
+            if fields and self._noise.random() < 0.95:
+                parts.append(self._known(self._noise.choice(fields)))
+            else:
+                parts.append(self._unknown())
+        return b"".join(parts)
+
+    def _known(self, field: FieldDescriptor) -> bytes:
+        """A field as declared, or with another wire type."""
+        if self._noise.random() < 0.02:
+            return self._value(field.number, self._noise.choice((VARINT, I64, LEN, GROUP, I32)))
+        if field.type == FieldDescriptor.TYPE_GROUP:
+            return self._group(field.number, lambda: self._inner(field))
+        if field.type in _LENGTHY:
+            return self._len(field.number, self._content(field))
+        if field.is_repeated and self._noise.random() < 0.6:
+            return self._len(field.number, self._packed(field))
+        wire_type = I32 if field.type in _FIXED32 else I64 if field.type in _FIXED64 else VARINT
+        return self._value(field.number, wire_type)
+
+    def _content(self, field: FieldDescriptor) -> bytes:
+        if field.message_type is not None:
+            return self._inner(field)
+        parts = self._noise.choices(_TEXTS, k=self._noise.randrange(4))
+        if self._noise.random() < 0.1:
+            parts.append(self._noise.choice(_EDGES))
+        self._noise.shuffle(parts)
+        return b"".join(parts)
+
+    def _inner(self, field: FieldDescriptor) -> bytes:
+        """The fields of a message or group; now and then about as deep as protobuf takes it."""
+        assert field.message_type is not None
+        content = self._message(field.message_type)
+        if self._noise.random() > 0.02:
+            return content
+        recursive = [each for each in field.message_type.fields if each.message_type is field.message_type]
+        for _ in range(self._noise.randrange(95, 103) if recursive or self._noise.random() < 0.3 else 0):
+            content = self._wrapped(self._noise.choice(recursive) if recursive else None, content)
+        return content
+
+    def _wrapped(self, field: FieldDescriptor | None, content: bytes) -> bytes:
+        if field is None:
+            return tag(99, GROUP) + content + tag(99, GROUP_END)
+        if field.type == FieldDescriptor.TYPE_GROUP:
+            return tag(field.number, GROUP) + content + tag(field.number, GROUP_END)
+        return self._len(field.number, content)
+
+    def _packed(self, field: FieldDescriptor) -> bytes:
+        count = self._noise.choice((0, 1, 2, 3, 20))
+        if field.type in _FIXED32 or field.type in _FIXED64:
+            size = 4 if field.type in _FIXED32 else 8
+            return self._noise.randbytes(count * size + (self._noise.random() < 0.05))
+        values = b"".join(self._varint() for _ in range(count))
+        return values[:-1] if self._noise.random() < 0.05 else values
+
+    def _unknown(self) -> bytes:
+        number = self._noise.choice((0, 1, 17, 30, 99, 2047, 2048, 99999, 2**29 - 1))
+        return self._value(number, self._noise.choice((VARINT, I64, LEN, GROUP, I32, I32, LEN, VARINT, 4, 6, 7)))
+
+    def _value(self, number: int, wire_type: int) -> bytes:
+        """Any value of a wire type; nothing behind the tag for those that have none."""
+        if wire_type == GROUP:
+            return self._group(number, lambda: b"".join(self._unknown() for _ in range(self._noise.randrange(3))))
+        if wire_type == LEN:
+            return self._len(number, self._noise.choice((b"", b"\0\0", b"\x08\x01", b"\x0b\x0c", self._varint() * 2)))
+        head = self._tag(number, wire_type)
+        if wire_type == VARINT:
+            return head + self._varint()
+        zeros_too = self._noise.choice((bytes(8), self._noise.randbytes(8)))
+        return head + zeros_too[: {I32: 4, I64: 8}.get(wire_type, 0)]
+
+    def _group(self, number: int, content: Callable[[], bytes]) -> bytes:
+        end = number if self._noise.random() < 0.97 else self._noise.choice((0, 1, number + 1))
+        if self._room <= 0:
+            return b""
+        self._room -= 1
+        return self._tag(number, GROUP) + content() + self._tag(end, GROUP_END)
+
+    def _len(self, number: int, content: bytes) -> bytes:
+        size = len(content)
+        if self._noise.random() < 0.01:
+            size = self._noise.choice((size + 1, size - 1, 2**31 - 1, 2**31, 2**32 + size, 2**64 - 1))
+        return self._tag(number, LEN) + self._stretched(varint(size % 2**64)) + content
+
+    def _tag(self, number: int, wire_type: int) -> bytes:
+        return self._stretched(tag(number, wire_type))
+
+    def _stretched(self, encoded: bytes) -> bytes:
+        """A varint, now and then longer than it needs to be, up to one byte more than any may have."""
+        if self._noise.random() > 0.02:
+            return encoded
+        longest: Sequence[int] = range(len(encoded) + 1, 12)
+        more = self._noise.choice(longest or (len(encoded) + 1,)) - len(encoded)
+        return encoded[:-1] + bytes((encoded[-1] | 0x80,)) + b"\x80" * (more - 1) + b"\0"
+
+    def _varint(self) -> bytes:
+        value = self._noise.choice((0, 1, 2, 127, 128, 300, 2**31, 2**32 - 1, 2**63, 2**64 - 1))
+        if self._noise.random() < 0.02:
+            return b"\xff" * 9 + self._noise.choice((b"\0", b"\1", b"\2", b"\x7f", b"\xff\1"))
+        return self._stretched(varint(value))

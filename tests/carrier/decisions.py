@@ -1,0 +1,133 @@
+"""What becomes of a datagram, as Python and as the carrier decide it."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from router.carrier.schema import wire_schema
+from router.compiler.metrics import REJECT_REASONS
+from router.compiler.program import Program
+from router.engine import MAX_DATAGRAM
+from tests.engine.rig import Rig, program
+from tests.tables import PROTOS
+
+TESTS = Path(__file__).parents[1]
+SENDER = ("192.168.0.30", 8)
+
+HEAD = """version: 1
+envelope: {protos: PROTOS, message: PBEnvelope, oneof: payload}
+listen:
+  trimmed: {address: 127.0.0.1:5000, framing: zero_trimmed}
+  exact: {address: 127.0.0.1:5001, framing: exact}
+endpoints:
+  board: {address: 192.168.0.30:8, kind: tool}
+  tool: {address: 192.168.0.20:9000, kind: tool}
+routes:
+"""
+
+SCHEMAS = {
+    "rover": (PROTOS, ["imu_info", "drive_diag", "gps_info", "arm_pos", "manual_drive"]),
+    "every_kind": (TESTS / "protos", ["every_kind"]),
+    "hard": (TESTS / "carrier" / "protos", ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
+}
+"""Folders of protos, and the payload cases that get a route."""
+
+
+def table(schema: str, folder: Path) -> Program:
+    """A table for one of SCHEMAS, with its file in `folder`."""
+    protos, cases = SCHEMAS[schema]
+    routes = "".join(f"  {case}: {{source: any, destinations: [tool]}}\n" for case in cases)
+    return program(folder, routes, HEAD, protos)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What becomes of a datagram before senders are looked at.
+
+    `reason` is None for the payload case `number`, which may have no route. For `unknown_case` and `malformed` it is
+    the number of the field to blame, or 0. `is_repaired`: counted as padded.
+    """
+
+    reason: str | None
+    number: int
+    is_repaired: bool
+
+
+class PythonSide:
+    """An engine, asked by its counters and reports."""
+
+    def __init__(self, made: Program) -> None:
+        self._rig = Rig(made)
+        index = made.counters.index
+        self._numbers = {case.name: case.number for case in made.envelope.cases.values()}
+        self._received = {
+            number: index("messages_received", handler.route, "board") for number, (handler,) in made.inbound.items()
+        }
+        self._padded = {name: index("datagrams_padded", name) for name in ("trimmed", "exact")}
+
+    def decide(self, data: bytes, repairs: bool) -> Decision:
+        listener = "trimmed" if repairs else "exact"
+        rig, counts = self._rig, self._rig.counts
+        rig.reports.clear()
+        rig.sent.clear()
+        padded = counts[self._padded[listener]]
+        received = {number: counts[index] for number, index in self._received.items()}
+        rig.receive(data, SENDER, listener)
+        is_repaired = counts[self._padded[listener]] != padded
+        if not rig.reports:
+            (number,) = [number for number, index in self._received.items() if counts[index] != received[number]]
+            return Decision(None, number, is_repaired)
+        (report,) = rig.reports
+        if report.reason == "unhandled":
+            return Decision(None, self._numbers[report.detail.rpartition(" ")[2]], is_repaired)
+        field = re.search(r": field (\d+)", report.detail)
+        return Decision(report.reason, int(field[1]) if field else 0, is_repaired)
+
+
+class _Envelope(ctypes.Structure):
+    """`struct envelope` in envelope.h."""
+
+    _fields_ = (
+        ("case_number", ctypes.c_uint32),
+        ("size", ctypes.c_uint32),
+        ("start", ctypes.c_uint32),
+        ("length", ctypes.c_uint32),
+        ("is_single", ctypes.c_bool),
+        ("is_repaired", ctypes.c_bool),
+    )
+
+
+class CarrierSide:
+    """`envelope_read` in the C library `library`."""
+
+    def __init__(self, library: ctypes.CDLL, made: Program) -> None:
+        self._lowered = wire_schema(made.envelope, made.inbound)
+        self._read = library.envelope_read
+        self._read.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_bool, ctypes.c_void_p)
+        self._read.restype = ctypes.c_int
+        self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
+        self._schema = ctypes.byref(self._lowered.schema)
+        self._buffer = (ctypes.c_char * (MAX_DATAGRAM + 8))()
+        self._envelope = _Envelope()
+
+    def decide(self, data: bytes, repairs: bool) -> Decision:
+        kept = data[:MAX_DATAGRAM]
+        # What an earlier datagram left behind this one must not count.
+        ctypes.memmove(self._buffer, kept + b"\xa5" * 8, len(kept) + 8)
+        code = self._read(self._schema, self._buffer, len(data), repairs, ctypes.byref(self._envelope))
+        envelope = self._envelope
+        return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired)
+
+    def whole(self) -> bytes:
+        """The envelope that was read last, repaired."""
+        return self._buffer.raw[: self._envelope.size]
+
+    def payload(self) -> bytes | None:
+        """The payload that was read last, if it was the only field."""
+        envelope = self._envelope
+        if not envelope.is_single:
+            return None
+        return self._buffer.raw[envelope.start : envelope.start + envelope.length]
