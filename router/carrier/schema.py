@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Container, Iterator, Mapping, Sequence
-from ctypes import POINTER, c_uint8, c_uint16, c_uint32
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
@@ -12,6 +11,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from google.protobuf.message import DecodeError
 from google.protobuf.message_factory import GetMessageClass
 
+from router.carrier.structures import Schema, WireField, WireType
 from router.compiler.payload import varint
 from router.engine.slow_path import LEN
 from router.types.descriptors import container, message_of
@@ -44,31 +44,17 @@ class WireFlag(IntFlag):
     ROUTED = 4
 
 
-class WireField(ctypes.Structure):
-    """`struct wire_field` in envelope.h."""
-
-    _fields_ = (("number", c_uint32), ("kind", c_uint8), ("flags", c_uint8), ("type", c_uint16))
-
-
-class WireType(ctypes.Structure):
-    """`struct wire_type` in envelope.h."""
-
-    _fields_ = (("fields", POINTER(WireField)), ("count", c_uint32), ("accepts_zero", c_uint32))
-
-
-class WireSchema(ctypes.Structure):
-    """`struct wire_schema` in envelope.h."""
-
-    _fields_ = (("types", POINTER(WireType)), ("count", c_uint32))
-
-
 @dataclass(frozen=True, slots=True)
-class LoweredSchema:
+class WireSchema:
     """A `struct wire_schema`, and the arrays that it points to. C may use it as long as this object lives."""
 
-    schema: WireSchema
+    schema: Schema
     types: ctypes.Array[WireType]
     fields: Sequence[ctypes.Array[WireField]]
+
+    @property
+    def address(self) -> int:
+        return ctypes.addressof(self.schema)
 
 
 _KINDS: Mapping[int, WireKind] = {
@@ -93,7 +79,7 @@ _KINDS: Mapping[int, WireKind] = {
 }
 
 
-def wire_schema(envelope: Envelope, routed: Container[int]) -> LoweredSchema:
+def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
     """Return the types of an envelope and its payloads. `routed` are the numbers of the cases that have a route.
 
     Raises CannotCarry.
@@ -109,7 +95,7 @@ def wire_schema(envelope: Envelope, routed: Container[int]) -> LoweredSchema:
             for fields, each in zip(arrays, indexes, strict=True)
         )
     )
-    return LoweredSchema(WireSchema(types, len(types)), types, arrays)
+    return WireSchema(Schema(types, len(types)), types, arrays)
 
 
 def _check_envelope(envelope: Descriptor, cases: Container[int]) -> None:

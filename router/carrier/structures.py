@@ -3,10 +3,28 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, c_int32, c_int64, c_uint32, c_void_p
+from ctypes import POINTER, c_int32, c_int64, c_uint8, c_uint16, c_uint32, c_void_p
 
 REASONS = 8
 """Reasons to reject a datagram: those of REJECT_REASONS, in the same order."""
+
+
+class WireField(ctypes.Structure):
+    """`struct wire_field` in envelope.h."""
+
+    _fields_ = (("number", c_uint32), ("kind", c_uint8), ("flags", c_uint8), ("type", c_uint16))
+
+
+class WireType(ctypes.Structure):
+    """`struct wire_type` in envelope.h."""
+
+    _fields_ = (("fields", POINTER(WireField)), ("count", c_uint32), ("accepts_zero", c_uint32))
+
+
+class Schema(ctypes.Structure):
+    """`struct wire_schema` in envelope.h."""
+
+    _fields_ = (("types", POINTER(WireType)), ("count", c_uint32))
 
 
 class Limit(ctypes.Structure):
@@ -194,5 +212,8 @@ __all__ = [
     "Peer",
     "Program",
     "Route",
+    "Schema",
     "Waiting",
+    "WireField",
+    "WireType",
 ]

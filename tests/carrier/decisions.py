@@ -109,7 +109,6 @@ class CarrierSide:
         self._read.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_bool, ctypes.c_void_p)
         self._read.restype = ctypes.c_int
         self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
-        self._schema = ctypes.byref(self._lowered.schema)
         self._buffer = (ctypes.c_char * (MAX_DATAGRAM + 8))()
         self._envelope = _Envelope()
 
@@ -117,7 +116,7 @@ class CarrierSide:
         kept = data[:MAX_DATAGRAM]
         # What an earlier datagram left behind this one must not count.
         ctypes.memmove(self._buffer, kept + b"\xa5" * 8, len(kept) + 8)
-        code = self._read(self._schema, self._buffer, len(data), repairs, ctypes.byref(self._envelope))
+        code = self._read(self._lowered.address, self._buffer, len(data), repairs, ctypes.byref(self._envelope))
         envelope = self._envelope
         return Decision(self._reasons[code], envelope.case_number, envelope.is_repaired)
 
