@@ -193,7 +193,7 @@ class InboundEngine:
 class PartEngine:
     """One part of a program's routes from UDP, for datagrams that another thread has accepted and put into a queue.
 
-    That thread has counted them as received and as waiting. They are counted in `context.counts` from then on.
+    That thread has counted them as received. What becomes of them is counted in `context.counts`.
     """
 
     def __init__(self, program: Program, context: EngineContext, part: Part) -> None:
@@ -207,13 +207,15 @@ class PartEngine:
         for handle in self._handles:
             unbind(handle)
 
-    def functions(self) -> Mapping[str, ServePart]:
-        """Compile and return the functions of all routes that have the part. They never raise for what was received."""
+    def functions(self) -> Mapping[str, tuple[ServePart, Sequence[int]]]:
+        """Compile and return the functions of all routes that have the part, each with the indexes of its targets'
+        `messages_waiting`, which are left to the caller. They never raise for what was received.
+        """
         handlers = [handler for handlers in self._program.inbound.values() for handler in handlers]
         parts = ((handler.route, handler.part(self._part)) for handler in handlers)
         return {route: self._function(part) for route, part in parts if part is not None}
 
-    def _function(self, part: Handler) -> ServePart:
+    def _function(self, part: Handler) -> tuple[ServePart, Sequence[int]]:
         counters, counts, route = self._program.counters, self._context.counts, part.route
         handle = bind(part, counters, self._context, Freshness())  # it has no use for the time stamps of ROS
         self._handles.append(handle)
@@ -223,8 +225,6 @@ class PartEngine:
         name, is_aged = part.case.name, part.ttl is not None
 
         def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: int) -> None:
-            for index in waiting:
-                counts[index] -= 1
             try:
                 if payload is not None:
                     message = parse(payload)
@@ -239,7 +239,7 @@ class PartEngine:
             else:
                 handle(message, data, received_at, now, source)
 
-        return serve
+        return serve, waiting
 
 
 @dataclass(frozen=True, slots=True)
