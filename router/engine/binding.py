@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import FunctionType
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 from router.compiler.metrics import Counters
 from router.compiler.program import Handler, TargetPlan
@@ -52,6 +52,12 @@ class State:
         self._previous = {}
 
 
+class Flag(Protocol):
+    """Has one element, which is true or false."""
+
+    def __getitem__(self, index: int, /) -> object: ...
+
+
 @dataclass(frozen=True, slots=True)
 class TimerGroup:
     """Timers with one lock. `counts` are changed only under it."""
@@ -66,7 +72,7 @@ class EngineContext:
 
     `send` takes a datagram, by endpoint, and may raise OSError; `command(endpoint, route, names)` returns what sends a
     message that has a `ttl` or deadmen (see engine.deadman). `publish` takes CDR bytes, by topic, and may raise
-    `publish_errors`. `wanted`, by topic, is a list of one that its owner keeps up to date: whether anybody subscribes.
+    `publish_errors`. `wanted`, by topic, is a flag that its owner keeps up to date: whether anybody subscribes.
     `report` is called for losses only. `counts` belong to the thread that calls the handlers. `pacers` are those of
     the endpoints with a budget, in the group `pacing`; frames are collected in the group `collecting`.
     """
@@ -74,7 +80,7 @@ class EngineContext:
     counts: list[int]
     send: Mapping[str, Callable[[bytes], int]]
     publish: Mapping[str, Callable[[bytes], None]]
-    wanted: Mapping[str, list[bool]]
+    wanted: Mapping[str, Flag]
     report: Callable[[Report], None]
     clock_ns: Callable[[], int]
     wall_ns: Callable[[], int]

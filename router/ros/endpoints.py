@@ -16,7 +16,7 @@ from rclpy.node import Node
 
 from router.compiler.program import TopicPlan
 from router.errors import SourceSpan, StartError
-from router.ros.events import PeerEvents
+from router.ros.events import PeerEvents, WantedFlag
 from router.ros.node import RCL, RCL_ERRORS
 from router.ros.qos import publisher_qos, qos_profile, subscription_qos
 from router.ros.receiving import MessageThread, RawSubscription
@@ -64,7 +64,7 @@ def _rcl_error() -> Exception:
 
 
 class Publication:
-    """A publisher. `wanted`, a list of one boolean, is whether it has subscribers or serves late joiners.
+    """A publisher. `wanted` is whether it has subscribers or serves late joiners.
 
     `publish` takes CDR bytes, is thread-safe, and releases the interpreter lock while the middleware works. It raises
     RCLError if the middleware fails or the publisher is closed.
@@ -73,7 +73,7 @@ class Publication:
     def __init__(self, node: Node, peers: PeerEvents, plan: TopicPlan, message: type, span: SourceSpan) -> None:
         """Raises StartError."""
         self.plan = plan
-        self.wanted = [plan.qos.serves_late_joiners]
+        self.wanted: WantedFlag = (ctypes.c_uint8 * 1)(plan.qos.serves_late_joiners)
         with _refusing(f"{span}: topic '{plan.label}' cannot be published"), ExitStack() as opening:
             self._publisher = node.create_publisher(
                 message,
@@ -97,7 +97,7 @@ class Publication:
         """Wait up to 0.5 s until subscribers of an earlier publisher of the topic have discovered this one."""
         for _ in range(int(_DISCOVERY_S / _POLL_S)):
             if self._publisher.get_subscription_count():
-                self.wanted[0] = True
+                self.wanted[0] = 1
                 return
             sleep(_POLL_S)
 

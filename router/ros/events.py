@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.guard_condition import GuardCondition
@@ -37,6 +38,10 @@ _MORE_CHECKS = 10
 graph."""
 
 
+WantedFlag: TypeAlias = "ctypes.Array[ctypes.c_uint8]"
+"""One byte, not 0 while a topic has subscribers or serves late joiners. Native threads read it by its address."""
+
+
 class PeerEvents:
     """Event callbacks of publishers and subscriptions about their peers. For one thread.
 
@@ -50,7 +55,7 @@ class PeerEvents:
         self._incompatible = incompatible
         self._checks: dict[str, int] = {}  # by topic that has or had incompatible peers: how many checks are left
 
-    def of_publisher(self, plan: TopicPlan, wanted: list[bool]) -> PublisherEventCallbacks:
+    def of_publisher(self, plan: TopicPlan, wanted: WantedFlag) -> PublisherEventCallbacks:
         """Callbacks that also keep `wanted` up to date: whether there are subscribers."""
 
         def on_matched(status: Any) -> None:

@@ -11,7 +11,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from router.compiler.program import TopicPlan
 from router.errors import SourceSpan, StartError
 from router.ros.endpoints import Publication, RosChange, Subscription, hand_over, left_by, opened_beside
-from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined
+from router.ros.events import EventThread, Incompatible, PeerEvents, SubscriberJoined, WantedFlag
 from router.ros.node import RCL_ERRORS, close_node, open_node
 from router.ros.receiving import MessageThread, Receive
 from router.ros.topics import RosTopics
@@ -21,7 +21,7 @@ from router.table.model import NodeSettings
 class RouterNode:
     """The node, its publishers and subscriptions, and the threads that serve them. Opening raises StartError.
 
-    `publish[topic]` takes CDR bytes. `wanted[topic]`, a list of one boolean that is updated in place, is whether the
+    `publish[topic]` takes CDR bytes. `wanted[topic]`, a byte that is updated in place, is whether the
     topic has subscribers or serves late joiners. `subscribed` has the topics with subscribers. `topics` are those that
     the node has discovered. `name` has the namespace: `rover1/rover_router`.
 
@@ -47,7 +47,7 @@ class RouterNode:
         subscriber_joined: SubscriberJoined = lambda _: None,
     ) -> None:
         self.publish: dict[str, Callable[[bytes], None]] = {}
-        self.wanted: dict[str, list[bool]] = {}
+        self.wanted: dict[str, WantedFlag] = {}
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
