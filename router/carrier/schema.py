@@ -91,7 +91,7 @@ def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
     arrays = [_lowered(each, indexes, {} if index else flags) for each, index in indexes.items()]
     types = (WireType * len(arrays))(
         *(
-            WireType(fields, len(fields), not fields and not each.is_extendable)
+            WireType(fields, len(fields), _parses(each, _len(0, b"")))
             for fields, each in zip(arrays, indexes, strict=True)
         )
     )
@@ -149,6 +149,8 @@ def _lowered(
 
 def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], flags: WireFlag) -> WireField:
     kind = _kind(field)
+    if kind is WireKind.GROUP and not _parses(container(field), _len(field.number, b"\xff")):
+        raise CannotCarry(f"protobuf before 7.36 takes {field.full_name}, a group, for a message")
     if kind in {WireKind.MESSAGE, WireKind.GROUP}:
         return WireField(field.number, kind, flags, indexes[message_of(field)])
     is_packable = field.is_repeated and kind in {WireKind.VARINT, WireKind.I64, WireKind.I32}
@@ -156,16 +158,20 @@ def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], fl
 
 
 def _kind(field: FieldDescriptor) -> WireKind:
-    if field.type == FieldDescriptor.TYPE_STRING and not _checks_utf8(field):
-        return WireKind.BYTES
+    if field.type == FieldDescriptor.TYPE_STRING and _parses(container(field), _len(field.number, b"\xff")):
+        return WireKind.BYTES  # what is no UTF-8 is accepted; that depends on syntax and features
     return _KINDS[field.type]
 
 
-def _checks_utf8(field: FieldDescriptor) -> bool:
-    """Whether protobuf refuses text that is no UTF-8. That depends on syntax and features, so protobuf is asked."""
-    encoded = varint(field.number << 3 | LEN) + b"\x01\xff"
+def _len(number: int, value: bytes) -> bytes:
+    """A LEN field."""
+    return varint(number << 3 | LEN) + varint(len(value)) + value
+
+
+def _parses(descriptor: Descriptor, data: bytes) -> bool:
+    """Whether protobuf parses a message. Versions and features differ in details; so they are asked."""
     try:
-        GetMessageClass(container(field)).FromString(encoded)
+        GetMessageClass(descriptor).FromString(data)
     except DecodeError:
-        return True
-    return False
+        return False
+    return True

@@ -183,7 +183,7 @@ static bool read_field(struct walk *walk) {
     uint32_t tag;
     if (!read_tag(&walk->rest, &tag)) return false;
     uint32_t number = tag >> 3, wire_type = tag & 7;
-    /* protobuf does not look at field numbers in unknown groups and empty messages. */
+    /* protobuf does not look at field numbers in unknown groups, nor in messages that declare no fields. */
     if (number == 0 && level->type != NULL && !level->type->accepts_zero) return false;
     if (wire_type == LEN) return read_known_len(walk, level->type, number);
     if (wire_type == GROUP) return enter_group(walk, level->type, number);

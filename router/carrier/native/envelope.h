@@ -31,7 +31,7 @@ enum wire_flag {
 struct wire_type {
     const struct wire_field *fields; /* by ascending number */
     uint32_t count;
-    uint32_t accepts_zero; /* has neither fields nor extensions: protobuf does not look at field numbers there */
+    uint32_t accepts_zero; /* field number 0 is no error, as in messages that declare no fields */
 };
 
 struct wire_schema {
