@@ -39,6 +39,19 @@ class Feed(ctypes.Structure):
     _fields_ = (("deadman", c_void_p), ("disarms", c_uint32), ("reserved", c_uint32))
 
 
+class DeadmanDestination(ctypes.Structure):
+    """`struct deadman_destination` in deadman.h."""
+
+    _fields_ = (
+        ("sender", c_void_p),
+        ("datagram", ctypes.c_char_p),
+        ("size", c_uint32),
+        ("sent", c_uint32),
+        ("send_errors", c_uint32),
+        ("id", c_uint32),
+    )
+
+
 class Destination(ctypes.Structure):
     """`struct destination` in carrier.h."""
 
@@ -201,6 +214,7 @@ __all__ = [
     "REASONS",
     "Case",
     "Change",
+    "DeadmanDestination",
     "Destination",
     "Entry",
     "Feed",

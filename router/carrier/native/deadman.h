@@ -80,4 +80,8 @@ enum { COMMAND_STALE = -1 };
 int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
                  const struct feed *feeds, uint32_t count);
 
+/* As `command_send` at the time `now`, for callers that hold the lock if there are feeds. */
+int command_send_at(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
+                    const struct feed *feeds, uint32_t count, int64_t now);
+
 #endif

@@ -1,0 +1,108 @@
+"""Deadmen of the carrier: native code sends commands and brakes under one lock."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable, Mapping, Sequence
+
+from router.carrier import structures as c
+from router.carrier.program import Names
+from router.carrier.ring import Ring
+from router.carrier.sender import NativeSender
+from router.compiler.metrics import Counters
+from router.compiler.program import DeadmanPlan
+from router.engine.delivery import Stale
+
+_NEVER = (1 << 63) - 1
+_STALE = -1
+
+
+class NativeDeadman:
+    """The deadman of one route, as `engine.deadman.Deadman`. `address` is that of its `struct deadman`."""
+
+    def __init__(self, library: ctypes.CDLL, deadmen: int, address: int, plan: DeadmanPlan, keep: object) -> None:
+        self.address = address
+        self._library = library
+        self._deadmen = deadmen
+        self._plan = plan
+        self._keep = keep
+        self._successor: NativeDeadman | None = None
+
+    def start(self) -> list[str]:
+        """Send the payload when the router starts, unless the table says otherwise; return the endpoints reached."""
+        if not self._plan.at_start:
+            return []
+        reached = self._library.deadman_start(self._deadmen, self.address)
+        return [endpoint for bit, (endpoint, _) in enumerate(self._plan.datagrams) if reached >> bit & 1]
+
+    def succeeds(self, earlier: NativeDeadman) -> None:
+        """Live as long as `earlier`, whose feeds act on this one once the carrier has replaced it."""
+        earlier._successor = self
+
+    def end(self) -> None:
+        """Send a last time, if armed or tripped."""
+        self._library.deadman_end(self._deadmen, self.address)
+
+    def __del__(self) -> None:
+        self._library.deadman_close(self._deadmen, self.address)
+
+
+class Deadmen:
+    """All deadmen of routes. They count in `counters`, and write to `events` what they do; never closed."""
+
+    def __init__(self, library: ctypes.CDLL, counters: object, events: Ring, names: Names) -> None:
+        """Raises MemoryError."""
+        self._library = library
+        self._keep = counters, events
+        self._names = names
+        self.address: int = library.deadmen_open(counters, events.address)
+        if not self.address:
+            raise MemoryError("the deadmen of the carrier cannot be opened")
+
+    def add(self, plan: DeadmanPlan, counters: Counters, senders: Mapping[str, NativeSender]) -> NativeDeadman:
+        """Serve a deadman from now on. `senders` are by endpoint. Raises MemoryError."""
+        destinations = [
+            c.DeadmanDestination(
+                sender=senders[endpoint].address,
+                datagram=datagram,
+                size=len(datagram),
+                sent=counters.index("deadman_datagrams_sent", plan.route, endpoint),
+                send_errors=counters.index("deadman_send_errors", plan.route, endpoint),
+                id=self._names.number(endpoint),
+            )
+            for endpoint, datagram in plan.datagrams
+        ]
+        address = self._library.deadman_open(
+            self.address,
+            plan.timeout,
+            plan.repeat,
+            counters.index("deadman_active", plan.route),
+            counters.index("deadman_trips", plan.route),
+            self._names.number(plan.route),
+            (c.DeadmanDestination * len(destinations))(*destinations),
+            len(destinations),
+        )
+        if not address:
+            raise MemoryError("a deadman of the carrier cannot be opened")
+        return NativeDeadman(self._library, self.address, address, plan, senders)
+
+    def command(
+        self, sender: NativeSender, feeds: Sequence[tuple[NativeDeadman, bool]]
+    ) -> Callable[[bytes, int | None], int]:
+        """Return what sends a command: it checks `expires`, feeds or disarms (True) deadmen and sends, under the lock.
+
+        Returns the number of bytes sent; raises Stale, or OSError.
+        """
+        array = (c.Feed * len(feeds))(*(c.Feed(deadman.address, disarms) for deadman, disarms in feeds))
+        send, deadmen, to, count = self._library.command_send, self.address, sender.address, len(feeds)
+
+        def command(data: bytes, expires: int | None, _keep: object = (feeds, sender)) -> int:
+            error = send(deadmen, to, data, len(data), _NEVER if expires is None else expires, array, count)
+            if not error:
+                return len(data)
+            if error == _STALE:
+                raise Stale
+            raise OSError(error, os.strerror(error))
+
+        return command

@@ -1,0 +1,231 @@
+#include "deadman.h"
+
+#include <errno.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/timerfd.h>
+#include <unistd.h>
+
+#include "clock.h"
+
+enum { MOST_REACHED = 64 };
+
+struct deadman {
+    struct deadman *next;      /* in the list of all */
+    struct deadman *successor; /* the deadman that has replaced it, or NULL */
+    int64_t timeout, repeat;   /* ns */
+    int64_t due;               /* NEVER while it is unarmed */
+    bool has_tripped;
+    bool is_replaced;          /* it waits for its end, and nothing is due before */
+    bool is_armed_at_end;      /* of a replaced one: it was armed */
+    uint32_t active, trips, id;
+    uint32_t count;
+    struct deadman_destination destinations[];
+};
+
+struct deadmen *deadmen_open(counter *counters, struct ring *events) {
+    struct deadmen *deadmen = calloc(1, sizeof *deadmen);
+    if (!deadmen) return NULL;
+    deadmen->timer = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK);
+    if (deadmen->timer < 0) {
+        free(deadmen);
+        return NULL;
+    }
+    pthread_mutex_init(&deadmen->lock, NULL);
+    deadmen->counters = counters;
+    deadmen->events = events;
+    deadmen->timer_set_for = NEVER;
+    deadmen->next_due = NEVER;
+    return deadmen;
+}
+
+void deadmen_close(struct deadmen *deadmen) {
+    pthread_mutex_destroy(&deadmen->lock);
+    close(deadmen->timer);
+    free(deadmen);
+}
+
+/* What follows, up to the public functions, is called with the lock held. */
+
+static void report(struct deadmen *deadmen, enum event_kind kind, const struct deadman *deadman, uint32_t destination,
+                   int error) {
+    struct deadman_event event = {sizeof event, kind, deadman->id, destination, error, 0}, oldest;
+    if (!deadmen->events) return;
+    while (!ring_put(deadmen->events, &event, sizeof event)) ring_drop(deadmen->events, &oldest, sizeof oldest);
+}
+
+/* Set the timer for `due`. It is left alone if it ends earlier: then it is set anew when it has ended. */
+static void set_timer(struct deadmen *deadmen, int64_t due) {
+    struct itimerspec at = {.it_value = {due / 1000000000, due % 1000000000}};
+    if (due == NEVER) at.it_value = (struct timespec){0, 0}; /* stops it */
+    else if (due <= 0) at.it_value = (struct timespec){0, 1};
+    timerfd_settime(deadmen->timer, TFD_TIMER_ABSTIME, &at, NULL);
+    deadmen->timer_set_for = due;
+}
+
+/* Find out when the next deadman is due, see to it that the timer ends by then, and return that time. */
+static int64_t note_due(struct deadmen *deadmen) {
+    int64_t next = NEVER;
+    for (const struct deadman *each = deadmen->first; each; each = each->next)
+        if (each->due < next) next = each->due;
+    atomic_store_explicit(&deadmen->next_due, next, memory_order_relaxed);
+    if (next < deadmen->timer_set_for) set_timer(deadmen, next);
+    return next;
+}
+
+/* Send the datagrams. Return a bit for each of the first 64 destinations reached. */
+static uint64_t send_all(struct deadmen *deadmen, const struct deadman *deadman) {
+    uint64_t reached = 0;
+    for (uint32_t index = 0; index < deadman->count; index++) {
+        const struct deadman_destination *to = &deadman->destinations[index];
+        int error = sender_send_checked(to->sender, to->datagram, to->size);
+        counter_add(deadmen->counters, error ? to->send_errors : to->sent, 1);
+        if (error) report(deadmen, EVENT_DEADMAN_ERROR, deadman, to->id, error);
+        else if (index < MOST_REACHED) reached |= (uint64_t)1 << index;
+    }
+    return reached;
+}
+
+static void release(struct deadmen *deadmen, struct deadman *deadman) {
+    if (!deadman->has_tripped) return;
+    deadman->has_tripped = false;
+    counter_set(deadmen->counters, deadman->active, 0);
+    report(deadmen, EVENT_RELEASED, deadman, 0, 0);
+}
+
+static void feed_one(struct deadmen *deadmen, const struct feed *feed, int64_t now) {
+    struct deadman *deadman = feed->deadman;
+    while (deadman->successor) deadman = deadman->successor;
+    deadman->due = feed->disarms ? NEVER : now + deadman->timeout;
+    release(deadmen, deadman);
+}
+
+static void serve_one(struct deadmen *deadmen, struct deadman *deadman, int64_t now) {
+    /* Repetitions that a stalled process has missed are left out. */
+    deadman->due += deadman->repeat * ((now - deadman->due) / deadman->repeat + 1);
+    if (deadman->has_tripped) {
+        send_all(deadmen, deadman);
+        return;
+    }
+    deadman->has_tripped = true;
+    counter_set(deadmen->counters, deadman->active, 1);
+    counter_add(deadmen->counters, deadman->trips, 1);
+    send_all(deadmen, deadman);
+    report(deadmen, EVENT_TRIPPED, deadman, 0, 0);
+}
+
+static bool sends_to(const struct deadman *deadman, const struct sender *sender) {
+    for (uint32_t index = 0; index < deadman->count; index++)
+        if (deadman->destinations[index].sender == sender) return true;
+    return false;
+}
+
+static void keep_others_than(struct deadman *deadman, const struct deadman *next) {
+    uint32_t kept = 0;
+    for (uint32_t index = 0; index < deadman->count; index++) {
+        struct deadman_destination *each = &deadman->destinations[index];
+        if (!sends_to(next, each->sender)) deadman->destinations[kept++] = *each;
+    }
+    deadman->count = kept;
+}
+
+/* Deadline and state pass to `next`, unless a later command has fed it already. */
+static void take_over(struct deadmen *deadmen, struct deadman *next, struct deadman *earlier) {
+    earlier->successor = next;
+    earlier->is_replaced = true;
+    keep_others_than(earlier, next);
+    int64_t due = earlier->due;
+    earlier->due = NEVER;
+    earlier->is_armed_at_end = due != NEVER;
+    if (due == NEVER) return;
+    if (next->due != NEVER) {
+        release(deadmen, earlier);
+        return;
+    }
+    next->has_tripped = earlier->has_tripped;
+    next->due = due + (next->has_tripped ? next->repeat - earlier->repeat : next->timeout - earlier->timeout);
+}
+
+/* ---- public ---- */
+
+struct deadman *deadman_open(struct deadmen *deadmen, int64_t timeout, int64_t repeat, uint32_t active, uint32_t trips,
+                             uint32_t id, const struct deadman_destination *destinations, uint32_t count) {
+    size_t datagrams = 0;
+    for (uint32_t index = 0; index < count; index++) datagrams += destinations[index].size;
+    struct deadman *deadman = calloc(1, sizeof *deadman + count * sizeof *destinations + datagrams);
+    if (!deadman) return NULL;
+    *deadman = (struct deadman){.timeout = timeout, .repeat = repeat, .due = NEVER, .active = active, .trips = trips,
+                                .id = id, .count = count};
+    uint8_t *copy = (uint8_t *)&deadman->destinations[count];
+    for (uint32_t index = 0; index < count; index++) {
+        deadman->destinations[index] = destinations[index];
+        deadman->destinations[index].datagram = memcpy(copy, destinations[index].datagram, destinations[index].size);
+        copy += destinations[index].size;
+    }
+    pthread_mutex_lock(&deadmen->lock);
+    deadman->next = deadmen->first;
+    deadmen->first = deadman;
+    pthread_mutex_unlock(&deadmen->lock);
+    return deadman;
+}
+
+void deadman_close(struct deadmen *deadmen, struct deadman *deadman) {
+    pthread_mutex_lock(&deadmen->lock);
+    struct deadman **link = &deadmen->first;
+    while (*link != deadman) link = &(*link)->next;
+    *link = deadman->next;
+    pthread_mutex_unlock(&deadmen->lock);
+    free(deadman);
+}
+
+uint64_t deadman_start(struct deadmen *deadmen, struct deadman *deadman) {
+    pthread_mutex_lock(&deadmen->lock);
+    uint64_t reached = send_all(deadmen, deadman);
+    pthread_mutex_unlock(&deadmen->lock);
+    return reached;
+}
+
+void deadman_replace(struct deadmen *deadmen, struct deadman *next, struct deadman *earlier) {
+    pthread_mutex_lock(&deadmen->lock);
+    take_over(deadmen, next, earlier);
+    note_due(deadmen);
+    pthread_mutex_unlock(&deadmen->lock);
+}
+
+void deadman_end(struct deadmen *deadmen, struct deadman *deadman) {
+    pthread_mutex_lock(&deadmen->lock);
+    bool is_armed = deadman->is_replaced ? deadman->is_armed_at_end : deadman->due != NEVER;
+    deadman->due = NEVER;
+    deadman->is_armed_at_end = false;
+    if (is_armed) send_all(deadmen, deadman);
+    note_due(deadmen);
+    pthread_mutex_unlock(&deadmen->lock);
+}
+
+void deadmen_serve(struct deadmen *deadmen, int64_t now) {
+    pthread_mutex_lock(&deadmen->lock);
+    for (struct deadman *each = deadmen->first; each; each = each->next)
+        if (each->due <= now) serve_one(deadmen, each, now);
+    set_timer(deadmen, note_due(deadmen));
+    pthread_mutex_unlock(&deadmen->lock);
+}
+
+int command_send_at(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
+                    const struct feed *feeds, uint32_t count, int64_t now) {
+    if (now > expires) return COMMAND_STALE;
+    for (uint32_t index = 0; index < count; index++) feed_one(deadmen, &feeds[index], now);
+    if (count) note_due(deadmen);
+    return sender_send(sender, data, size);
+}
+
+int command_send(struct deadmen *deadmen, struct sender *sender, const void *data, size_t size, int64_t expires,
+                 const struct feed *feeds, uint32_t count) {
+    if (!count) {
+        int64_t now = expires == NEVER ? 0 : monotonic_ns();
+        return command_send_at(deadmen, sender, data, size, expires, feeds, count, now);
+    }
+    pthread_mutex_lock(&deadmen->lock);
+    int error = command_send_at(deadmen, sender, data, size, expires, feeds, count, monotonic_ns());
+    pthread_mutex_unlock(&deadmen->lock);
+    return error;
+}
