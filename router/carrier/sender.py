@@ -15,11 +15,12 @@ class NativeSender(Sender):
 
     def __init__(self, library: ctypes.CDLL, endpoint: Endpoint) -> None:
         """Raises StartError, and MemoryError."""
+        self.address = 0
         super().__init__(endpoint)
         self._library = library
         host, port = endpoint.address.value
         number = int.from_bytes(socket.inet_aton(host), "big")
-        self.address: int = library.sender_open(self.socket.fileno(), number, port)
+        self.address = int(library.sender_open(self.socket.fileno(), number, port) or 0)
         if not self.address:
             self.socket.close()
             raise MemoryError("a sender of the carrier cannot be opened")
@@ -32,7 +33,10 @@ class NativeSender(Sender):
         return len(data)
 
     def close(self) -> None:
-        """To be called when nothing sends any more."""
+        """Close the socket. Whoever sends later gets an OSError."""
+        self._library.sender_end(self.address)
         super().close()
-        self._library.sender_close(self.address)
-        self.address = 0
+
+    def __del__(self) -> None:
+        if self.address:
+            self._library.sender_close(self.address)

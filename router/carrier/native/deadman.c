@@ -1,6 +1,5 @@
 #include "deadman.h"
 
-#include <errno.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/timerfd.h>
@@ -11,17 +10,29 @@
 enum { MOST_REACHED = 64 };
 
 struct deadman {
-    struct deadman *next;      /* in the list of all */
-    struct deadman *successor; /* the deadman that has replaced it, or NULL */
-    int64_t timeout, repeat;   /* ns */
-    int64_t due;               /* NEVER while it is unarmed */
+    struct deadman *next;    /* in the list of all */
+    struct deadman *acting;  /* the deadman that has replaced it, with no other one between; or itself */
+    int64_t timeout, repeat; /* ns */
+    int64_t due;             /* NEVER while it is unarmed, and once it is replaced */
+    bool is_armed;           /* or tripped: it sends when it ends */
     bool has_tripped;
-    bool is_replaced;          /* it waits for its end, and nothing is due before */
-    bool is_armed_at_end;      /* of a replaced one: it was armed */
     uint32_t active, trips, id;
     uint32_t count;
     struct deadman_destination destinations[];
 };
+
+/* Whoever holds a lock with priority inheritance lends itself the priority of those who wait, and hands it to the first
+ * of them when it is done: a thread that sends without a pause cannot keep brakes waiting by taking it again and again. It
+ * costs nothing while nobody waits. Return 0 or an errno. */
+static int open_lock(pthread_mutex_t *lock) {
+    pthread_mutexattr_t attributes;
+    int error = pthread_mutexattr_init(&attributes);
+    if (error) return error;
+    error = pthread_mutexattr_setprotocol(&attributes, PTHREAD_PRIO_INHERIT);
+    if (!error) error = pthread_mutex_init(lock, &attributes);
+    pthread_mutexattr_destroy(&attributes);
+    return error;
+}
 
 struct deadmen *deadmen_open(counter *counters, struct ring *events) {
     struct deadmen *deadmen = calloc(1, sizeof *deadmen);
@@ -31,7 +42,11 @@ struct deadmen *deadmen_open(counter *counters, struct ring *events) {
         free(deadmen);
         return NULL;
     }
-    pthread_mutex_init(&deadmen->lock, NULL);
+    if (open_lock(&deadmen->lock)) {
+        close(deadmen->timer);
+        free(deadmen);
+        return NULL;
+    }
     deadmen->counters = counters;
     deadmen->events = events;
     deadmen->timer_set_for = NEVER;
@@ -54,7 +69,7 @@ static void report(struct deadmen *deadmen, enum event_kind kind, const struct d
     while (!ring_put(deadmen->events, &event, sizeof event)) ring_drop(deadmen->events, &oldest, sizeof oldest);
 }
 
-/* Set the timer for `due`. It is left alone if it ends earlier: then it is set anew when it has ended. */
+/* Set the timer for `due`. A timer that has ended is no longer readable then. */
 static void set_timer(struct deadmen *deadmen, int64_t due) {
     struct itimerspec at = {.it_value = {due / 1000000000, due % 1000000000}};
     if (due == NEVER) at.it_value = (struct timespec){0, 0}; /* stops it */
@@ -63,14 +78,20 @@ static void set_timer(struct deadmen *deadmen, int64_t due) {
     deadmen->timer_set_for = due;
 }
 
-/* Find out when the next deadman is due, see to it that the timer ends by then, and return that time. */
-static int64_t note_due(struct deadmen *deadmen) {
+/* Find out when the next deadman is due, and return that time. */
+static int64_t find_due(struct deadmen *deadmen) {
     int64_t next = NEVER;
     for (const struct deadman *each = deadmen->first; each; each = each->next)
         if (each->due < next) next = each->due;
     atomic_store_explicit(&deadmen->next_due, next, memory_order_relaxed);
-    if (next < deadmen->timer_set_for) set_timer(deadmen, next);
     return next;
+}
+
+/* As a deadline has changed, see to it that the timer ends by then. A timer that ends earlier is left alone, and set anew
+ * when it has ended: commands put off a deadline a thousand times per second, and cost no system call. */
+static void note_due(struct deadmen *deadmen) {
+    int64_t next = find_due(deadmen);
+    if (next < deadmen->timer_set_for) set_timer(deadmen, next);
 }
 
 /* Send the datagrams. Return a bit for each of the first 64 destinations reached. */
@@ -94,8 +115,8 @@ static void release(struct deadmen *deadmen, struct deadman *deadman) {
 }
 
 static void feed_one(struct deadmen *deadmen, const struct feed *feed, int64_t now) {
-    struct deadman *deadman = feed->deadman;
-    while (deadman->successor) deadman = deadman->successor;
+    struct deadman *deadman = feed->deadman->acting;
+    deadman->is_armed = !feed->disarms;
     deadman->due = feed->disarms ? NEVER : now + deadman->timeout;
     release(deadmen, deadman);
 }
@@ -129,19 +150,26 @@ static void keep_others_than(struct deadman *deadman, const struct deadman *next
     deadman->count = kept;
 }
 
+/* Let `next` act for `earlier` and for all that this one has replaced. */
+static void redirect(struct deadmen *deadmen, struct deadman *next, const struct deadman *earlier) {
+    const struct deadman *acting = earlier->acting;
+    for (struct deadman *each = deadmen->first; each; each = each->next)
+        if (each->acting == acting) each->acting = next;
+    next->acting = next;
+}
+
 /* Deadline and state pass to `next`, unless a later command has fed it already. */
 static void take_over(struct deadmen *deadmen, struct deadman *next, struct deadman *earlier) {
-    earlier->successor = next;
-    earlier->is_replaced = true;
+    redirect(deadmen, next, earlier);
     keep_others_than(earlier, next);
     int64_t due = earlier->due;
     earlier->due = NEVER;
-    earlier->is_armed_at_end = due != NEVER;
     if (due == NEVER) return;
-    if (next->due != NEVER) {
+    if (next->is_armed) {
         release(deadmen, earlier);
         return;
     }
+    next->is_armed = true;
     next->has_tripped = earlier->has_tripped;
     next->due = due + (next->has_tripped ? next->repeat - earlier->repeat : next->timeout - earlier->timeout);
 }
@@ -163,6 +191,7 @@ struct deadman *deadman_open(struct deadmen *deadmen, int64_t timeout, int64_t r
         copy += destinations[index].size;
     }
     pthread_mutex_lock(&deadmen->lock);
+    deadman->acting = deadman;
     deadman->next = deadmen->first;
     deadmen->first = deadman;
     pthread_mutex_unlock(&deadmen->lock);
@@ -194,10 +223,10 @@ void deadman_replace(struct deadmen *deadmen, struct deadman *next, struct deadm
 
 void deadman_end(struct deadmen *deadmen, struct deadman *deadman) {
     pthread_mutex_lock(&deadmen->lock);
-    bool is_armed = deadman->is_replaced ? deadman->is_armed_at_end : deadman->due != NEVER;
+    bool was_armed = deadman->is_armed;
+    deadman->is_armed = false;
     deadman->due = NEVER;
-    deadman->is_armed_at_end = false;
-    if (is_armed) send_all(deadmen, deadman);
+    if (was_armed) send_all(deadmen, deadman);
     note_due(deadmen);
     pthread_mutex_unlock(&deadmen->lock);
 }
@@ -206,7 +235,7 @@ void deadmen_serve(struct deadmen *deadmen, int64_t now) {
     pthread_mutex_lock(&deadmen->lock);
     for (struct deadman *each = deadmen->first; each; each = each->next)
         if (each->due <= now) serve_one(deadmen, each, now);
-    set_timer(deadmen, note_due(deadmen));
+    set_timer(deadmen, find_due(deadmen));
     pthread_mutex_unlock(&deadmen->lock);
 }
 

@@ -33,7 +33,7 @@ struct deadman;
 struct deadmen {
     pthread_mutex_t lock;
     counter *counters;
-    struct ring *events;       /* of struct deadman_event; may be NULL */
+    struct ring *events;       /* of struct deadman_event, written under the lock; may be NULL */
     int timer;                 /* timerfd, readable when a deadman is due */
     int64_t timer_set_for;     /* monotonic, ns; NEVER while it is not set */
     _Atomic int64_t next_due;  /* NEVER if nothing is due; may be read without the lock */
@@ -47,6 +47,7 @@ struct feed {
     uint32_t reserved;
 };
 
+/* Both are written under the lock, and by nobody else. Return NULL for lack of memory or descriptors. */
 struct deadmen *deadmen_open(counter *counters, struct ring *events);
 void deadmen_close(struct deadmen *deadmen); /* when no thread uses it and it has no deadman left */
 

@@ -66,28 +66,36 @@ bool ring_drop(struct ring *ring, void *record, size_t limit) {
     return atomic_compare_exchange_strong(&ring->taken, &taken, taken + size);
 }
 
+/* The size of the record at `taken`. If it was overwritten meanwhile, this may be any size that a record can have, or 0. */
+static uint32_t record_at(struct ring *ring, uint64_t taken) {
+    uint32_t size = size_at(ring, taken);
+    return size >= WORD && size % WORD == 0 && size <= ring->capacity ? size : 0;
+}
+
+/* Whether nothing was dropped since `taken` was read: then all that was read of the record since is its own. */
+static bool is_oldest(struct ring *ring, uint64_t taken) {
+    atomic_thread_fence(memory_order_acquire);
+    return atomic_load_explicit(&ring->taken, memory_order_relaxed) == taken;
+}
+
+static bool claim(struct ring *ring, uint64_t taken, uint32_t size) {
+    atomic_thread_fence(memory_order_acquire);
+    return atomic_compare_exchange_strong(&ring->taken, &taken, taken + size);
+}
+
 static size_t take_ready(struct ring *ring, void *records, size_t limit) {
-    uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
     size_t copied = 0;
-    while (atomic_load_explicit(&ring->written, memory_order_acquire) != taken) {
-        uint32_t size = size_at(ring, taken);
-        /* A size that was read while the record was overwritten may be anything. */
-        bool is_valid = size >= WORD && size % WORD == 0 && size <= ring->capacity;
-        if (is_valid && size > limit - copied) {
-            if (atomic_load(&ring->taken) == taken) return copied;
-            is_valid = false;
-        }
-        if (is_valid) copy_out(ring, taken, (char *)records + copied, size);
-        atomic_thread_fence(memory_order_acquire);
-        uint64_t expected = taken;
-        if (is_valid && atomic_compare_exchange_strong(&ring->taken, &expected, taken + size)) {
-            copied += size;
-            taken += size;
-        } else {
-            taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
+    for (;;) {
+        uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
+        if (atomic_load(&ring->written) == taken) return copied;
+        uint32_t size = record_at(ring, taken);
+        if (size > limit - copied) {
+            if (is_oldest(ring, taken)) return copied;
+        } else if (size) {
+            copy_out(ring, taken, (char *)records + copied, size);
+            if (claim(ring, taken, size)) copied += size;
         }
     }
-    return copied;
 }
 
 size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms) {
@@ -97,8 +105,8 @@ size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms)
     copied = take_ready(ring, records, limit);
     if (!copied) {
         struct pollfd wake = {ring->wake, POLLIN, 0};
-        uint64_t times;
-        if (poll(&wake, 1, timeout_ms) > 0 && read(ring->wake, &times, sizeof times) < 0) return 0;
+        eventfd_t times;
+        if (poll(&wake, 1, timeout_ms) > 0) eventfd_read(ring->wake, &times);
         copied = take_ready(ring, records, limit);
     }
     atomic_store(&ring->is_waited_for, 0);

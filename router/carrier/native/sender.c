@@ -20,6 +20,8 @@ struct sender *sender_open(int fd, uint32_t address, uint16_t port) {
     return sender;
 }
 
+void sender_end(struct sender *sender) { atomic_store(&sender->fd, -1); }
+
 void sender_close(struct sender *sender) { free(sender); }
 
 /* Whether there was no network when the socket was connected, there is none now, or this computer has lost the address
@@ -28,12 +30,16 @@ static bool has_network_changed(int error) {
     return error == EDESTADDRREQ || error == ENETUNREACH || error == EHOSTUNREACH || error == EINVAL;
 }
 
+/* Whether the socket may be replaced now; if so, the caller has to. */
+static bool may_reconnect(struct sender *sender) {
+    int64_t now = monotonic_ns(), last = atomic_load(&sender->reconnected_at);
+    if (now - last < RECONNECT_INTERVAL) return false;
+    return atomic_compare_exchange_strong(&sender->reconnected_at, &last, now);
+}
+
 /* Replace the socket by a new one: `connect` alone would keep its local address, which may have gone. Return 0 or an
  * errno. */
 static int reconnect(struct sender *sender) {
-    int64_t now = monotonic_ns(), last = atomic_load(&sender->reconnected_at);
-    if (now - last < RECONNECT_INTERVAL) return EAGAIN;
-    if (!atomic_compare_exchange_strong(&sender->reconnected_at, &last, now)) return EAGAIN;
     int fresh = socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
     if (fresh < 0) return errno;
     int error = 0;
@@ -46,7 +52,7 @@ static int reconnect(struct sender *sender) {
 
 /* Return 0 or an errno. */
 static int send_once(struct sender *sender, const void *data, size_t size) {
-    return send(sender->fd, data, size, 0) < 0 ? errno : 0;
+    return send(atomic_load_explicit(&sender->fd, memory_order_relaxed), data, size, MSG_DONTWAIT) < 0 ? errno : 0;
 }
 
 int sender_send(struct sender *sender, const void *data, size_t size) {
@@ -54,10 +60,11 @@ int sender_send(struct sender *sender, const void *data, size_t size) {
     if (!error) return 0;
     if (error == ECONNREFUSED) {
         int again = send_once(sender, data, size);
-        return again && again != ECONNREFUSED ? again : error;
+        return again ? again : error;
     }
-    if (!has_network_changed(error) || reconnect(sender)) return error;
-    return send_once(sender, data, size);
+    if (!has_network_changed(error) || !may_reconnect(sender)) return error;
+    error = reconnect(sender);
+    return error ? error : send_once(sender, data, size);
 }
 
 int sender_send_checked(struct sender *sender, const void *data, size_t size) {

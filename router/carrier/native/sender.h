@@ -9,15 +9,16 @@
 #include <stdint.h>
 
 struct sender {
-    int fd;                          /* stays the same when the socket is replaced */
+    _Atomic int fd; /* stays the same when the socket is replaced; -1 after `sender_end` */
     struct sockaddr_in address;
-    _Atomic int64_t reconnected_at;  /* monotonic, ns */
+    _Atomic int64_t reconnected_at; /* monotonic, ns */
 };
 
 /* Return a sender for a socket that is connected to `address` (host byte order) and `port`, or NULL for lack of memory.
- * Closing the socket is the caller's. */
+ * The caller closes the socket, after `sender_end`: sending fails with EBADF from then on. */
 struct sender *sender_open(int fd, uint32_t address, uint16_t port);
-void sender_close(struct sender *sender);
+void sender_end(struct sender *sender);
+void sender_close(struct sender *sender); /* when nothing refers to it any more */
 
 /* Send a datagram. Return 0, or an errno: then exactly one datagram is lost.
  *
