@@ -47,5 +47,5 @@ lint: setup  ## ruff and mypy
 	@$(ENV) .venv/bin/mypy
 
 clean:  ## remove .venv and what tools left behind
-	rm -rf .venv build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv router/carrier/native/libcarrier.so build dist .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

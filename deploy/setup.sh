@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Builds .venv: the router, ROS 2 Jazzy and the interfaces of schemas/comms. `make setup` calls it.
+# Builds .venv: the router, ROS 2 Jazzy and the interfaces of schemas/comms; and the carrier's library.
+# `make setup` calls it.
 #
 #   PYTHON=...  the interpreter to use, 3.10 to 3.13; found without it
 #   ROS=...     an installed Jazzy (/opt/ros/jazzy) to use instead of the wheels; a sourced one is found without it
@@ -137,6 +138,10 @@ install_packages() {
     "$python" -m pip install --no-input --editable "$root[$extras]"
 }
 
+build_carrier() {
+  "$python" router/carrier/build.py
+}
+
 build_comms() (
   build=$venv/build/comms
   names=$(ls schemas/comms/msg)
@@ -176,10 +181,12 @@ remembered=$(cat "$made/ros" 2>/dev/null || find_sourced_ros)
 ros=${ROS:-$remembered}
 environment=$(printf '%s\n' "$root" "$ros" | checksum)
 packages=$(cat pyproject.toml constraints.txt | checksum)
+carrier=library  # which has the checksum of its sources in it
+"$python" router/carrier/build.py --check 2>/dev/null || rm -f "$made/carrier"
 # The pins of what the generated code is compiled against belong to it as much as the messages.
 comms=$({ find schemas/comms -type f | sort | xargs sha256sum; grep -E '^(ros-|numpy)' constraints.txt; } | checksum)
 
-if is_usable && is_made packages "$packages" && is_made comms "$comms"; then
+if is_usable && is_made packages "$packages" && is_made carrier "$carrier" && is_made comms "$comms"; then
   echo "setup: .venv is up to date"
   exit
 fi
@@ -191,4 +198,5 @@ if ! is_usable; then
   step environment "$environment" "environment with $("$base" --version)" make_environment
 fi
 step packages "$packages" "packages${ros:+, with ROS from $ros}" install_packages
+step carrier "$carrier" "carrier" build_carrier
 step comms "$comms" "ROS interfaces of schemas/comms" build_comms

@@ -1,0 +1,99 @@
+"""Compiles the carrier's library. Needs a C compiler and nothing else, not even the router's dependencies:
+
+python router/carrier/build.py              compile it; `$CC` is the compiler, `cc` unless set
+python router/carrier/build.py --output F   to another file
+python router/carrier/build.py --check      exit with 0 if it is up to date, else with 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from hashlib import sha256
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+NATIVE = Path(__file__).parent / "native"
+LIBRARY = NATIVE / "libcarrier.so"
+
+LANGUAGE = ("-std=c11", "-D_GNU_SOURCE", "-pthread")
+"""What the sources are written in: needed by whoever compiles one of them."""
+
+_OPTIMIZED = (
+    "-O2",
+    "-fno-semantic-interposition",
+    "-fstack-protector-strong",
+    "-U_FORTIFY_SOURCE",
+    "-D_FORTIFY_SOURCE=2",
+)
+_LINKED = ("-Wl,-Bsymbolic", "-Wl,-z,relro", "-Wl,-z,now", "-Wl,-z,noexecstack")
+"""All functions are exported, for ctypes; among themselves they need no symbol table."""
+
+
+class BuildError(Exception):
+    """There is no compiler, or it refuses the sources; says what it said."""
+
+
+def sources() -> list[Path]:
+    """The files to compile."""
+    return sorted(NATIVE.glob("*.c"))
+
+
+def checksum() -> str:
+    """The SHA-256 of all that the library is made of: sources, headers and this file. `carrier_checksum` returns it."""
+    digest = sha256()
+    for path in [*sorted(NATIVE.glob("*.[ch]")), Path(__file__)]:
+        content = path.read_bytes()
+        digest.update(f"{path.name} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
+
+
+def is_current(library: Path = LIBRARY) -> bool:
+    """Whether the library was made of the files that are there now. It is not loaded for that."""
+    return library.exists() and checksum().encode() in library.read_bytes()
+
+
+def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, compiler: str | None = None) -> Path:
+    """Compile the library and put it in place of `output` at once: a running router keeps the one that it has loaded.
+
+    Raises BuildError.
+    """
+    defined = f'-DCARRIER_CHECKSUM="{checksum()}"'
+    with TemporaryDirectory(dir=output.parent, prefix=".carrier") as folder:
+        made = Path(folder) / output.name
+        compile_c([*LANGUAGE, "-fPIC", "-shared", *flags, defined, *map(str, sources()), "-o", str(made)], compiler)
+        made.replace(output)
+    return output
+
+
+def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
+    """Run the C compiler. Raises BuildError."""
+    command = [compiler or os.environ.get("CC") or "cc", *arguments]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise BuildError(f"the C compiler '{command[0]}' cannot be run: {error.strerror}") from None
+    if done.returncode:
+        raise BuildError(f"{' '.join(command)}\n{done.stderr.rstrip()}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Compile the carrier's library.")
+    parser.add_argument("--output", type=Path, default=LIBRARY)
+    parser.add_argument("--check", action="store_true", help="only say by the exit code whether it is up to date")
+    args = parser.parse_args()
+    if args.check:
+        return 0 if is_current(args.output) else 1
+    try:
+        build(args.output)
+    except BuildError as error:
+        print(f"build: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""Finds and loads the carrier's library, which `build.py` makes, and declares its functions.
+
+A library of other sources than those beside it is refused: its structures may differ from those in `structures.py`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Iterator, Mapping
+from ctypes import POINTER, c_bool, c_char_p, c_int, c_int64, c_size_t, c_uint16, c_uint32, c_uint64, c_void_p
+from pathlib import Path
+
+from router.assets import asset, is_installed
+from router.carrier import structures
+from router.carrier.build import LIBRARY, checksum
+from router.errors import StartError
+from router.log import logger
+
+VARIABLE = "ROUTER_CARRIER"
+NATIVE, PYTHON = "native", "python"
+"""The values of that environment variable. Without it the library is used if it can be."""
+
+FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
+    "carrier_change": (None, (c_void_p, c_void_p)),
+    "carrier_close": (None, (c_void_p,)),
+    "carrier_mirror": (None, (c_void_p, c_void_p, c_uint32)),
+    "carrier_open": (c_void_p, (c_void_p, c_void_p, c_void_p)),
+    "carrier_pulse": (None, (c_void_p,)),
+    "carrier_resume": (None, (c_void_p,)),
+    "carrier_start": (c_int, (c_void_p, c_void_p, c_int, c_int64)),
+    "carrier_stop_receiving": (None, (c_void_p,)),
+    "carrier_turns": (c_uint64, (c_void_p,)),
+    "command_send": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32)),
+    "deadman_close": (None, (c_void_p, c_void_p)),
+    "deadman_end": (None, (c_void_p, c_void_p)),
+    "deadman_open": (
+        c_void_p,
+        (c_void_p, c_int64, c_int64, c_uint32, c_uint32, c_uint32, c_void_p, c_uint32),
+    ),
+    "deadman_replace": (None, (c_void_p, c_void_p, c_void_p)),
+    "deadman_start": (c_uint64, (c_void_p, c_void_p)),
+    "deadmen_close": (None, (c_void_p,)),
+    "deadmen_open": (c_void_p, (c_void_p, c_void_p)),
+    "deadmen_serve": (None, (c_void_p, c_int64)),
+    "envelope_read": (c_int, (c_void_p, c_void_p, c_size_t, c_bool, c_void_p)),
+    "freshness_born": (c_int64, (c_void_p, c_int64, c_int64, c_int64)),
+    "ring_close": (None, (c_void_p,)),
+    "ring_drop": (c_bool, (c_void_p, c_void_p, c_size_t)),
+    "ring_open": (c_void_p, (c_size_t,)),
+    "ring_put": (c_bool, (c_void_p, c_void_p, c_uint32)),
+    "ring_take": (c_size_t, (c_void_p, c_void_p, c_size_t, c_int)),
+    "ring_taken": (c_uint64, (c_void_p,)),
+    "ring_wake": (None, (c_void_p,)),
+    "ring_watch": (c_int, (c_void_p,)),
+    "ring_written": (c_uint64, (c_void_p,)),
+    "sender_close": (None, (c_void_p,)),
+    "sender_open": (c_void_p, (c_int, c_uint32, c_uint16)),
+    "sender_send": (c_int, (c_void_p, c_void_p, c_size_t)),
+    "sender_send_checked": (c_int, (c_void_p, c_void_p, c_size_t)),
+}
+"""What each function of the headers returns and takes. Any pointer is a c_void_p, which also takes bytes and arrays."""
+
+STRUCTURES: Mapping[str, type[ctypes.Structure]] = {
+    "change": structures.Change,
+    "destination": structures.Destination,
+    "entry": structures.Entry,
+    "feed": structures.Feed,
+    "limit": structures.Limit,
+    "listener": structures.Listener,
+    "message_record": structures.MessageRecord,
+    "mirror_record": structures.MirrorRecord,
+    "part": structures.Part,
+    "payload_case": structures.Case,
+    "peer": structures.Peer,
+    "program": structures.Program,
+    "route": structures.Route,
+    "waiting": structures.Waiting,
+    "wire_field": structures.WireField,
+    "wire_schema": structures.Schema,
+    "wire_type": structures.WireType,
+}
+"""The structures that both sides declare, by their names in C."""
+
+
+class LibraryError(Exception):
+    """The library cannot be used; says why and what to do."""
+
+
+class _StructureSize(ctypes.Structure):
+    """`struct structure_size` in library.c."""
+
+    _fields_ = (("name", c_char_p), ("size", c_size_t))
+
+
+def chosen_library(variables: Mapping[str, str] = os.environ) -> ctypes.CDLL | None:
+    """Return the library, or None if Python is to do its work: ROUTER_CARRIER says which, or what there is.
+
+    Logs a warning if the library cannot be used and was not asked for. Raises StartError if it was, and for any other
+    value.
+    """
+    choice = variables.get(VARIABLE, "")
+    if choice == PYTHON:
+        return None
+    if choice not in {"", NATIVE}:
+        raise StartError(f"{VARIABLE} is '{choice}'; set it to '{NATIVE}' or '{PYTHON}', or unset it")
+    try:
+        return load()
+    except LibraryError as error:
+        if choice:
+            raise StartError(f"{VARIABLE} is '{choice}', but {error}") from None
+        logger.warning("the carrier's library cannot be used: Python does its work, and more slowly", why=str(error))
+        return None
+
+
+def load(path: Path = LIBRARY) -> ctypes.CDLL:
+    """Load the library and declare its functions. Raises LibraryError."""
+    if not path.exists():
+        raise LibraryError(f"{path} was not built; {_remedy()}")
+    try:
+        library = ctypes.CDLL(str(path))
+        made_of = _text(library.carrier_checksum)
+    except (OSError, AttributeError) as error:  # of another architecture, or no such library at all
+        raise LibraryError(f"{path} cannot be loaded: {error}; {_remedy()}") from None
+    if made_of != checksum():
+        raise LibraryError(f"{path} was built from other sources; {_remedy()}")
+    if differing := sorted(_differing_structures(library)):
+        raise LibraryError(f"C and Python differ about struct {', '.join(differing)}: correct structures.py")
+    for name, (returned, taken) in FUNCTIONS.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = returned, taken
+    return library
+
+
+def _text(function: ctypes._NamedFuncPointer) -> str:
+    function.restype = c_char_p
+    return str(function().decode())
+
+
+def _differing_structures(library: ctypes.CDLL) -> Iterator[str]:
+    library.carrier_structure_sizes.restype = POINTER(_StructureSize)
+    sizes = library.carrier_structure_sizes()
+    found: dict[str, int] = {}
+    while name := sizes[len(found)].name:
+        found[name.decode()] = sizes[len(found)].size
+    for name, structure in STRUCTURES.items():
+        if found.pop(name, None) != ctypes.sizeof(structure):
+            yield name
+    yield from found
+
+
+def _remedy() -> str:
+    if is_installed(asset("schemas")):
+        return "install the router again where there is a C compiler"
+    return "run 'make setup'"
