@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import re
+import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from tests.engine.rig import Rig, program
 from tests.tables import PROTOS
 
 TESTS = Path(__file__).parents[1]
+NATIVE = TESTS.parent / "router" / "carrier" / "native"
 SENDER = ("192.168.0.30", 8)
 
 HEAD = """version: 1
@@ -34,6 +36,13 @@ SCHEMAS = {
     "hard": (TESTS / "carrier" / "protos", ["nothing", "tree", "texts", "scalars", "old", "maps", "far"]),
 }
 """Folders of protos, and the payload cases that get a route."""
+
+
+def native_library(folder: Path) -> ctypes.CDLL:
+    """`envelope.c` alone, built in `folder`."""
+    command = ["cc", "-std=c11", "-O2", "-shared", "-fPIC", "-o", "envelope.so", str(NATIVE / "envelope.c")]
+    subprocess.run(command, cwd=folder, check=True)
+    return ctypes.CDLL(str(folder / "envelope.so"))
 
 
 def table(schema: str, folder: Path) -> Program:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import random
-import shutil
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,11 +15,9 @@ from router.carrier.schema import CannotCarry, wire_schema
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM
 from tests.carrier.datagrams import GROUP, GROUP_END, Maker
-from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, table
+from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, native_library, table
 from tests.engine.rig import program
 from tests.engine.wire import I32, I64, LEN, VARINT, damaged, framed, tag, varint
-
-NATIVE = Path(__file__).parents[2] / "router" / "carrier" / "native"
 
 Sides = tuple[Program, PythonSide, CarrierSide]
 
@@ -30,13 +25,8 @@ Sides = tuple[Program, PythonSide, CarrierSide]
 @pytest.fixture(scope="module")
 def sides(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Sides]:
     """By schema: the table, and both who decide."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler")
     folder = tmp_path_factory.mktemp("envelope")
-    command = [compiler, "-std=c11", "-O2", "-shared", "-fPIC", "-o", "envelope.so", str(NATIVE / "envelope.c")]
-    subprocess.run(command, cwd=folder, check=True)
-    library = ctypes.CDLL(str(folder / "envelope.so"))
+    library = native_library(folder)
     tables = {schema: table(schema, folder) for schema in SCHEMAS}
     return {schema: (made, PythonSide(made), CarrierSide(library, made)) for schema, made in tables.items()}
 
