@@ -26,7 +26,7 @@ def fuzz(schema: str, count: int, seed: int, found: Callable[[str], None]) -> Co
     """Compare `count` datagrams of a schema. Returns the number of each decision; `found` is called for differences."""
     with tempfile.TemporaryDirectory() as folder:
         made = table(schema, Path(folder))
-        python, carrier = PythonSide(made), CarrierSide(native_library(Path(folder)), made)
+        python, carrier = PythonSide(made), CarrierSide(native_library(), made)
     noise = random.Random(seed)
     maker = Maker(made.envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
     decisions: Counter[str] = Counter()

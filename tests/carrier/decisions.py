@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import re
-import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+from router.carrier.build import build, is_current
+from router.carrier.library import load
 from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
@@ -16,7 +17,6 @@ from tests.engine.rig import Rig, program
 from tests.tables import PROTOS
 
 TESTS = Path(__file__).parents[1]
-NATIVE = TESTS.parent / "router" / "carrier" / "native"
 SENDER = ("192.168.0.30", 8)
 
 HEAD = """version: 1
@@ -38,11 +38,11 @@ SCHEMAS = {
 """Folders of protos, and the payload cases that get a route."""
 
 
-def native_library(folder: Path) -> ctypes.CDLL:
-    """`envelope.c` alone, built in `folder`."""
-    command = ["cc", "-std=c11", "-O2", "-shared", "-fPIC", "-o", "envelope.so", str(NATIVE / "envelope.c")]
-    subprocess.run(command, cwd=folder, check=True)
-    return ctypes.CDLL(str(folder / "envelope.so"))
+def native_library() -> ctypes.CDLL:
+    """The carrier's library, built first if it is not up to date."""
+    if not is_current():
+        build()
+    return load()
 
 
 def table(schema: str, folder: Path) -> Program:
@@ -110,13 +110,11 @@ class _Envelope(ctypes.Structure):
 
 
 class CarrierSide:
-    """`envelope_read` in the C library `library`."""
+    """`envelope_read` in the carrier's library."""
 
     def __init__(self, library: ctypes.CDLL, made: Program) -> None:
         self._lowered = wire_schema(made.envelope, made.inbound)
         self._read = library.envelope_read
-        self._read.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_bool, ctypes.c_void_p)
-        self._read.restype = ctypes.c_int
         self._reasons = {-1: None, **dict(enumerate(REJECT_REASONS))}
         self._buffer = (ctypes.c_char * (MAX_DATAGRAM + 8))()
         self._envelope = _Envelope()

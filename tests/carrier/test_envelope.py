@@ -26,7 +26,7 @@ Sides = tuple[Program, PythonSide, CarrierSide]
 def sides(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Sides]:
     """By schema: the table, and both who decide."""
     folder = tmp_path_factory.mktemp("envelope")
-    library = native_library(folder)
+    library = native_library()
     tables = {schema: table(schema, folder) for schema in SCHEMAS}
     return {schema: (made, PythonSide(made), CarrierSide(library, made)) for schema, made in tables.items()}
 

@@ -11,13 +11,13 @@ from __future__ import annotations
 import argparse
 import json
 import random
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+from router.carrier.build import LANGUAGE, NATIVE, compile_c
 from router.carrier.schema import WireSchema, wire_schema
 from tests.carrier.datagrams import Maker
-from tests.carrier.decisions import NATIVE, SCHEMAS, TESTS, table
+from tests.carrier.decisions import SCHEMAS, TESTS, table
 
 HERE = Path(__file__).parent
 GOLDEN = TESTS / "wire" / "golden_envelopes.json"
@@ -45,10 +45,10 @@ def build(folder: Path) -> Path:
     )
     declarations.append(f"static const struct wire_schema schemas[] = {{{schemas}}};")
     (folder / "schemas.h").write_text("\n".join(declarations) + "\n")
-    command = ["clang", "-std=c11", "-O2", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
-    sources = [HERE / "envelope_fuzz.c", NATIVE / "envelope.c"]
+    flags = ["-O2", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
+    files = [HERE / "envelope_fuzz.c", NATIVE / "envelope.c"]
     program = folder / "envelope_fuzz"
-    subprocess.run([*command, "-I", NATIVE, "-I", folder, *sources, "-o", program], check=True)
+    compile_c([*LANGUAGE, *flags, f"-I{NATIVE}", f"-I{folder}", *map(str, files), "-o", str(program)], "clang")
     return program
 
 
