@@ -38,7 +38,7 @@ def build(folder: Path) -> Path:
         if name == "rover":
             seeds += [bytes.fromhex(each["hex"]) for each in json.loads(GOLDEN.read_text())]
         for number, seed in enumerate(seeds):
-            (corpus / f"{name}-{number}").write_bytes(bytes((index << 1 | number & 1,)) + seed)
+            (corpus / f"{name}-{number}").write_bytes(seed)
     declarations.append(f"enum {{ SCHEMA_COUNT = {len(SCHEMAS)} }};")
     schemas = ", ".join(
         f"{{types_{index}, sizeof types_{index} / sizeof *types_{index}}}" for index in range(len(SCHEMAS))
