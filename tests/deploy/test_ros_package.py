@@ -52,6 +52,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     variables = {**os.environ, "AMENT_PREFIX_PATH": roots, "CMAKE_PREFIX_PATH": roots}
     for arguments in (
         ["-S", PACKAGE, "-B", folder, f"-DCMAKE_INSTALL_PREFIX={prefix}", f"-DPython3_EXECUTABLE={sys.executable}"],
+        ["--build", folder],
         ["--install", folder],
     ):
         command = ["cmake", *map(str, arguments)]
@@ -124,6 +125,12 @@ def test_colcon_meets_both_packages_and_neither_inside_the_other() -> None:
 def test_executable_may_be_executed_where_it_is_built_too(installed: Path) -> None:
     """`colcon build --symlink-install` installs a link to it."""
     assert os.access(installed.parent / "router", os.X_OK)
+
+
+def test_the_carrier_is_built_and_installed(installed: Path) -> None:
+    script = "from router.carrier.library import load; print(load()._name)"
+    loaded = subprocess.check_output([sys.executable, "-c", script], env=environment(installed), cwd="/", text=True)
+    assert Path(loaded.strip()).is_relative_to(installed)
 
 
 def test_ament_finds_the_package_and_its_files(installed: Path) -> None:

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -48,14 +49,20 @@ routes:
 Router = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
+def build(folder: Path, **variables: str) -> Path:
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
-    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    environment = {**os.environ, **variables}
+    built = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
     assert built.returncode == 0, built.stderr
     [path] = folder.glob("*.whl")
     return path
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture
@@ -93,6 +100,28 @@ def ship(packages: Path, proto: str) -> Path:
     shipped.mkdir()
     (shipped / "envelope.proto").write_text(proto)
     return shipped
+
+
+def loaded(packages: Path) -> str:
+    """What `chosen_library` says of the carrier in an installation, and what it logs."""
+    script = "from router.carrier.library import chosen_library; print(chosen_library())"
+    environment = {**os.environ, "PYTHONPATH": str(packages)}
+    return subprocess.check_output([sys.executable, "-c", script], env=environment, cwd=packages, text=True)
+
+
+def test_the_carrier_comes_with_it_for_this_platform_and_any_python(wheel: Path, packages: Path) -> None:
+    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    assert wheel.name.endswith(f"-py3-none-{platform}.whl")
+    assert f"CDLL '{packages / 'router/carrier/native/libcarrier.so'}'" in loaded(packages)
+
+
+def test_without_a_compiler_it_is_for_any_platform_and_python_does_the_carriers_work(tmp_path: Path) -> None:
+    wheel = build(tmp_path, CC="no-compiler")
+    assert wheel.name.endswith("-py3-none-any.whl")
+    zipfile.ZipFile(wheel).extractall(tmp_path / "packages")
+    said = loaded(tmp_path / "packages")
+    assert said.endswith("None\n")
+    assert "was not built; install the router again where there is a C compiler" in said
 
 
 def test_the_examples_are_copied_and_work_where_they_are(routed: Router, packages: Path, tmp_path: Path) -> None:
