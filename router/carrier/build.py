@@ -19,9 +19,6 @@ from tempfile import TemporaryDirectory
 NATIVE = Path(__file__).parent / "native"
 LIBRARY = NATIVE / "libcarrier.so"
 
-LANGUAGE = ("-std=c11", "-D_GNU_SOURCE", "-pthread")
-"""What the sources are written in: needed by whoever compiles one of them."""
-
 _OPTIMIZED = (
     "-O2",
     "-fno-semantic-interposition",
@@ -29,7 +26,7 @@ _OPTIMIZED = (
     "-U_FORTIFY_SOURCE",
     "-D_FORTIFY_SOURCE=2",
 )
-_LINKED = ("-Wl,-Bsymbolic", "-Wl,-z,relro", "-Wl,-z,now", "-Wl,-z,noexecstack")
+_LINKED = ("-Wl,-Bsymbolic", "-Wl,-z,defs", "-Wl,-z,relro", "-Wl,-z,now", "-Wl,-z,noexecstack")
 """All functions are exported, for ctypes; among themselves they need no symbol table."""
 
 
@@ -61,17 +58,17 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
 
     Raises BuildError.
     """
-    defined = f'-DCARRIER_CHECKSUM="{checksum()}"'
     with TemporaryDirectory(dir=output.parent, prefix=".carrier") as folder:
         made = Path(folder) / output.name
-        compile_c([*LANGUAGE, "-fPIC", "-shared", *flags, defined, *map(str, sources()), "-o", str(made)], compiler)
+        compile_c([*map(str, sources()), "-fPIC", "-shared", *flags, "-o", str(made)], compiler)
         made.replace(output)
     return output
 
 
 def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
-    """Run the C compiler. Raises BuildError."""
-    command = [compiler or os.environ.get("CC") or "cc", *arguments]
+    """Run the C compiler on sources of the carrier, and of those who call it. Raises BuildError."""
+    language = ("-std=c11", "-D_GNU_SOURCE", "-pthread", f'-DCARRIER_CHECKSUM="{checksum()}"')
+    command = [compiler or os.environ.get("CC") or "cc", *language, *arguments]
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import random
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from router.carrier.schema import CannotCarry, wire_schema
 from router.compiler.program import Program
 from router.engine import MAX_DATAGRAM
 from tests.carrier.datagrams import GROUP, GROUP_END, Maker
-from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, native_library, table
+from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, table
 from tests.engine.rig import program
 from tests.engine.wire import I32, I64, LEN, VARINT, damaged, framed, tag, varint
 
@@ -23,10 +24,9 @@ Sides = tuple[Program, PythonSide, CarrierSide]
 
 
 @pytest.fixture(scope="module")
-def sides(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Sides]:
+def sides(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Sides]:
     """By schema: the table, and both who decide."""
     folder = tmp_path_factory.mktemp("envelope")
-    library = native_library()
     tables = {schema: table(schema, folder) for schema in SCHEMAS}
     return {schema: (made, PythonSide(made), CarrierSide(library, made)) for schema, made in tables.items()}
 

@@ -14,7 +14,7 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from router.carrier.build import LANGUAGE, NATIVE, compile_c
+from router.carrier.build import NATIVE, compile_c
 from router.carrier.schema import WireSchema, wire_schema
 from tests.carrier.datagrams import Maker
 from tests.carrier.decisions import SCHEMAS, TESTS, table
@@ -48,7 +48,7 @@ def build(folder: Path) -> Path:
     flags = ["-O2", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
     files = [HERE / "envelope_fuzz.c", NATIVE / "envelope.c"]
     program = folder / "envelope_fuzz"
-    compile_c([*LANGUAGE, *flags, f"-I{NATIVE}", f"-I{folder}", *map(str, files), "-o", str(program)], "clang")
+    compile_c([*flags, f"-I{NATIVE}", f"-I{folder}", *map(str, files), "-o", str(program)], "clang")
     return program
 
 

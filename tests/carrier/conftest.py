@@ -1,0 +1,31 @@
+"""The carrier's library: the one that set-up has built, or one of the present sources."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from pathlib import Path
+
+import pytest
+
+from router.carrier.build import LIBRARY, build, is_current
+from router.carrier.library import load
+from tests.carrier.building import sanitized_library
+
+SANITIZED = "CARRIER_TESTED_WITH_SANITIZERS"
+"""An environment variable. test_sanitized.py sets it, with those that sanitizers need."""
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its file."""
+    made = tmp_path_factory.mktemp("carrier") / LIBRARY.name
+    if SANITIZED in os.environ:
+        return sanitized_library(made)
+    return LIBRARY if is_current() else build(made)
+
+
+@pytest.fixture(scope="session")
+def library(built: Path) -> ctypes.CDLL:
+    """It, loaded."""
+    return load(built)

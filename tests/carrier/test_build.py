@@ -1,0 +1,94 @@
+"""Building the library: by which compilers, when again, and what happens to one that is in use."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from router.carrier import build
+from router.carrier.library import load
+
+STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Werror", "-O2")
+COMPILERS = [compiler for compiler in ("gcc", "clang") if shutil.which(compiler)]
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("source", build.sources(), ids=lambda path: path.name)
+def test_compilers_have_nothing_to_warn_of(source: Path, compiler: str, tmp_path: Path) -> None:
+    build.compile_c([str(source), *STRICT, "-c", "-o", str(tmp_path / "made.o")], compiler)
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_a_library_of_any_compiler_can_be_loaded(compiler: str, tmp_path: Path) -> None:
+    load(build.build(tmp_path / "libcarrier.so", compiler=compiler))
+
+
+@pytest.fixture
+def native(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder with the sources: here one that is compiled soon."""
+    folder = tmp_path / "native"
+    folder.mkdir()
+    (folder / "one.h").write_text("extern const char *made_of;\n")
+    (folder / "one.c").write_text('#include "one.h"\nconst char *made_of = CARRIER_CHECKSUM;\n')
+    monkeypatch.setattr(build, "NATIVE", folder)
+    return folder
+
+
+@pytest.fixture
+def made(native: Path) -> Path:
+    return build.build(native / "libcarrier.so")
+
+
+def test_a_library_is_current_until_a_source_changes(made: Path, native: Path) -> None:
+    assert build.is_current(made)
+    with (native / "one.h").open("a") as header:
+        header.write("\n")
+    assert not build.is_current(made)
+    build.build(made)
+    assert build.is_current(made)
+    made.unlink()
+    assert not build.is_current(made)
+
+
+def test_a_library_that_is_loaded_keeps_its_file(made: Path, native: Path) -> None:
+    before = set(native.iterdir())
+    with made.open("rb") as loaded:
+        inode = made.stat().st_ino
+        build.build(made)
+        assert Path(f"/proc/self/fd/{loaded.fileno()}").stat().st_ino == inode
+        assert made.stat().st_ino != inode
+    assert set(native.iterdir()) == before
+
+
+def test_a_library_stays_when_the_next_one_cannot_be_built(made: Path, native: Path) -> None:
+    (native / "two.c").write_text("what is this\n")
+    with pytest.raises(build.BuildError, match=r"two\.c:1:1: error"):
+        build.build(made)
+    assert made.exists()
+
+
+def test_a_function_that_nobody_wrote_is_found_when_it_is_built(made: Path, native: Path) -> None:
+    (native / "two.c").write_text("int missing(void);\nint calls_it(void);\nint calls_it(void) { return missing(); }\n")
+    with pytest.raises(build.BuildError, match="undefined reference to `missing'"):
+        build.build(made)
+
+
+def test_everyone_may_read_it(made: Path) -> None:
+    """The service runs as a user of its own."""
+    assert made.stat().st_mode & 0o444 == 0o444
+
+
+def test_it_is_built_where_no_package_is_installed_and_tells_of_a_missing_compiler(tmp_path: Path) -> None:
+    made = tmp_path / "made.so"
+    script: list[str | Path] = [sys.executable, "-I", "-S", build.__file__, "--output", made]
+    subprocess.run(script, check=True)
+    assert subprocess.run([*script, "--check"], check=False).returncode == 0
+    failed = subprocess.run(script, env={"CC": "no-compiler"}, capture_output=True, text=True, check=False)
+    assert (failed.returncode, failed.stderr) == (
+        1,
+        "build: the C compiler 'no-compiler' cannot be run: No such file or directory\n",
+    )
