@@ -45,6 +45,11 @@ class ThreadCounts:
         self.receive, self.ros, self.deadman, self.gateway_deadmen, self.pacing, self.collecting = self.lists[:6]
         self.gateways, self.events, self.own = self.lists[6:]
 
+    def add(self, counts: list[int]) -> list[int]:
+        """Count in another list too, which is returned."""
+        self.lists.append(counts)
+        return counts
+
     def total(self, metric: str) -> int:
         """The sum of a counter over all its labels."""
         indexes = [index for series, index in self.counters.series() if series.metric == metric]

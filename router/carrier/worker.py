@@ -12,11 +12,8 @@ from dataclasses import dataclass
 from struct import Struct
 
 from router.carrier.ring import Ring
+from router.engine.dispatch import ServePart
 from router.log import logger
-
-Function = Callable[["bytes | None", bytes, int, int, str, int], None]
-"""Called with the payload (None if there are several fields), the datagram, when it was received (wall clock), taken
-and born (monotonic), and its source; `born` last. Never raises for what was received."""
 
 _RECORD = Struct("@IIQqqqIIIIII")
 """`struct message_record`."""
@@ -24,26 +21,22 @@ _RECORD = Struct("@IIQqqqIIIIII")
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What a worker calls while a program runs: functions by handler, with the indexes at which their targets wait.
+    """What a worker calls while a program runs: functions by number of the handler.
 
     `switch` is called once, before the first message of this program.
     """
 
     generation: int
-    functions: Mapping[int, tuple[Function, Sequence[int]]]
+    functions: Mapping[int, ServePart]
     sources: Sequence[str]
     switch: Callable[[], None]
 
 
 class Worker:
-    """Serves the messages of `ring` in a thread of its own. `failed` is called with what a function raises.
+    """Serves the messages of `ring` in a thread of its own. `failed` is called with what a function raises."""
 
-    `counts` belong to the thread, which takes what it has served off those that wait.
-    """
-
-    def __init__(self, name: str, ring: Ring, counts: list[int], failed: Callable[[Exception], None]) -> None:
-        self._ring = ring
-        self._counts = counts
+    def __init__(self, name: str, ring: Ring, failed: Callable[[Exception], None]) -> None:
+        self.ring = ring
         self._failed = failed
         self._stages: dict[int, Stage] = {}
         self._stage: Stage | None = None
@@ -70,7 +63,7 @@ class Worker:
     def advance(self, generation: int) -> None:
         """Switch to that generation once all earlier messages are served: none of them can come any more."""
         self._latest = generation
-        self._ring.wake()
+        self.ring.wake()
 
     def wait_for(self, generation: int, timeout: float) -> bool:
         """Wait until the thread serves that generation. Return False after `timeout` s: it is stuck, or behind."""
@@ -80,7 +73,7 @@ class Worker:
     def stop(self, timeout: float) -> bool:
         """Serve what waits, and end. Return False if that takes longer than `timeout` s: the thread is left."""
         self._stopping = True
-        self._ring.wake()
+        self.ring.wake()
         if self._thread.ident is not None:
             self._thread.join(timeout)
         return not self._thread.is_alive()
@@ -88,7 +81,7 @@ class Worker:
     def _run(self) -> None:
         while True:
             latest, is_stopping = self._latest, self._stopping
-            records = self._ring.take(0 if is_stopping else -1)
+            records = self.ring.take(0 if is_stopping else -1)
             if records:
                 self._serve(records)
             elif self._stage is None or latest > self._stage.generation:
@@ -110,7 +103,7 @@ class Worker:
             del self._stages[earlier]
 
     def _serve(self, records: memoryview) -> None:
-        counts, position, end, head = self._counts, 0, len(records), _RECORD.size
+        position, end, head = 0, len(records), _RECORD.size
         stage = self._stage
         while position < end:
             (
@@ -131,16 +124,13 @@ class Worker:
                 self._switch(generation)
                 stage = self._stage
             assert stage is not None  # noqa: S101 - each generation is prepared before its first message
-            function, waiting = stage.functions[number]
             data = position + head
             payload = bytes(records[data + start : data + start + payload_length]) if is_single else None
             datagram = bytes(records[data : data + length])
             try:
-                function(payload, datagram, received_at, now, stage.sources[column], born)
+                stage.functions[number](payload, datagram, received_at, now, stage.sources[column], born)
             except Exception as error:  # noqa: BLE001 as above
                 self._failed(error)
-            for index in waiting:
-                counts[index] -= 1
             position += size
 
 

@@ -36,9 +36,14 @@ class RateLimit:
     __slots__ = ("_late", "_period", "next_pass")
 
     def __init__(self, hertz: float) -> None:
-        self._period = ceil(NS / hertz)
+        self._period = self.period(hertz)
         self._late = self._period - self._period // 2
         self.next_pass = -self._period  # a whole period ago at any time, because monotonic time is not negative
+
+    @staticmethod
+    def period(hertz: float) -> int:
+        """The period of the grid in ns."""
+        return ceil(NS / hertz)
 
     def may_pass(self, now: int) -> bool:
         """Whether a message may pass now; if so, it takes the place."""

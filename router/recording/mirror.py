@@ -1,6 +1,6 @@
 """The mirror: what listeners receive, before routing, for recordings, taps and pages.
 
-While no consumer is attached, the receive path has nothing of it.
+While no consumer is attached, the receive path has nothing of it. The carrier has a ring of its own in place of `tee`.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ class Mirror:
         self._rewire = rewire
         self._failed = failed
         self._waiting: deque[Mirrored] = deque()
+        self._drain = self._drain_waiting
         self._consumers: tuple[Consumer, ...] = ()
         self._attaching = threading.Lock()
         self._stopping = threading.Event()
@@ -95,7 +96,7 @@ class Mirror:
                 self._consumers = tuple(each for each in self._consumers if each is not consumer)
                 if not self._consumers:
                     self._rewire()
-                    self._waiting.clear()
+                    self._drain()
 
         return detach
 
@@ -113,6 +114,14 @@ class Mirror:
             receive(data, peer)
 
         return mirrored
+
+    def drain_by(self, drain: Callable[[], list[Mirrored]]) -> None:
+        """Have `drain` return what was received since its last call, in place of what `tee` has kept."""
+        self._drain = drain
+
+    def _drain_waiting(self) -> list[Mirrored]:
+        pop = self._waiting.popleft
+        return [pop() for _ in range(len(self._waiting))]
 
     def close(self) -> None:
         """Deliver what waits, and end the thread. To be called when nothing is received any more."""
@@ -132,8 +141,7 @@ class Mirror:
 
     def _deliver(self) -> None:
         """Called by the thread, and after its end by whoever has joined it: never by two at once."""
-        pop = self._waiting.popleft
-        batch = [pop() for _ in range(len(self._waiting))]
+        batch = self._drain()
         if not batch:
             return
         for consumer in self._consumers:

@@ -1,0 +1,370 @@
+"""The datapath of the carrier: native threads receive, forward and brake; Python serves what only Python can.
+
+Datagrams whose targets the carrier does not serve come by rings to two threads: `topics` publishes, which may block in
+the middleware, and `destinations` sends to endpoints that need Python. Each has its own engine with its own state, and
+changes to another program when it has served all that the earlier one received.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from itertools import count
+from socket import inet_ntoa
+from struct import Struct
+from typing import TYPE_CHECKING, Any
+
+from router.app.sockets import SocketChange
+from router.app.wiring import (
+    RouterContext,
+    Send,
+    States,
+    Wiring,
+    engine_context,
+    gateway_deadmen,
+    log_start,
+    open_pacers,
+)
+from router.carrier import structures as c
+from router.carrier.carrier import Carrier
+from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.events import EventThread
+from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
+from router.carrier.ring import Ring
+from router.carrier.schema import wire_schema
+from router.carrier.sender import NativeSender
+from router.carrier.worker import Stage, Worker, left_behind
+from router.compiler.program import DeadmanPlan, Handler, Part, Program, TargetPlan
+from router.engine import MAX_DATAGRAM, OutboundEngine, PartEngine
+from router.engine.binding import State
+from router.engine.deadman import feeder
+from router.engine.pacing import RateLimit
+from router.engine.slow_path import Rejected, SlowPath
+from router.log import logger
+from router.net.udp import Listener, Sender
+from router.recording.mirror import Mirror, Mirrored
+from router.table import model
+
+if TYPE_CHECKING:
+    from router.ros.endpoints import RosChange
+    from router.ros.router_node import RouterNode
+
+MOST_COUNTERS = 1 << 18
+"""Counters of each native thread: their addresses stay the same, so they cannot grow."""
+
+_QUEUE, _EVENTS = 1 << 22, 1 << 18
+"""Bytes that may wait for a thread of Python: messages, and events."""
+
+_PATIENCE_S = 1.0
+"""How long a reload and a stop wait for a thread of Python that may be stuck in the middleware."""
+
+_MIRROR = Struct("@IIqIIII")
+"""`struct mirror_record`."""
+
+_PARTS = {Part.TOPICS: "topics", Part.DESTINATIONS: "destinations"}
+_ROS, _ENDPOINTS, _GATEWAYS = "ros", "endpoints", "gateways"
+
+
+@dataclass(frozen=True, slots=True)
+class NativeWiring(Wiring):
+    """`deadmen` are those of routes; `stages` by part."""
+
+    native: NativeProgram
+    deadmen: Mapping[str, NativeDeadman]
+    stages: Mapping[Part, Stage]
+
+
+class NativeDatapath:
+    """See `Datapath`."""
+
+    def __init__(self, library: ctypes.CDLL, context: RouterContext, mirror: Mirror) -> None:
+        self._library = library
+        self._context = context
+        self._names = Names()
+        self._generations = count(1)
+        self._wiring: NativeWiring | None = None
+        self._is_running = False
+        report, failed = context.reporter.report, context.reporter.failed
+        received, braked = Ring(library, _EVENTS), Ring(library, _EVENTS)
+        self._deadmen = Deadmen(library, self._native_counts(), braked, self._names)
+        self._carrier = Carrier(library, self._deadmen.address, self._native_counts(), received)
+        self._part_counts = {part: context.counts.add([]) for part in Part}
+        self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in _PARTS.items()}
+        self._mirrored = MirrorRing(Ring(library, _QUEUE), self._names)
+        mirror.drain_by(self._mirrored.take)
+        self._events = EventThread(
+            [received, braked], self._names, report, context.deadman_changed, self._why_rejected, self._carrier.pulse
+        )
+
+    def _native_counts(self) -> list[int]:
+        """An array of counters that never moves. It is used like a list."""
+        counts: Any = (ctypes.c_int64 * MOST_COUNTERS)()
+        self._context.counts.add(counts)
+        return counts
+
+    @property
+    def turns(self) -> int:
+        return self._carrier.turns
+
+    def open_sender(self, endpoint: model.Endpoint) -> NativeSender:
+        return NativeSender(self._library, endpoint)
+
+    def states(self, earlier: Wiring | None) -> States:
+        return States([*_PARTS.values(), _ROS, _ENDPOINTS, _GATEWAYS], earlier.states if earlier else None)
+
+    def start_deadmen(self, program: Program, sockets: SocketChange, states: States) -> None:
+        for plan in program.deadmen:
+            log_start(plan.route, self._deadman(plan, program, sockets, states).start())
+
+    # wiring
+
+    def wire(
+        self,
+        program: Program,
+        sockets: SocketChange,
+        ros: RouterNode | None,
+        topics: RosChange | None,
+        states: States,
+    ) -> NativeWiring:
+        context, timers = self._context, self._context.timers
+        senders = {endpoint: self._native(sender) for endpoint, sender in sockets.senders.items()}
+        deadmen = {plan.route: self._deadman(plan, program, sockets, states) for plan in program.deadmen}
+        behind_gateways = gateway_deadmen(program, context, ros, states[_GATEWAYS])
+        send: dict[str, Send] = {endpoint: sender.send for endpoint, sender in senders.items()}
+        pacers = open_pacers(program, timers.pacing, send, states[_ENDPOINTS])
+
+        def feeds(route: str, names: Sequence[str]) -> list[tuple[NativeDeadman, bool]]:
+            return [(deadmen[name], name != route) for name in names]
+
+        def command(endpoint: str, route: str, names: Sequence[str]) -> Callable[[bytes, int | None], int]:
+            return self._deadmen.command(senders[endpoint], feeds(route, names))
+
+        errors = ros.publish_errors if ros else ()
+        shared = engine_context(program, context, topics, errors, send, command, pacers)
+        outbound = OutboundEngine(program, replace(shared, counts=context.counts.ros, state=states[_ROS]))
+        parts = {
+            part: PartEngine(program, replace(shared, counts=self._part_counts[part], state=states[user]), part)
+            for part, user in _PARTS.items()
+        }
+        functions = {part: engine.functions() for part, engine in parts.items()}
+
+        def parts_of(handler: Handler) -> Iterator[PartTargets]:
+            for part, worker in self._workers.items():
+                if handler.route in functions[part]:
+                    targets = _targets(program, handler, part)
+                    is_always_wanted = part is Part.DESTINATIONS or handler.collect_timeout is not None
+                    yield PartTargets(worker.ring.address, targets, is_always_wanted)
+
+        outlets = Outlets(
+            listeners=sockets.listeners,
+            senders={endpoint: sender.address for endpoint, sender in senders.items()},
+            wanted=shared.wanted,
+            feeds=lambda route, names: [(deadman.address, disarms) for deadman, disarms in feeds(route, names)],
+            limit=partial(_limit, states[_ENDPOINTS]),
+            carried=lambda handler: _targets(program, handler, None),
+            parts=lambda handler: list(parts_of(handler)),
+            names=self._names,
+        )
+        native = native_program(program, wire_schema(program.envelope), next(self._generations), outlets)
+        native.arrays += [senders, deadmen]
+        numbers = {handler.route: number for number, handler in enumerate(native.handlers)}
+        stages = {
+            part: Stage(
+                native.generation,
+                {numbers[route]: function for route, function in functions[part].items()},
+                native.sources,
+                partial(self._end_timers, part, states),
+            )
+            for part in Part
+        }
+        for part, stage in stages.items():
+            self._workers[part].prepare(stage)
+        return NativeWiring(
+            program=program,
+            take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},
+            feed=feeder(behind_gateways, timers.inbound_deadman.locked),
+            states=states,
+            gateway_deadmen=behind_gateways,
+            pacers=pacers,
+            engines=(outbound, *parts.values()),
+            native=native,
+            deadmen=deadmen,
+            stages=stages,
+        )
+
+    def _native(self, sender: Sender) -> NativeSender:
+        assert isinstance(sender, NativeSender)  # noqa: S101 - made by `open_sender`
+        return sender
+
+    def _deadman(self, plan: DeadmanPlan, program: Program, sockets: SocketChange, states: States) -> NativeDeadman:
+        senders = {endpoint: self._native(sockets.senders[endpoint]) for endpoint, _ in plan.datagrams}
+        key = "deadman", plan, tuple(senders.values())
+        return states[_ENDPOINTS].keep(key, lambda: self._deadmen.add(plan, program.counters, senders))
+
+    def _end_timers(self, part: Part, states: States) -> None:
+        """End the timers that only the earlier program had, once its messages are served.
+
+        What waits for an endpoint may have come by any of its timers, which end before the pacer.
+        """
+        left = list(states[_PARTS[part]].left())
+        if part is Part.DESTINATIONS:
+            left += states[_ENDPOINTS].left()
+        self._context.timers.release(left)
+
+    def abandon(self, wiring: Wiring) -> None:
+        assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
+        for part, stage in wiring.stages.items():
+            self._workers[part].abandon(stage)
+
+    # running
+
+    def between(self, swap: Callable[[], None]) -> None:
+        swap()
+
+    def adopt(self, wiring: Wiring, earlier: Wiring | None, left: Sequence[Listener], now: Sequence[Listener]) -> None:
+        assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
+        wiring.succeed_gateways(earlier, self._context.timers)
+        self._context.timers.release([*wiring.states[_GATEWAYS].left(), *wiring.states[_ROS].left()])
+        if isinstance(earlier, NativeWiring):
+            for listener in left:
+                listener.end_input()
+            self._change(wiring, earlier)
+        self._wiring = wiring
+
+    def _change(self, wiring: NativeWiring, earlier: NativeWiring) -> None:
+        """Have the carrier execute another program; deadmen with other settings inherit the state of earlier ones."""
+        pairs = [(deadman, earlier.deadmen.get(route)) for route, deadman in wiring.deadmen.items()]
+        replaced = [(next_one, before) for next_one, before in pairs if before is not None and before is not next_one]
+        kept = list(wiring.deadmen.values())
+        ended = [before for before in earlier.deadmen.values() if before not in kept]
+        for next_one, before in replaced:
+            next_one.succeeds(before)
+        generation = wiring.native.generation
+        holds = _moves_to_carrier(earlier.program, wiring.program)
+        self._carrier.change(
+            wiring.native,
+            [(next_one.address, before.address) for next_one, before in replaced],
+            [before.address for before in ended],
+            holds=holds,
+        )
+        for worker in self._workers.values():
+            worker.advance(generation)
+        if holds:  # what waits for Python is sent before what the carrier receives from now on
+            self._workers[Part.DESTINATIONS].wait_for(generation, _PATIENCE_S)
+            self._carrier.resume()
+
+    def start(self) -> None:
+        assert self._wiring is not None  # noqa: S101 - `adopt` was called
+        native = self._wiring.native
+        self._carrier.start(native)
+        for worker in self._workers.values():
+            worker.start()
+            worker.advance(native.generation)
+        self._is_running = True
+
+    def has_passed(self, wiring: Wiring) -> bool:
+        assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
+        if not self._is_running:
+            return True
+        return not left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
+
+    def observe(self, *, is_observed: bool) -> None:
+        assert self._wiring is not None  # noqa: S101 - observers attach once there is a program
+        lost = self._wiring.program.counters.index("mirror_dropped")
+        self._carrier.mirror(self._mirrored.ring if is_observed else None, lost)
+
+    def watch(self, notify: int, interval: int) -> bool:
+        self._carrier.watchdog(notify, interval)
+        return True
+
+    def stop(self, listeners: Sequence[Listener]) -> None:
+        for listener in listeners:
+            listener.end_input()
+        self._carrier.stop_receiving()
+        self._is_running = False
+        stuck = [worker.name for worker in self._workers.values() if not worker.stop(_PATIENCE_S)]
+        if stuck:
+            logger.error("a thread is stuck, and the router ends without it", threads=stuck)
+
+    def close(self) -> None:
+        for deadman in self._wiring.deadmen.values() if self._wiring else ():
+            deadman.end()
+        self._carrier.close()
+        self._events.close()
+
+    def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
+        """Say in words why the carrier rejected a datagram, of which `data` may be the beginning."""
+        if length > MAX_DATAGRAM:
+            return f"{length} bytes"
+        wiring = self._wiring
+        if wiring is None or all(plan.name != listener for plan in wiring.program.listeners):
+            return ""
+        program = wiring.program
+        routed = {number: handlers[0].case.name for number, handlers in program.inbound.items()}
+        try:
+            case, _ = SlowPath(program, program.counters.fresh_counts(), listener, routed).parse(data)
+        except Rejected as rejected:
+            return str(rejected)
+        return case
+
+
+class MirrorRing:
+    """What the carrier shows of received datagrams, in the form in which observers get it."""
+
+    def __init__(self, ring: Ring, names: Names) -> None:
+        self.ring = ring
+        self._name = names.name
+
+    def take(self) -> list[Mirrored]:
+        """Return what was received since the last call. For one thread."""
+        taken: list[Mirrored] = []
+        head = _MIRROR.size
+        while records := self.ring.take():
+            position = 0
+            while position < len(records):
+                size, listener, at, address, port, length, _ = _MIRROR.unpack_from(records, position)
+                data = bytes(records[position + head : position + head + length])
+                taken.append((at, self._name(listener), (_host(address), port), data))
+                position += size
+        return taken
+
+
+@cache
+def _host(address: int) -> str:
+    return inet_ntoa(address.to_bytes(4, "big"))
+
+
+def _targets(program: Program, handler: Handler, part: Part | None) -> list[TargetPlan]:
+    """The targets of a route that a part serves; None for those that the carrier serves."""
+
+    def served_by(target: TargetPlan) -> Part | None:
+        if target.is_topic:
+            return Part.TOPICS
+        return None if program.executors[handler.route, None, target.label].is_carrier else Part.DESTINATIONS
+
+    return [target for target in handler.targets if served_by(target) is part]
+
+
+def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
+    """The limit of a target with `max_rate`, which lives as long as programs have the target."""
+    rate = target.max_rate
+    assert rate is not None  # noqa: S101 - asked for by the caller
+    period = RateLimit.period(rate)
+    return state.keep(
+        ("native limit", handler.route, target), lambda: c.Limit(period, period - period // 2, -period)
+    )
+
+
+def _moves_to_carrier(earlier: Program, later: Program) -> bool:
+    """Whether an endpoint that Python served is served by the carrier now."""
+
+    def served(program: Program, *, by_carrier: bool) -> set[str]:
+        return {
+            endpoint
+            for (_, topic, endpoint), executor in program.executors.items()
+            if topic is None and executor.is_carrier is by_carrier
+        }
+
+    return bool(served(earlier, by_carrier=False) & served(later, by_carrier=True))

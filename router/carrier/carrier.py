@@ -1,0 +1,84 @@
+"""The native threads: receive, and brakes."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Sequence
+
+from router.carrier import structures as c
+from router.carrier.program import NativeProgram
+from router.carrier.ring import Ring
+from router.errors import StartError
+
+
+class Carrier:
+    """Receives datagrams and executes programs, in native threads that never wait for Python.
+
+    `counters` is the array of the receive thread, which writes losses and rejections to `events`. Deadmen are served
+    when they are due.
+    """
+
+    def __init__(self, library: ctypes.CDLL, deadmen: int, counters: ctypes.Array[ctypes.c_int64], events: Ring) -> None:
+        """Raises MemoryError."""
+        self._library = library
+        self._keep = counters, events
+        self._carrier: int = library.carrier_open(deadmen, counters, events.address)
+        self._running: tuple[object, ...] = ()
+        if not self._carrier:
+            raise MemoryError("the carrier cannot be opened")
+
+    @property
+    def turns(self) -> int:
+        """A number that grows at least every 50 ms unless the receive thread is stuck."""
+        return int(self._library.carrier_turns(self._carrier)) if self._carrier else 0
+
+    def start(self, program: NativeProgram) -> None:
+        """Start the threads. Raises StartError."""
+        change = c.Change(program=ctypes.pointer(program.structure))
+        if error := self._library.carrier_start(self._carrier, ctypes.byref(change)):
+            raise StartError(f"the carrier's threads cannot be started: {os.strerror(error)}")
+        self._running = program, change
+
+    def change(
+        self, program: NativeProgram, replaced: Sequence[tuple[int, int]], ended: Sequence[int], *, holds: bool
+    ) -> None:
+        """Execute another program from the next datagram on.
+
+        `replaced` has deadmen with those that they take over from, `ended` those that no deadman replaces. With
+        `holds`, nothing is received until `resume` is called, or for a second.
+        """
+        pairs = [deadman for pair in replaced for deadman in pair]
+        change = c.Change(
+            program=ctypes.pointer(program.structure),
+            replaced=(ctypes.c_void_p * len(pairs))(*pairs),
+            ended=(ctypes.c_void_p * len(ended))(*ended),
+            replaced_count=len(replaced),
+            ended_count=len(ended),
+            holds=holds,
+        )
+        self._library.carrier_change(self._carrier, ctypes.byref(change))
+        self._running = program, change
+
+    def resume(self) -> None:
+        self._library.carrier_resume(self._carrier)
+
+    def mirror(self, ring: Ring | None, lost: int) -> None:
+        """Write what is received to `ring` from now on. `lost` is the counter of what had no room there."""
+        self._library.carrier_mirror(self._carrier, ring.address if ring else None, lost)
+
+    def watchdog(self, notify: int, interval: int) -> None:
+        """Feed a watchdog by a connected socket every `interval` ns, while receiving makes progress and `pulse` is
+        called every few seconds."""
+        self._library.carrier_watchdog(self._carrier, notify, interval)
+
+    def pulse(self) -> None:
+        self._library.carrier_pulse(self._carrier)
+
+    def stop_receiving(self) -> None:
+        """Handle what the kernel holds, and end the receive thread. Brakes go on."""
+        self._library.carrier_stop_receiving(self._carrier)
+
+    def close(self) -> None:
+        self._library.carrier_close(self._carrier)
+        self._carrier = 0
