@@ -33,7 +33,6 @@ from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.events import EventThread
 from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
 from router.carrier.ring import Ring
-from router.carrier.schema import wire_schema
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker, left_behind
 from router.compiler.program import DeadmanPlan, Handler, Part, Program, TargetPlan
@@ -167,7 +166,7 @@ class NativeDatapath:
             parts=lambda handler: list(parts_of(handler)),
             names=self._names,
         )
-        native = native_program(program, wire_schema(program.envelope), next(self._generations), outlets)
+        native = native_program(program, next(self._generations), outlets)
         native.arrays += [senders, deadmen]
         numbers = {handler.route: number for number, handler in enumerate(native.handlers)}
         stages = {
@@ -271,8 +270,7 @@ class NativeDatapath:
         return not left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
 
     def observe(self, *, is_observed: bool) -> None:
-        assert self._wiring is not None  # noqa: S101 - observers attach once there is a program
-        lost = self._wiring.program.counters.index("mirror_dropped")
+        lost = self._context.counts.counters.index("mirror_dropped")
         self._carrier.mirror(self._mirrored.ring if is_observed else None, lost)
 
     def watch(self, notify: int, interval: int) -> bool:
@@ -352,9 +350,7 @@ def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
     rate = target.max_rate
     assert rate is not None  # noqa: S101 - asked for by the caller
     period = RateLimit.period(rate)
-    return state.keep(
-        ("native limit", handler.route, target), lambda: c.Limit(period, period - period // 2, -period)
-    )
+    return state.keep(("native limit", handler.route, target), lambda: c.Limit(period, period - period // 2, -period))
 
 
 def _moves_to_carrier(earlier: Program, later: Program) -> bool:

@@ -33,11 +33,14 @@ _REMEDY = "ListenDatagram= in rover-router.socket says something else than the t
 
 
 @contextmanager
-def supervised(progress: Callable[[], int]) -> Iterator[None]:
+def supervised(
+    progress: Callable[[], int], feed: Callable[[int, int], bool] = lambda notify, interval: False
+) -> Iterator[None]:
     """Notify that the router is ready inside, and stops at the end.
 
     The service manager's watchdog is fed while `progress()` changes, which it has to do at least every half second. If
-    the router is stuck, it ends it with SIGABRT, and the log shows where each thread stood.
+    the router is stuck, it ends it with SIGABRT, and the log shows where each thread stood. `feed(socket, interval)`
+    has it fed by native threads instead, every `interval` ns, or returns False.
     """
     for address in inherited().unclaimed():
         logger.warning("nobody listens on a socket that was handed over", address=address, remedy=_REMEDY)
@@ -45,10 +48,14 @@ def supervised(progress: Callable[[], int]) -> Iterator[None]:
         notify("READY=1")
         if (limit := _watchdog_ns()) is not None:
             faulthandler.enable()
-            thread = TimerThread("watchdog", _log_fault)
-            thread.add(Watchdog(progress, limit // _CHECKS, monotonic_ns()))
-            thread.start()
-            ending.callback(thread.stop)
+            notifying = _notify_socket()
+            if notifying is None or not feed(ending.enter_context(notifying).fileno(), limit // _CHECKS):
+                thread = TimerThread("watchdog", _log_fault)
+                thread.add(Watchdog(progress, limit // _CHECKS, monotonic_ns()))
+                thread.start()
+                ending.callback(thread.stop)
+            else:
+                ending.callback(feed, -1, 0)
         ending.callback(notify, "STOPPING=1", "WATCHDOG=1")  # the service manager's stop timeout starts here
         yield
 
@@ -84,16 +91,29 @@ class Watchdog(Timer):
 
 def notify(*lines: str) -> None:
     """Send lines such as `READY=1` to the service manager, if there is one."""
+    if (notifying := _notify_socket()) is None:
+        return
+    with notifying:
+        try:
+            notifying.send("\n".join(lines).encode())
+        except OSError as error:
+            logger.warning("the service manager cannot be notified", line=lines[0], error=str(error))
+
+
+def _notify_socket() -> socket.socket | None:
+    """A socket that is connected to the service manager; None without one, or where it cannot be reached."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
-        return
+        return None
+    notifying = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    notifying.settimeout(NOTIFY_TIMEOUT)
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifying:
-            notifying.settimeout(NOTIFY_TIMEOUT)
-            notifying.connect(f"\0{address[1:]}" if address.startswith("@") else address)
-            notifying.send("\n".join(lines).encode())
+        notifying.connect(f"\0{address[1:]}" if address.startswith("@") else address)
     except OSError as error:
-        logger.warning("the service manager cannot be notified", line=lines[0], error=str(error))
+        notifying.close()
+        logger.warning("the service manager cannot be reached", address=address, error=str(error))
+        return None
+    return notifying
 
 
 def _watchdog_ns() -> int | None:

@@ -135,6 +135,10 @@ class Router:
     def progress(self) -> int:
         return self._runtime.datapath.turns + self.total("datagrams_received")
 
+    def feed_watchdog(self, notify: int, interval: int) -> bool:
+        """Have native threads feed a watchdog by a connected socket, every `interval` ns; False if there are none."""
+        return self._runtime.datapath.watch(notify, interval)
+
     def collect(self) -> Iterator[Family]:
         if (made := self._collector) is None or made[0] is not self.program:
             program = self.program
@@ -192,7 +196,7 @@ class Router:
             return lambda: gateways.clients(value) if (gateways := self._runtime.gateways) else ()
 
         return {
-            "mirror_dropped": lambda: [((), self.mirror.lost)],
+            "mirror_dropped": lambda: [((), self.mirror.lost + self.total("mirror_dropped"))],
             **self._services.asked(),
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
             "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),

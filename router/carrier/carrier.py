@@ -19,7 +19,9 @@ class Carrier:
     when they are due.
     """
 
-    def __init__(self, library: ctypes.CDLL, deadmen: int, counters: ctypes.Array[ctypes.c_int64], events: Ring) -> None:
+    def __init__(
+        self, library: ctypes.CDLL, deadmen: int, counters: ctypes.Array[ctypes.c_int64], events: Ring
+    ) -> None:
         """Raises MemoryError."""
         self._library = library
         self._keep = counters, events

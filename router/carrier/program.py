@@ -9,17 +9,15 @@ import ctypes
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from router.carrier import structures as c
+from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
 from router.compiler.program import STRANGER, Handler, Program, TargetPlan, source_label
 from router.net.udp import Listener
 from router.table.model import Framing
-
-if TYPE_CHECKING:
-    from router.carrier.schema import WireSchema
 
 
 class Names:
@@ -79,8 +77,9 @@ class NativeProgram:
     structure: c.Program = field(default_factory=c.Program)
 
 
-def native_program(program: Program, schema: WireSchema, generation: int, outlets: Outlets) -> NativeProgram:
-    """Make the arrays of a program; `generation` numbers the programs of the process."""
+def native_program(program: Program, generation: int, outlets: Outlets) -> NativeProgram:
+    """Make the arrays of a program; `generation` numbers the programs of the process. Raises CannotCarry."""
+    schema = wire_schema(program.envelope, program.inbound.keys())
     handlers = [handler for several in program.inbound.values() for handler in several]
     endpoints = list(program.table.endpoints)
     made = NativeProgram(generation, handlers, [*endpoints, source_label(STRANGER)], [schema])
@@ -90,7 +89,7 @@ def native_program(program: Program, schema: WireSchema, generation: int, outlet
         listener_count=len(program.listeners),
         case_count=len(program.envelope.cases),
         unknown_case=program.counters.index("unhandled", UNKNOWN_CASE),
-        schema=schema.address,
+        schema=ctypes.addressof(schema.schema),
         listeners=writer.array(c.Listener, writer.listeners()),
         cases=writer.array(c.Case, writer.cases()),
         routes=writer.array(c.Route, [writer.route(number, handler) for number, handler in enumerate(handlers)]),

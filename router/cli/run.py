@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     with Router(checked.program, ["--ros-args", *args.ros_args], environ) as router:
         tune_interpreter()
         del checked  # so that a reload can free it
-        with supervised(router.progress):
+        with supervised(router.progress, router.feed_watchdog):
             _serve_signals(router, ending)
         for number in ending:
             signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once

@@ -16,6 +16,7 @@ from rclpy.node import Node
 
 from router.compiler.program import TopicPlan
 from router.errors import SourceSpan, StartError
+from router.log import logger
 from router.ros.events import PeerEvents, WantedFlag
 from router.ros.node import RCL, RCL_ERRORS
 from router.ros.qos import publisher_qos, qos_profile, subscription_qos
@@ -25,6 +26,9 @@ from router.ros.types import checked_class
 _DISCOVERY_S, _POLL_S, _OTHERS_S = 0.5, 0.005, 0.1
 """The longest wait for peers of a new endpoint, the interval in which they are looked for, and the wait for further
 publishers after the first."""
+
+CLOSING_S = 1.0
+"""How long closing a publisher waits for the middleware."""
 
 _IN_TRANSIT_S = 0.005
 """Time in which the middleware passes a message to the second of two subscriptions."""
@@ -117,12 +121,21 @@ class Publication:
 
         return publish
 
-    def close(self) -> None:
-        """Wait for running calls of `publish`, and close. No thread may wait for its events."""
+    def close(self) -> bool:
+        """Close, unless a call of `publish` is stuck in the middleware; then return False, and it stays open.
+
+        Waits up to CLOSING_S for running calls. No thread may wait for its events.
+        """
         self._is_closed = True
-        while self._calls:
+        for _ in range(int(CLOSING_S / _POLL_S)):
+            if not self._calls:
+                break
             sleep(_POLL_S)
+        else:
+            logger.error("the middleware is stuck, and this publisher stays open", topic=self.plan.label)
+            return False
         self._open.close()
+        return True
 
 
 class Subscription:

@@ -51,12 +51,13 @@ class RouterNode:
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
+        self._is_stuck = False
         self._failed: Callable[[Exception], None] | None = None
         self._peers = PeerEvents(incompatible, subscriber_joined)
         self.subscribed: Collection[str] = self._peers.subscribed
         with ExitStack() as opening:
             self._node = open_node(node.name, node.namespace, ros_args)
-            opening.callback(close_node, self._node)
+            opening.callback(self._close_node)
             self.name = self._node.get_fully_qualified_name().removeprefix("/")
             self.topics = RosTopics(self._node)
             opening.callback(self._close_topics)
@@ -144,7 +145,7 @@ class RouterNode:
         if change.left or change.opened:
             self._events.stop()
             for opened in change.left:
-                opened.close()
+                self._close_one(opened)
             self._peers.forget_all_but(self._publications)
             self._events = self._event_thread()
             self._events.start()
@@ -177,7 +178,16 @@ class RouterNode:
         self._events.stop()
 
     def _close_topics(self) -> None:
-        for publication in self._publications.values():
-            publication.close()
-        for subscription in self._subscriptions.values():
-            subscription.close()
+        for each in (*self._publications.values(), *self._subscriptions.values()):
+            self._close_one(each)
+
+    def _close_one(self, endpoint: Publication | Subscription) -> None:
+        if isinstance(endpoint, Subscription):
+            endpoint.close()
+        elif not endpoint.close():
+            self._is_stuck = True
+
+    def _close_node(self) -> None:
+        """Close the node, unless a thread is in the middleware: that cannot be closed then."""
+        if not self._is_stuck:
+            close_node(self._node)
