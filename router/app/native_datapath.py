@@ -14,7 +14,7 @@ from functools import cache, partial
 from itertools import count
 from socket import inet_ntoa
 from struct import Struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from router.app.sockets import SocketChange
 from router.app.wiring import (
@@ -83,6 +83,7 @@ class NativeDatapath:
         self._context = context
         self._names = Names()
         self._generations = count(1)
+        context.counts.most = MOST_COUNTERS
         self._wiring: NativeWiring | None = None
         self._is_running = False
         report, failed = context.reporter.report, context.reporter.failed
@@ -90,18 +91,20 @@ class NativeDatapath:
         self._deadmen = Deadmen(library, self._native_counts(), braked, self._names)
         self._carrier = Carrier(library, self._deadmen.address, self._native_counts(), received)
         self._part_counts = {part: context.counts.add([]) for part in Part}
-        self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in _PARTS.items()}
+        self._workers = {
+            part: Worker(name, Ring(library, _QUEUE), self._part_counts[part], failed) for part, name in _PARTS.items()
+        }
         self._mirrored = MirrorRing(Ring(library, _QUEUE), self._names)
         mirror.drain_by(self._mirrored.take)
         self._events = EventThread(
             [received, braked], self._names, report, context.deadman_changed, self._why_rejected, self._carrier.pulse
         )
 
-    def _native_counts(self) -> list[int]:
-        """An array of counters that never moves. It is used like a list."""
+    def _native_counts(self) -> ctypes.Array[ctypes.c_int64]:
+        """An array of counters that never moves. The metrics use it like a list."""
         counts: Any = (ctypes.c_int64 * MOST_COUNTERS)()
         self._context.counts.add(counts)
-        return counts
+        return cast("ctypes.Array[ctypes.c_int64]", counts)
 
     @property
     def turns(self) -> int:
@@ -159,7 +162,7 @@ class NativeDatapath:
         outlets = Outlets(
             listeners=sockets.listeners,
             senders={endpoint: sender.address for endpoint, sender in senders.items()},
-            wanted=shared.wanted,
+            wanted={topic: each.wanted for topic, each in topics.publications.items()} if topics else {},
             feeds=lambda route, names: [(deadman.address, disarms) for deadman, disarms in feeds(route, names)],
             limit=partial(_limit, states[_ENDPOINTS]),
             carried=lambda handler: _targets(program, handler, None),
@@ -289,8 +292,8 @@ class NativeDatapath:
     def close(self) -> None:
         for deadman in self._wiring.deadmen.values() if self._wiring else ():
             deadman.end()
-        self._carrier.close()
         self._events.close()
+        self._carrier.close()
 
     def _why_rejected(self, listener: str, data: bytes, length: int) -> str:
         """Say in words why the carrier rejected a datagram, of which `data` may be the beginning."""

@@ -34,7 +34,7 @@ _REMEDY = "ListenDatagram= in rover-router.socket says something else than the t
 
 @contextmanager
 def supervised(
-    progress: Callable[[], int], feed: Callable[[int, int], bool] = lambda notify, interval: False
+    progress: Callable[[], int], feed: Callable[[int, int], bool] = lambda *_: False
 ) -> Iterator[None]:
     """Notify that the router is ready inside, and stops at the end.
 

@@ -10,12 +10,15 @@ from importlib.metadata import PackageNotFoundError, version
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from router.app.native_datapath import NativeDatapath
 from router.app.python_datapath import PythonDatapath
 from router.app.reloading import Reloader
 from router.app.runtime import Change, Runtime
 from router.app.timers import Timers
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
-from router.app.wiring import RouterContext, ThreadCounts
+from router.app.wiring import Datapath, RouterContext, ThreadCounts
+from router.carrier.library import chosen_library
+from router.carrier.schema import CannotCarry, wire_schema
 from router.clock import monotonic_ns
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
@@ -61,7 +64,7 @@ class Router:
         self._counts = ThreadCounts(program.counters)
         self.mirror = Mirror(MAX_DATAGRAM, self._observers_changed, self._reporter.failed)
         context = RouterContext(self._counts, Timers(self._reporter.failed), self._reporter, self._deadman_changed)
-        self._runtime = Runtime(context, ros_args, partial(PythonDatapath, context, self.mirror))
+        self._runtime = Runtime(context, ros_args, partial(_datapath, program, context, self.mirror))
         self._services = Services(self)
         self._reloader = Reloader(self._runtime, self._counts, environ, self._program_replaced)
         self._watcher: Watcher | None = None
@@ -213,6 +216,21 @@ class Router:
             "protos_sha256": program.protos_sha256,
         }
         return CountersCollector(program.counters, self._counts.lists, self._asked(), build)
+
+
+def _datapath(
+    program: Program, context: RouterContext, mirror: Mirror, subscribed: Callable[[], bool]
+) -> Datapath:
+    """The carrier where there is one that can take the program's messages, else Python. Raises StartError."""
+    library = chosen_library()
+    if library is not None:
+        try:
+            wire_schema(program.envelope, ())
+        except CannotCarry as error:
+            logger.warning("the carrier cannot take these messages, and Python serves them", why=str(error))
+        else:
+            return NativeDatapath(library, context, mirror)
+    return PythonDatapath(context, mirror, subscribed)
 
 
 def _version() -> str:

@@ -21,6 +21,7 @@ from router.engine.binding import EngineContext, State, TimerGroup
 from router.engine.deadman import CommandMaker, Deadman, FeedMaker
 from router.engine.dispatch import Take
 from router.engine.pacing import Pacer
+from router.errors import StartError
 from router.log import logger
 from router.net.udp import Listener, Sender
 from router.observe.reports import Reporter
@@ -41,12 +42,15 @@ class ThreadCounts:
 
     def __init__(self, counters: Counters) -> None:
         self.counters = counters
+        self.most: int | None = None
+        """The length of a list that cannot grow, if there is one."""
         self.lists = [counters.fresh_counts() for _ in range(9)]
         self.receive, self.ros, self.deadman, self.gateway_deadmen, self.pacing, self.collecting = self.lists[:6]
         self.gateways, self.events, self.own = self.lists[6:]
 
     def add(self, counts: list[int]) -> list[int]:
         """Count in another list too, which is returned."""
+        self.counters.grow(counts)
         self.lists.append(counts)
         return counts
 
@@ -56,7 +60,10 @@ class ThreadCounts:
         return sum(counts[index] for counts in self.lists for index in indexes)
 
     def make_room(self, counters: Counters) -> None:
-        """Add the counts of `counters`, which continue the present ones."""
+        """Add the counts of `counters`, which continue the present ones. Raises StartError."""
+        if self.most is not None and counters.size > self.most:
+            what = f"the table has {counters.size} counters, and the carrier has room for {self.most}"
+            raise StartError(f"{what}; with ROUTER_CARRIER=python there is no limit")
         present = dict(self.counters.series())
         new = [index for series, index in counters.series() if series not in present]
         for counts in self.lists:

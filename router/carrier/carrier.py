@@ -66,8 +66,12 @@ class Carrier:
         self._library.carrier_resume(self._carrier)
 
     def mirror(self, ring: Ring | None, lost: int) -> None:
-        """Write what is received to `ring` from now on. `lost` is the counter of what had no room there."""
-        self._library.carrier_mirror(self._carrier, ring.address if ring else None, lost)
+        """Write what is received to `ring` from now on. `lost` is the counter of what had no room there.
+
+        After `close`, nothing is received.
+        """
+        if self._carrier:
+            self._library.carrier_mirror(self._carrier, ring.address if ring else None, lost)
 
     def watchdog(self, notify: int, interval: int) -> None:
         """Feed a watchdog by a connected socket every `interval` ns, while receiving makes progress and `pulse` is

@@ -21,22 +21,26 @@ _RECORD = Struct("@IIQqqqIIIIII")
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What a worker calls while a program runs: functions by number of the handler.
+    """What a worker calls while a program runs: functions by number of the handler, with the indexes of what waits.
 
     `switch` is called once, before the first message of this program.
     """
 
     generation: int
-    functions: Mapping[int, ServePart]
+    functions: Mapping[int, tuple[ServePart, Sequence[int]]]
     sources: Sequence[str]
     switch: Callable[[], None]
 
 
 class Worker:
-    """Serves the messages of `ring` in a thread of its own. `failed` is called with what a function raises."""
+    """Serves the messages of `ring` in a thread of its own. `failed` is called with what a function raises.
 
-    def __init__(self, name: str, ring: Ring, failed: Callable[[Exception], None]) -> None:
+    `counts` belong to the thread, which takes off what waits what it has served.
+    """
+
+    def __init__(self, name: str, ring: Ring, counts: list[int], failed: Callable[[Exception], None]) -> None:
         self.ring = ring
+        self._counts = counts
         self._failed = failed
         self._stages: dict[int, Stage] = {}
         self._stage: Stage | None = None
@@ -67,8 +71,12 @@ class Worker:
 
     def wait_for(self, generation: int, timeout: float) -> bool:
         """Wait until the thread serves that generation. Return False after `timeout` s: it is stuck, or behind."""
+
+        def has_switched() -> bool:
+            return self._stage is not None and self._stage.generation >= generation
+
         with self._switched:
-            return self._switched.wait_for(lambda: self._stage and self._stage.generation >= generation, timeout)
+            return self._switched.wait_for(has_switched, timeout)
 
     def stop(self, timeout: float) -> bool:
         """Serve what waits, and end. Return False if that takes longer than `timeout` s: the thread is left."""
@@ -103,7 +111,7 @@ class Worker:
             del self._stages[earlier]
 
     def _serve(self, records: memoryview) -> None:
-        position, end, head = 0, len(records), _RECORD.size
+        counts, position, end, head = self._counts, 0, len(records), _RECORD.size
         stage = self._stage
         while position < end:
             (
@@ -124,13 +132,16 @@ class Worker:
                 self._switch(generation)
                 stage = self._stage
             assert stage is not None  # noqa: S101 - each generation is prepared before its first message
+            function, waiting = stage.functions[number]
             data = position + head
             payload = bytes(records[data + start : data + start + payload_length]) if is_single else None
             datagram = bytes(records[data : data + length])
             try:
-                stage.functions[number](payload, datagram, received_at, now, stage.sources[column], born)
+                function(payload, datagram, received_at, now, stage.sources[column], born)
             except Exception as error:  # noqa: BLE001 as above
                 self._failed(error)
+            for index in waiting:
+                counts[index] -= 1
             position += size
 
 

@@ -223,6 +223,11 @@ class Counters:
         self._size += length
         return self._size - length
 
+    @property
+    def size(self) -> int:
+        """The length of a list of counts."""
+        return self._size
+
     def series(self) -> Iterable[tuple[Series, int]]:
         """Return every series with its index, also those of earlier programs that have counted something."""
         return self._indexes.items()
@@ -232,8 +237,9 @@ class Counters:
         return [0] * self._size
 
     def grow(self, counts: list[int]) -> None:
-        """Extend the list of a thread that has counted in earlier counters, in place."""
-        counts.extend([0] * (self._size - len(counts)))
+        """Extend the list of a thread that has counted in earlier counters, in place, where it is shorter."""
+        if len(counts) < self._size:
+            counts.extend([0] * (self._size - len(counts)))
 
     def settle(self, threads: Iterable[list[int]]) -> None:
         """Free the indexes of series that are no longer current, given the lists of all threads.

@@ -178,8 +178,10 @@ class RouterNode:
         self._events.stop()
 
     def _close_topics(self) -> None:
-        for each in (*self._publications.values(), *self._subscriptions.values()):
-            self._close_one(each)
+        for publication in self._publications.values():
+            self._close_one(publication)
+        for subscription in self._subscriptions.values():
+            self._close_one(subscription)
 
     def _close_one(self, endpoint: Publication | Subscription) -> None:
         if isinstance(endpoint, Subscription):
