@@ -262,8 +262,7 @@ class NativeDatapath:
         native = self._wiring.native
         self._carrier.start(native)
         for worker in self._workers.values():
-            worker.start()
-            worker.advance(native.generation)
+            worker.start(native.generation)
         self._is_running = True
 
     def has_passed(self, wiring: Wiring) -> bool:

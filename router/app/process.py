@@ -33,9 +33,7 @@ _REMEDY = "ListenDatagram= in rover-router.socket says something else than the t
 
 
 @contextmanager
-def supervised(
-    progress: Callable[[], int], feed: Callable[[int, int], bool] = lambda *_: False
-) -> Iterator[None]:
+def supervised(progress: Callable[[], int], feed: Callable[[int, int], bool] = lambda *_: False) -> Iterator[None]:
     """Notify that the router is ready inside, and stops at the end.
 
     The service manager's watchdog is fed while `progress()` changes, which it has to do at least every half second. If
@@ -111,7 +109,7 @@ def _notify_socket() -> socket.socket | None:
         notifying.connect(f"\0{address[1:]}" if address.startswith("@") else address)
     except OSError as error:
         notifying.close()
-        logger.warning("the service manager cannot be reached", address=address, error=str(error))
+        logger.warning("the service manager cannot be notified", address=address, error=str(error))
         return None
     return notifying
 

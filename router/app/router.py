@@ -218,9 +218,7 @@ class Router:
         return CountersCollector(program.counters, self._counts.lists, self._asked(), build)
 
 
-def _datapath(
-    program: Program, context: RouterContext, mirror: Mirror, subscribed: Callable[[], bool]
-) -> Datapath:
+def _datapath(program: Program, context: RouterContext, mirror: Mirror, subscribed: Callable[[], bool]) -> Datapath:
     """The carrier where there is one that can take the program's messages, else Python. Raises StartError."""
     library = chosen_library()
     if library is not None:

@@ -61,7 +61,9 @@ class Worker:
         """Undo `prepare`, if nothing was received in that generation."""
         self._stages.pop(stage.generation, None)
 
-    def start(self) -> None:
+    def start(self, generation: int) -> None:
+        """Start the thread, with the first generation."""
+        self._latest = generation
         self._thread.start()
 
     def advance(self, generation: int) -> None:
@@ -88,11 +90,12 @@ class Worker:
 
     def _run(self) -> None:
         while True:
+            # Read before the ring: what is put there later is of this generation, or a later one.
             latest, is_stopping = self._latest, self._stopping
-            records = self.ring.take(0 if is_stopping else -1)
-            if records:
+            is_behind = self._stage is None or latest > self._stage.generation
+            if records := self.ring.take(0 if is_behind or is_stopping else -1):
                 self._serve(records)
-            elif self._stage is None or latest > self._stage.generation:
+            elif is_behind:
                 self._switch(latest)
             elif is_stopping:
                 return

@@ -13,12 +13,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import time
+from typing import Any
 from unittest.mock import ANY
 
 import pytest
 from structlog.testing import capture_logs
 
 from router.app import Router, reloading, watching
+from router.app.native_datapath import NativeDatapath
 from router.app.runtime import Runtime
 from router.app.watching import watched_files
 from router.app.wiring import ThreadCounts
@@ -163,13 +165,18 @@ def test_what_has_arrived_on_a_listener_that_goes_is_routed_before_it_goes(
     with site.router(PH) as router:
         site.write(PH, listen=both)
         assert router.reload().ok
-        finish = ReceiveThread.finish
+        finish, adopt = ReceiveThread.finish, NativeDatapath.adopt
 
         def finish_late(thread: ReceiveThread, listener: object) -> None:
             site.send(*map(numbered, range(50)), port=second)  # while nobody receives
             finish(thread, listener)  # type: ignore[arg-type]
 
+        def adopt_late(datapath: NativeDatapath, *change: Any) -> None:
+            site.send(*map(numbered, range(50)), port=second)
+            adopt(datapath, *change)
+
         monkeypatch.setattr(ReceiveThread, "finish", finish_late)
+        monkeypatch.setattr(NativeDatapath, "adopt", adopt_late)
         site.write(PH)
         assert router.reload().ok
         assert [site.basestation.recv(1000) for _ in range(50)] == [numbered(number) for number in range(50)]

@@ -13,12 +13,14 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from structlog.testing import capture_logs
 
 from router.app import Router
+from router.app.native_datapath import NativeDatapath
 from router.engine.dispatch import Receive
 from router.errors import StartError
 from router.net.receiver import ReceiveThread
@@ -149,14 +151,19 @@ def test_who_asks_for_a_recording_does_not_wait_for_the_disk(site: Site, monkeyp
 def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     router = Router(site.program(ROUTE))
     seen: list[bytes] = []
-    serve = ReceiveThread.serve
+    serve, adopt = ReceiveThread.serve, NativeDatapath.adopt
 
     def serve_late(thread: ReceiveThread, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
         if listeners:
             router.mirror.attach(lambda batch: seen.extend(data for _, _, _, data in batch))
         serve(thread, listeners, receive)
 
+    def adopt_late(datapath: NativeDatapath, *change: Any) -> None:
+        router.mirror.attach(lambda batch: seen.extend(data for _, _, _, data in batch))
+        adopt(datapath, *change)
+
     monkeypatch.setattr(ReceiveThread, "serve", serve_late)
+    monkeypatch.setattr(NativeDatapath, "adopt", adopt_late)
     with router:
         site.send(PH)
         assert site.basestation.recv(1000) == PH
