@@ -28,8 +28,9 @@ PYTEST = .venv/bin/python -m pytest -n 4 --dist loadfile
 test: setup  ## run the tests of the router but the slow ones; TESTS=tests/wire for some. Your tables: make validate
 	@$(ENV) $(PYTEST) -m "not slow" $(TESTS)
 
-test-all: setup  ## run every test: also browser, systemd, Prometheus, every ROS type, long properties
+test-all: setup  ## run every test, also the slow ones; those that start a router on both carriers
 	@$(ENV) HYPOTHESIS_PROFILE=full $(PYTEST) $(TESTS)
+	@$(ENV) ROUTER_CARRIER=python $(PYTEST) $(or $(TESTS),tests/acceptance tests/app)
 
 demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost link halts the rover
 	@$(ENV) .venv/bin/python -m demo

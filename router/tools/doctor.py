@@ -20,6 +20,7 @@ from router.table.model import RouteTable
 from router.table.units import duration
 from router.tools.doctor_checks import (
     CheckResult,
+    carrier,
     clock,
     endpoints,
     fine,
@@ -44,6 +45,7 @@ def examine(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResult]:
     if program is None:
         return
     running = health(program)
+    yield from carrier(variables)
     yield from ros(program)
     yield from interfaces(program)
     yield from ports(program, running=running is not None)
@@ -62,6 +64,7 @@ def before_start(path: Path, variables: Mapping[str, str]) -> Iterator[CheckResu
     checked = check_table(path, variables)
     yield from _table(checked)
     if checked.program is not None:
+        yield from carrier(variables)
         yield from ros(checked.program)
         yield from interfaces(checked.program)
         yield from ports(checked.program, running=False, with_listeners=False)

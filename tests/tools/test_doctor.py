@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from router.carrier.library import LibraryError
 from router.compiler import check_table
 from router.compiler.program import Program
 from router.tools import doctor_checks
@@ -20,6 +21,7 @@ from router.tools.doctor import before_start, examine, health
 from router.tools.doctor_checks import (
     CheckResult,
     Grade,
+    carrier,
     clock,
     endpoints,
     interfaces,
@@ -82,6 +84,26 @@ def test_a_sound_place_has_no_problem(table: Path) -> None:
     assert texts(found, Grade.PROBLEM) == []
     assert {finding.about for finding in found} >= {"table", "ports", "buffers", "clock", "endpoints", "router"}
     assert all(finding.remedy for finding in found if finding.grade is not Grade.FINE)
+
+
+def test_what_carries_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor_checks, "load", lambda: None)
+    assert gist(carrier({}), "up to date") == [(Grade.FINE, True)]
+    assert gist(carrier({"ROUTER_CARRIER": "native"}), "up to date") == [(Grade.FINE, True)]
+    assert gist(carrier({"ROUTER_CARRIER": "python"}), "Python, as ROUTER_CARRIER says") == [(Grade.FINE, True)]
+    assert gist(carrier({"ROUTER_CARRIER": "c"}), "ROUTER_CARRIER is 'c'") == [(Grade.PROBLEM, True)]
+
+
+def test_a_library_that_cannot_be_used_keeps_only_those_from_starting_who_asked_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def missing() -> None:
+        raise LibraryError("libcarrier.so was not built; run 'make setup'")
+
+    monkeypatch.setattr(doctor_checks, "load", missing)
+    [found], [asked_for] = carrier({}), carrier({"ROUTER_CARRIER": "native"})
+    assert (found.grade, asked_for.grade) == (Grade.WARNING, Grade.PROBLEM)
+    assert found.remedy == asked_for.remedy == "libcarrier.so was not built; run 'make setup'"
 
 
 @pytest.mark.parametrize("look", [examine, before_start])
