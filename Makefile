@@ -43,8 +43,9 @@ validate: setup  ## say what is wrong with the tables in routes/, and prove them
 	@$(ENV) .venv/bin/router validate routes/
 	@$(ENV) .venv/bin/router test --coverage routes/
 
-lint: setup  ## ruff and mypy
+lint: setup  ## ruff, mypy, and what the C compiler warns of
 	@.venv/bin/ruff check
+	@.venv/bin/python router/carrier/build.py --lint
 	@$(ENV) .venv/bin/mypy
 
 clean:  ## remove .venv and what tools left behind

@@ -3,12 +3,14 @@
 python router/carrier/build.py              compile it; `$CC` is the compiler, `cc` unless set
 python router/carrier/build.py --output F   to another file
 python router/carrier/build.py --check      exit with 0 if it is up to date, else with 1
+python router/carrier/build.py --lint       exit with 0 if the compiler has nothing to warn of
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import platform
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -29,6 +31,9 @@ _OPTIMIZED = (
 _LINKED = ("-Wl,-Bsymbolic", "-Wl,-z,defs", "-Wl,-z,relro", "-Wl,-z,now", "-Wl,-z,noexecstack")
 """All functions are exported, for ctypes; among themselves they need no symbol table."""
 
+WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Werror")
+"""For developers: other compilers than theirs may warn of more."""
+
 
 class BuildError(Exception):
     """There is no compiler, or it refuses the sources; says what it said."""
@@ -40,8 +45,11 @@ def sources() -> list[Path]:
 
 
 def checksum() -> str:
-    """The SHA-256 of all that the library is made of: sources, headers and this file. `carrier_checksum` returns it."""
-    digest = sha256()
+    """The SHA-256 of all that the library is made of: sources, headers, this file, and for which processor.
+
+    `carrier_checksum` returns it.
+    """
+    digest = sha256(platform.machine().encode())
     for path in [*sorted(NATIVE.glob("*.[ch]")), Path(__file__)]:
         content = path.read_bytes()
         digest.update(f"{path.name} {len(content)}\n".encode() + content)
@@ -81,11 +89,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Compile the carrier's library.")
     parser.add_argument("--output", type=Path, default=LIBRARY)
     parser.add_argument("--check", action="store_true", help="only say by the exit code whether it is up to date")
+    parser.add_argument("--lint", action="store_true", help="only compile, with warnings as errors")
     args = parser.parse_args()
     if args.check:
         return 0 if is_current(args.output) else 1
     try:
-        build(args.output)
+        if args.lint:
+            compile_c([*map(str, sources()), *WARNINGS, "-fsyntax-only"])
+        else:
+            build(args.output)
     except BuildError as error:
         print(f"build: {error}", file=sys.stderr)
         return 1
