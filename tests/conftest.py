@@ -1,4 +1,4 @@
-"""What holds for every test: a ROS domain of this run alone that never leaves the machine."""
+"""What holds for every test: a ROS domain of this run alone that never leaves the machine, and the carrier."""
 
 from __future__ import annotations
 
@@ -11,11 +11,16 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from router.carrier.build import build, is_current
 from tests.lanes import LANE
 
 # Before anything imports rclpy. Domains above 101 would use ports that the kernel gives to others.
 os.environ["ROS_DOMAIN_ID"] = str(1 + LANE)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+# Unless `make test-all` says otherwise, routers of tests run on the carrier: of the sources that there are now.
+if os.environ.setdefault("ROUTER_CARRIER", "native") == "native" and not is_current():
+    build()
 
 # The rover's table records what came before a deadman trips.
 _recordings = tempfile.TemporaryDirectory(prefix="recordings-")

@@ -105,7 +105,7 @@ def ship(packages: Path, proto: str) -> Path:
 def loaded(packages: Path) -> str:
     """What `chosen_library` says of the carrier in an installation, and what it logs."""
     script = "from router.carrier.library import chosen_library; print(chosen_library())"
-    environment = {**os.environ, "PYTHONPATH": str(packages)}
+    environment = {**os.environ, "PYTHONPATH": str(packages), "ROUTER_CARRIER": ""}
     return subprocess.check_output([sys.executable, "-c", script], env=environment, cwd=packages, text=True)
 
 
