@@ -66,6 +66,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
 
 STRUCTURES: Mapping[str, type[ctypes.Structure]] = {
     "change": structures.Change,
+    "deadman_destination": structures.DeadmanDestination,
     "destination": structures.Destination,
     "entry": structures.Entry,
     "feed": structures.Feed,

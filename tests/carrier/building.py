@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import ctypes
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from ctypes import c_bool, c_int, c_int64, c_void_p
 from pathlib import Path
 
 from router.carrier.build import NATIVE, build, compile_c, sources
 
 MEMORY = "address,undefined"
 RACES = "thread"
+
+
+_SEAMS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
+    "seam_limit_passes": (c_bool, (c_void_p, c_int64)),
+    "seam_lock": (None, (c_void_p,)),
+    "seam_next_due": (c_int64, (c_void_p,)),
+    "seam_set_reconnected": (None, (c_void_p, c_int64)),
+    "seam_timer": (c_int, (c_void_p,)),
+    "seam_timer_set_for": (c_int64, (c_void_p,)),
+    "seam_unlock": (None, (c_void_p,)),
+}
 
 
 def sanitizing(sanitizers: str) -> list[str]:
@@ -29,7 +42,26 @@ def sanitizer_variables() -> dict[str, str]:
     return {"LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0", "UBSAN_OPTIONS": "print_stacktrace=1"}
 
 
+def seams(output: Path) -> ctypes.CDLL:
+    """The functions of seams.c, in a library that is made as `output`."""
+    compile_c(["-shared", "-fPIC", str(Path(__file__).parent / "seams.c"), f"-I{NATIVE}", "-o", str(output)])
+    loaded = ctypes.CDLL(str(output))
+    for name, (returned, taken) in _SEAMS.items():
+        function = getattr(loaded, name)
+        function.restype, function.argtypes = returned, taken
+    return loaded
+
+
 def program(output: Path, main: Path, flags: Sequence[str], compiler: str | None = None) -> Path:
     """A program of `main` and all sources of the carrier. Raises BuildError."""
     compile_c([str(main), *map(str, sources()), f"-I{NATIVE}", *flags, "-o", str(output)], compiler)
     return output
+
+
+def run_program(name: str, folder: Path, *arguments: object, sanitizers: str = "") -> None:
+    """Make `programs/NAME.c` in `folder`, and run it. Fails if the program does, or a sanitizer finds something."""
+    flags = sanitizing(sanitizers) if sanitizers else ["-O2"]
+    main = Path(__file__).parent / "programs" / f"{name}.c"
+    made = program(folder / name, main, flags, "clang" if sanitizers else None)
+    done = subprocess.run([made, *map(str, arguments)], capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr

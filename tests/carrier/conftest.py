@@ -10,6 +10,7 @@ import pytest
 
 from router.carrier.build import LIBRARY, build, is_current
 from router.carrier.library import load
+from tests.carrier import building
 from tests.carrier.building import sanitized_library
 
 SANITIZED = "CARRIER_TESTED_WITH_SANITIZERS"
@@ -29,3 +30,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def library(built: Path) -> ctypes.CDLL:
     """It, loaded."""
     return load(built)
+
+
+@pytest.fixture(scope="session")
+def seams(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """What tests need beside it: see seams.c."""
+    return building.seams(tmp_path_factory.mktemp("carrier") / "seams.so")

@@ -1,4 +1,4 @@
-/* What tests look at in the structures of the carrier, and inline functions. Linked with the sources of the carrier. */
+/* What tests look at and change in the structures of the carrier, and inline functions. A library of its own. */
 #include "deadman.h"
 #include "limit.h"
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-from math import ceil
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from router.carrier import structures as c
 from router.engine.freshness import MEMORY, TOLERANCE, Freshness
-from router.engine.pacing import NS, RateLimit
-from tests.carrier.native import library
+from router.engine.pacing import RateLimit
 
 _MOST_BYTES = 4096
 """More than `struct freshness` has."""
@@ -26,16 +24,19 @@ spans = st.one_of(
 
 
 class Native:
-    def __init__(self) -> None:
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._library = library
         self._structure = ctypes.create_string_buffer(_MOST_BYTES)
 
     def born(self, stamp: int, received_at: int, now: int) -> int:
-        return int(library().freshness_born(self._structure, stamp, received_at, now))
+        return int(self._library.freshness_born(self._structure, stamp, received_at, now))
 
 
-@given(st.lists(st.tuples(spans.map(abs), spans, st.booleans(), spans), max_size=120))
-def test_the_age_of_messages_while_the_wall_clock_jumps(steps: list[tuple[int, int, bool, int]]) -> None:
-    python, native, now, ahead = Freshness(), Native(), 10**12, 10**18
+@given(steps=st.lists(st.tuples(spans.map(abs), spans, st.booleans(), spans), max_size=120))
+def test_the_age_of_messages_while_the_wall_clock_jumps(
+    library: ctypes.CDLL, steps: list[tuple[int, int, bool, int]]
+) -> None:
+    python, native, now, ahead = Freshness(), Native(library), 10**12, 10**18
     for passed, jump, jumps, age in steps:
         now = min(now + passed, 10**18)
         ahead = max(-(10**18), min(ahead + jump * jumps, 2 * 10**18))
@@ -43,9 +44,12 @@ def test_the_age_of_messages_while_the_wall_clock_jumps(steps: list[tuple[int, i
         assert native.born(received_at - age, received_at, now) == python.born(received_at - age, received_at, now)
 
 
-@given(st.lists(st.integers(1, 100).map(lambda ms: ms * 1_000_000), min_size=40, max_size=80), st.integers(0, 10**10))
-def test_more_jumps_than_are_remembered(ages: list[int], age: int) -> None:
-    python, native, now = Freshness(), Native(), 10**12
+@given(
+    ages=st.lists(st.integers(1, 100).map(lambda ms: ms * 1_000_000), min_size=40, max_size=80),
+    age=st.integers(0, 10**10),
+)
+def test_more_jumps_than_are_remembered(library: ctypes.CDLL, ages: list[int], age: int) -> None:
+    python, native, now = Freshness(), Native(library), 10**12
     for number, passed in enumerate(ages):
         now += passed
         received_at = now + number * TOLERANCE
@@ -56,11 +60,11 @@ def test_more_jumps_than_are_remembered(ages: list[int], age: int) -> None:
 @given(
     st.sampled_from([0.3, 1, 7, 50, 333.3, 10**6]), st.lists(st.integers(0, 400), max_size=100), st.integers(0, 10**18)
 )
-def test_limits_of_rates(hertz: float, gaps: list[int], began: int) -> None:
+def test_limits_of_rates(seams: ctypes.CDLL, hertz: float, gaps: list[int], began: int) -> None:
     """`gaps` are in percent of the period."""
     python = RateLimit(hertz)
-    period = ceil(NS / hertz)
+    period = RateLimit.period(hertz)
     native, now = c.Limit(period, period - period // 2, -period), began
     for gap in gaps:
         now += period * gap // 100
-        assert library().seam_limit_passes(ctypes.byref(native), now) == python.may_pass(now)
+        assert seams.seam_limit_passes(ctypes.byref(native), now) == python.may_pass(now)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import gc
 import os
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
+from functools import partial
 
 import pytest
 from hypothesis import given
@@ -17,15 +19,18 @@ from router.carrier.sender import NativeSender
 from router.net.udp import Sender
 from router.table import model
 from router.table.addresses import Address
-from tests.carrier.native import library
 from tests.namespaces import cable, computers
 from tests.net.test_udp import endpoint
 
 LONG_AGO, IN_THE_FUTURE = -(1 << 62), 1 << 62
 
 
-def native(endpoint: model.Endpoint) -> NativeSender:
-    return NativeSender(library(), endpoint)
+Make = Callable[[model.Endpoint], NativeSender]
+
+
+@pytest.fixture(scope="session")
+def native(library: ctypes.CDLL) -> Make:
+    return partial(NativeSender, library)
 
 
 @pytest.fixture
@@ -42,7 +47,9 @@ def board(stack: ExitStack) -> socket.socket:
     return board
 
 
-def sender_to(stack: ExitStack, board: socket.socket) -> NativeSender:
+@pytest.fixture
+def sender(stack: ExitStack, native: Make, board: socket.socket) -> NativeSender:
+    """It sends to the board."""
     return stack.enter_context(closing(native(endpoint("board", Address(*board.getsockname())))))
 
 
@@ -87,8 +94,8 @@ class Link:
         return received
 
 
-@given(st.lists(st.sampled_from(["send", "send", "send checked", "send too much", "toggle"]), max_size=30))
-def test_it_sends_and_fails_as_python_does(steps: list[str]) -> None:
+@given(steps=st.lists(st.sampled_from(["send", "send", "send checked", "send too much", "toggle"]), max_size=30))
+def test_it_sends_and_fails_as_python_does(native: Make, steps: list[str]) -> None:
     with ExitStack() as stack:
         links = [Link(stack, make) for make in (Sender, native)]
         for step in steps:
@@ -96,8 +103,7 @@ def test_it_sends_and_fails_as_python_does(steps: list[str]) -> None:
             assert carrier == python
 
 
-def test_a_full_buffer_is_an_error_and_nobody_waits(stack: ExitStack, board: socket.socket) -> None:
-    sender = sender_to(stack, board)
+def test_a_full_buffer_is_an_error_and_nobody_waits(stack: ExitStack, sender: NativeSender) -> None:
     blocking, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     stack.enter_context(blocking)
     stack.enter_context(other)
@@ -117,8 +123,7 @@ def disconnect(sender: Sender) -> None:
         os.dup2(unconnected.fileno(), sender.socket.fileno())
 
 
-def test_it_connects_again_to_the_same_descriptor(stack: ExitStack, board: socket.socket) -> None:
-    sender = sender_to(stack, board)
+def test_it_connects_again_to_the_same_descriptor(sender: NativeSender, board: socket.socket) -> None:
     number = sender.socket.fileno()
     disconnect(sender)
     assert sender.send(b"drive") == 5
@@ -128,19 +133,20 @@ def test_it_connects_again_to_the_same_descriptor(stack: ExitStack, board: socke
     assert not os.get_blocking(number)
 
 
-def test_it_connects_again_only_now_and_then(stack: ExitStack, board: socket.socket) -> None:
-    sender = sender_to(stack, board)
+def test_it_connects_again_only_now_and_then(sender: NativeSender, board: socket.socket, seams: ctypes.CDLL) -> None:
     disconnect(sender)
-    library().seam_set_reconnected(sender.address, IN_THE_FUTURE)
+    seams.seam_set_reconnected(sender.address, IN_THE_FUTURE)
     for _ in range(3):
         with pytest.raises(OSError, match=os.strerror(errno.EDESTADDRREQ)):
             sender.send(b"lost")
-    library().seam_set_reconnected(sender.address, LONG_AGO)
+    seams.seam_set_reconnected(sender.address, LONG_AGO)
     assert sender.send(b"drive") == 5
     assert board.recv(100) == b"drive"
 
 
-def test_it_gets_over_the_loss_of_its_address_and_of_the_network(stack: ExitStack) -> None:
+def test_it_gets_over_the_loss_of_its_address_and_of_the_network(
+    stack: ExitStack, native: Make, seams: ctypes.CDLL
+) -> None:
     rover, station = stack.enter_context(computers("rover", "station"))
     address = Address("10.78.1.2", 9000)
     unconnected = rover.inside(lambda: native(endpoint("board", address)))  # no network leads there yet
@@ -148,7 +154,7 @@ def test_it_gets_over_the_loss_of_its_address_and_of_the_network(stack: ExitStac
 
     def send(data: bytes) -> int | None:
         """From within: what replaces the socket is opened where the sender is. Return an errno, or None."""
-        library().seam_set_reconnected(sender.address, LONG_AGO)
+        seams.seam_set_reconnected(sender.address, LONG_AGO)
 
         def attempt() -> int | None:
             try:
@@ -173,7 +179,7 @@ def test_it_gets_over_the_loss_of_its_address_and_of_the_network(stack: ExitStac
     assert board.recvfrom(100) == (b"second", ("10.78.1.3", sender.socket.getsockname()[1]))
 
 
-def test_nothing_is_sent_after_the_end(stack: ExitStack, board: socket.socket) -> None:
+def test_nothing_is_sent_after_the_end(native: Make, board: socket.socket) -> None:
     sender = native(endpoint("board", Address(*board.getsockname())))
     send = sender.send
     sender.close()

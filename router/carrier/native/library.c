@@ -22,7 +22,7 @@ const struct structure_size *carrier_structure_sizes(void) {
         SIZE(wire_field),     SIZE(wire_type), SIZE(wire_schema), SIZE(limit), SIZE(feed),
         SIZE(destination),    SIZE(waiting),   SIZE(part),        SIZE(route), SIZE(entry),
         SIZE(payload_case),   SIZE(peer),      SIZE(listener),    SIZE(program), SIZE(change),
-        SIZE(message_record), SIZE(mirror_record), {NULL, 0},
+        SIZE(message_record), SIZE(mirror_record), SIZE(deadman_destination), {NULL, 0},
     };
     return sizes;
 }
