@@ -35,7 +35,7 @@ class Subject(AbstractContextManager["Subject"]):
 
     def __exit__(self, *_: object) -> None:
         """The whole family; a wrapper would leave its children behind."""
-        alive, deadline = self._pids(), time.monotonic() + STOP_SECONDS
+        alive, deadline = self.pids(), time.monotonic() + STOP_SECONDS
         for number in (signal.SIGTERM, signal.SIGKILL):
             for pid in alive:
                 with suppress(ProcessLookupError):
@@ -62,7 +62,7 @@ class Subject(AbstractContextManager["Subject"]):
 
     def cpu_ns(self) -> int:
         """CPU time of all living threads: schedstat counts ns where utime and stime count ticks."""
-        tasks = (path for pid in self._pids() for path in Path(f"/proc/{pid}/task").glob("*/schedstat"))
+        tasks = (path for pid in self.pids() for path in Path(f"/proc/{pid}/task").glob("*/schedstat"))
         return sum(int((read(path) or "0").split()[0]) for path in tasks)
 
     def kernel_drops(self) -> int:
@@ -70,11 +70,16 @@ class Subject(AbstractContextManager["Subject"]):
         return sum(int(row[-1]) for row in _sockets_on(self._port))
 
     def rss_mb(self) -> float:
-        lines = (line for pid in self._pids() for line in read(f"/proc/{pid}/smaps_rollup").splitlines())
+        lines = (line for pid in self.pids() for line in read(f"/proc/{pid}/smaps_rollup").splitlines())
         return sum(int(line.split()[1]) for line in lines if line.startswith("Rss:")) * 1024 / 1e6
 
-    def _pids(self) -> set[int]:
+    def pids(self) -> set[int]:
+        """The process that was started, and its descendants."""
         return family(self._process.pid, processes())
+
+    def sockets(self) -> set[str]:
+        """The sockets that listen on its first port, as links in /proc/PID/fd name them."""
+        return {f"socket:[{row[9]}]" for row in _sockets_on(self._port)}
 
 
 class Meter:
