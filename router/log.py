@@ -109,8 +109,16 @@ class FloodLog:
     _floods: dict[Hashable, _Flood] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def note(self, key: Hashable, emit: Emit, event: str, exc_info: BaseException | None = None, **values: Any) -> None:
-        """Log or count an event of the kind `key`. The first line has the traceback of `exc_info`."""
+    def note(
+        self,
+        key: Hashable,
+        emit: Emit,
+        event: str,
+        exc_info: BaseException | None = None,
+        times: int = 1,
+        **values: Any,
+    ) -> None:
+        """Log or count `times` events of the kind `key`. The first line has the traceback of `exc_info`."""
         now = self.clock_ns()
         with self._lock:
             flood = self._floods.get(key)
@@ -119,11 +127,11 @@ class FloodLog:
                 key, event, values = None, "events of many further kinds", {}
             if flood is not None:
                 flood.values = values
-                flood.pending += 1
+                flood.pending += times
                 if now - flood.last_line_ns >= SUMMARY_INTERVAL_NS:
                     _summarise(flood, now)
                 return
-            self._floods[key] = _Flood(emit, event, values, now)
+            self._floods[key] = _Flood(emit, event, values, now, times - 1)
         emit(event, exc_info=exc_info, **values)
 
     def flush(self, *, final: bool = False) -> None:

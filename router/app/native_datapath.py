@@ -14,7 +14,7 @@ from functools import cache, partial
 from itertools import count
 from socket import inet_ntoa
 from struct import Struct
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from router.app.sockets import SocketChange
 from router.app.wiring import (
@@ -88,27 +88,31 @@ class NativeDatapath:
         self._is_running = False
         report, failed = context.reporter.report, context.reporter.failed
         received, braked = Ring(library, _EVENTS), Ring(library, _EVENTS)
-        self._deadmen = Deadmen(library, self._native_counts(), braked, self._names)
-        self._carrier = Carrier(library, self._deadmen.address, self._native_counts(), received)
-        self._part_counts = {part: context.counts.add([]) for part in Part}
-        self._workers = {
-            part: Worker(name, Ring(library, _QUEUE), self._part_counts[part], failed) for part, name in _PARTS.items()
-        }
+        receive_counts, deadman_counts = _fixed_counts(), _fixed_counts()
+        self._deadmen = Deadmen(library, deadman_counts, braked, self._names)
+        self._carrier = Carrier(library, self._deadmen.address, receive_counts, received)
+        self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in _PARTS.items()}
+        context.counts.add(_as_list(deadman_counts))
+        context.counts.add(_as_list(receive_counts), self._carrier.counters)
+        for worker in self._workers.values():
+            context.counts.add(worker.counts, worker.copy_counts)
         self._mirrored = MirrorRing(Ring(library, _QUEUE), self._names)
         mirror.drain_by(self._mirrored.take)
         self._events = EventThread(
-            [received, braked], self._names, report, context.deadman_changed, self._why_rejected, self._carrier.pulse
+            [(received, _as_list(receive_counts)), (braked, _as_list(deadman_counts))],
+            self._names,
+            report,
+            context.deadman_changed,
+            self._why_rejected,
+            self._carrier.pulse,
         )
-
-    def _native_counts(self) -> ctypes.Array[ctypes.c_int64]:
-        """An array of counters that never moves. The metrics use it like a list."""
-        counts: Any = (ctypes.c_int64 * MOST_COUNTERS)()
-        self._context.counts.add(counts)
-        return cast("ctypes.Array[ctypes.c_int64]", counts)
 
     @property
     def turns(self) -> int:
         return self._carrier.turns
+
+    def open_listener(self, settings: model.Listener) -> Listener:
+        return Listener(settings, is_stamped=True)
 
     def open_sender(self, endpoint: model.Endpoint) -> NativeSender:
         return NativeSender(self._library, endpoint)
@@ -147,7 +151,7 @@ class NativeDatapath:
         shared = engine_context(program, context, topics, errors, send, command, pacers)
         outbound = OutboundEngine(program, replace(shared, counts=context.counts.ros, state=states[_ROS]))
         parts = {
-            part: PartEngine(program, replace(shared, counts=self._part_counts[part], state=states[user]), part)
+            part: PartEngine(program, replace(shared, counts=self._workers[part].counts, state=states[user]), part)
             for part, user in _PARTS.items()
         }
         functions = {part: engine.functions() for part, engine in parts.items()}
@@ -308,6 +312,16 @@ class NativeDatapath:
         except Rejected as rejected:
             return str(rejected)
         return case
+
+
+def _fixed_counts() -> ctypes.Array[ctypes.c_int64]:
+    """Counters that never move."""
+    return (ctypes.c_int64 * MOST_COUNTERS)()
+
+
+def _as_list(counts: ctypes.Array[ctypes.c_int64]) -> list[int]:
+    """An array as what it is used like: metrics only index and slice it."""
+    return cast("list[int]", counts)
 
 
 class MirrorRing:

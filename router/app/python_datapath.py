@@ -60,6 +60,9 @@ class PythonDatapath:
     def turns(self) -> int:
         return self._receiving.turns
 
+    def open_listener(self, settings: model.Listener) -> Listener:
+        return Listener(settings)
+
     def open_sender(self, endpoint: model.Endpoint) -> Sender:
         return Sender(endpoint)
 

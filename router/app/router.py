@@ -215,7 +215,7 @@ class Router:
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
         }
-        return CountersCollector(program.counters, self._counts.lists, self._asked(), build)
+        return CountersCollector(program.counters, self._counts.copies, self._asked(), build)
 
 
 def _datapath(program: Program, context: RouterContext, mirror: Mirror, subscribed: Callable[[], bool]) -> Datapath:

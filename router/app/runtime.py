@@ -47,7 +47,7 @@ class Runtime:
         self.wiring: Wiring | None = None
         self.datapath = datapath(self._is_subscribed)
         self.drops = KernelDrops()
-        self.sockets = Sockets(self.drops, self.datapath.open_sender)
+        self.sockets = Sockets(self.drops, self.datapath.open_listener, self.datapath.open_sender)
         self.gateways: GatewayThread | None = None
         self._context = context
         self._ros_args = ros_args

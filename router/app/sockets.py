@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from router.compiler.program import Program
 from router.net.kernel import interface_is_up
 from router.net.udp import Listener, Sender
+from router.table import model
 from router.table.addresses import Address
-from router.table.model import Endpoint
 
 
 @dataclass(slots=True)
@@ -60,10 +60,16 @@ class KernelDrops:
 class Sockets:
     """Open listeners by name, and senders by endpoint; none before the first change is applied.
 
-    `open_sender` opens a socket to an endpoint, or raises StartError.
+    `open_listener` and `open_sender` open a socket, or raise StartError.
     """
 
-    def __init__(self, drops: KernelDrops, open_sender: Callable[[Endpoint], Sender]) -> None:
+    def __init__(
+        self,
+        drops: KernelDrops,
+        open_listener: Callable[[model.Listener], Listener],
+        open_sender: Callable[[model.Endpoint], Sender],
+    ) -> None:
+        self._open_listener = open_listener
         self._open_sender = open_sender
         self.listeners: dict[str, Listener] = {}
         self._bound: dict[str, Listener] = {}  # by the address and interface in the table
@@ -77,7 +83,7 @@ class Sockets:
             for plan in program.listeners:
                 listener = self._bound.get(plan.bound_to)
                 if listener is None or is_replaceable(listener):
-                    listener = Listener(plan)
+                    listener = self._open_listener(plan)
                     opening.callback(listener.close)
                 listeners[plan.name] = listener
             senders = {}

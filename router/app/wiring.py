@@ -44,15 +44,23 @@ class ThreadCounts:
         self.counters = counters
         self.most: int | None = None
         """The length of a list that cannot grow, if there is one."""
-        self.lists = [counters.fresh_counts() for _ in range(9)]
+        self.lists: list[list[int]] = []
+        self._copies: list[Callable[[int], list[int]]] = []
+        for _ in range(9):
+            self.add(counters.fresh_counts())
         self.receive, self.ros, self.deadman, self.gateway_deadmen, self.pacing, self.collecting = self.lists[:6]
         self.gateways, self.events, self.own = self.lists[6:]
 
-    def add(self, counts: list[int]) -> list[int]:
-        """Count in another list too, which is returned."""
+    def add(self, counts: list[int], copy: Callable[[int], list[int]] | None = None) -> None:
+        """Count in another list too. `copy(size)` returns its beginning at a time at which it balances."""
         self.counters.grow(counts)
         self.lists.append(counts)
-        return counts
+        self._copies.append(copy or (lambda size: counts[:size]))
+
+    def copies(self) -> list[list[int]]:
+        """Return what was counted, each list at one instant: between two messages, as far as that is known."""
+        size = self.counters.size
+        return [copy(size) for copy in self._copies]
 
     def total(self, metric: str) -> int:
         """The sum of a counter over all its labels."""
@@ -167,6 +175,9 @@ class Datapath(Protocol):
     @property
     def turns(self) -> int:
         """A number that grows unless the thread that receives is stuck, even if nothing comes."""
+
+    def open_listener(self, settings: model.Listener) -> Listener:
+        """Bind a socket. Raises StartError."""
 
     def open_sender(self, endpoint: model.Endpoint) -> Sender:
         """Open a socket to an endpoint. Raises StartError."""

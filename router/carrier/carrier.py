@@ -24,7 +24,7 @@ class Carrier:
     ) -> None:
         """Raises MemoryError."""
         self._library = library
-        self._keep = counters, events
+        self._counters, self._events = counters, events
         self._carrier: int = library.carrier_open(deadmen, counters, events.address)
         self._running: tuple[object, ...] = ()
         if not self._carrier:
@@ -34,6 +34,14 @@ class Carrier:
     def turns(self) -> int:
         """A number that grows at least every 50 ms unless the receive thread is stuck."""
         return int(self._library.carrier_turns(self._carrier)) if self._carrier else 0
+
+    def counters(self, count: int) -> list[int]:
+        """Return the first counters, as they are between two datagrams."""
+        if not self._carrier:
+            return list(self._counters[:count])
+        copy = (ctypes.c_int64 * count)()
+        self._library.carrier_counters(self._carrier, copy, count)
+        return list(copy)
 
     def start(self, program: NativeProgram) -> None:
         """Start the threads. Raises StartError."""

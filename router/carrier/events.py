@@ -6,6 +6,7 @@ import os
 import select
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from socket import inet_ntoa
 from struct import Struct
 
@@ -32,7 +33,7 @@ _REASONS = tuple(REJECT_REASONS)
 _HEAD = Struct("@II")
 _DEADMAN = Struct("@IIIIiI")
 _REJECT = Struct("@IIIIIIII")
-_LOSS = Struct("@IIIIIi")
+_LOSS = Struct("@IIIIIiII")
 
 _PULSE_MS = 5000
 
@@ -40,13 +41,14 @@ _PULSE_MS = 5000
 class EventThread:
     """Reads the events of `rings`, and calls `pulse` every few seconds to say that Python is alive.
 
-    `report` gets losses, `changed` a route and whether its deadman has tripped. `detail(listener, data, length)`
-    returns in words why a datagram was rejected.
+    Each ring comes with the counters of those who write to it. Of many losses of a kind, few are events; by the counter
+    that an event names, `report` is told of all of them. `changed` gets a route and whether its deadman has tripped.
+    `detail(listener, data, length)` returns in words why a datagram was rejected.
     """
 
     def __init__(
         self,
-        rings: Sequence[Ring],
+        rings: Sequence[tuple[Ring, Sequence[int]]],
         names: Names,
         report: Callable[[Report], None],
         changed: Callable[[str, bool], None],
@@ -60,7 +62,9 @@ class EventThread:
         self._detail = detail
         self._pulse = pulse
         self._stopping = False
-        self._wakes = [ring.watch() for ring in rings]
+        self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in rings]
+        """By ring and counter: how much of it was reported, and the last report."""
+        self._wakes = [ring.watch() for ring, _ in rings]
         self._thread = threading.Thread(target=self._run, name="carrier events", daemon=True)
         self._thread.start()
 
@@ -82,29 +86,50 @@ class EventThread:
         self._read()
 
     def _read(self) -> None:
-        for ring in self._rings:
+        for (ring, counters), last in zip(self._rings, self._last, strict=True):
             while records := ring.take():
                 position = 0
                 while position < len(records):
                     size, kind = _HEAD.unpack_from(records, position)
-                    self._tell(kind, records[position : position + size])
+                    self._tell(kind, records[position : position + size], counters, last)
                     position += size
+            for counter, (_, report) in list(last.items()):  # those for which no event was written
+                self._count(counter, report, counters, last)
 
-    def _tell(self, kind: int, record: memoryview) -> None:
-        if kind == _REJECTED:
-            _, _, listener, reason, address, port, length, _ = _REJECT.unpack_from(record)
+    def _tell(
+        self, kind: int, record: memoryview, counters: Sequence[int], last: dict[int, tuple[int, Report]]
+    ) -> None:
+        if kind in {_TRIPPED, _RELEASED}:
+            _, _, route, _, _, _ = _DEADMAN.unpack_from(record)
+            self._changed(self._name(route), kind == _TRIPPED)
+        elif kind == _REJECTED:
+            _, _, listener, reason, address, port, length, counter = _REJECT.unpack_from(record)
             place, data = self._name(listener), bytes(record[_REJECT.size : _REJECT.size + length])
             sender = f"from {inet_ntoa(address.to_bytes(4, 'big'))}:{port}"
             what = self._detail(place, data, length)
-            self._report(Report("reject", place, "", _REASONS[reason], None, f"{sender}: {what}" if what else sender))
+            detail = f"{sender}: {what}" if what else sender
+            self._count(counter, Report("reject", place, "", _REASONS[reason], None, detail), counters, last)
         elif kind == _LOST:
-            _, _, route, target, loss, number = _LOSS.unpack_from(record)
-            error = OSError(number, os.strerror(number)) if number else None
-            self._report(Report("drop", self._name(route), self._name(target), _LOSSES[loss], error))
+            _, _, route, target, loss, number, counter, _ = _LOSS.unpack_from(record)
+            lost = Report("drop", self._name(route), self._name(target), _LOSSES[loss], _error(number))
+            self._count(counter, lost, counters, last)
         else:
-            _, _, route, target, number, _ = _DEADMAN.unpack_from(record)
-            if kind == _DEADMAN_ERROR:
-                error = OSError(number, os.strerror(number))
-                self._report(Report("deadman", self._name(route), self._name(target), "send_error", error))
-            else:
-                self._changed(self._name(route), kind == _TRIPPED)
+            _, _, route, target, number, counter = _DEADMAN.unpack_from(record)
+            failed = Report("deadman", self._name(route), self._name(target), "send_error", _error(number))
+            self._count(counter, failed, counters, last)
+
+    def _count(
+        self, counter: int, report: Report, counters: Sequence[int], last: dict[int, tuple[int, Report]]
+    ) -> None:
+        """Report what was counted since the last report by this counter."""
+        total = counters[counter]
+        reported = last[counter][0] if counter in last else total - 1  # at least the one of this event
+        if total < reported:  # the counter has gone with a table, and stands for something else
+            reported = 0
+        last[counter] = total, report
+        if total > reported:
+            self._report(replace(report, times=total - reported))
+
+
+def _error(number: int) -> OSError | None:
+    return OSError(number, os.strerror(number)) if number else None

@@ -24,6 +24,7 @@ NATIVE, PYTHON = "native", "python"
 FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "carrier_change": (None, (c_void_p, c_void_p)),
     "carrier_close": (None, (c_void_p,)),
+    "carrier_counters": (c_bool, (c_void_p, c_void_p, c_uint32)),
     "carrier_mirror": (None, (c_void_p, c_void_p, c_uint32)),
     "carrier_open": (c_void_p, (c_void_p, c_void_p, c_void_p)),
     "carrier_pulse": (None, (c_void_p,)),

@@ -10,10 +10,13 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from struct import Struct
+from time import sleep
 
 from router.carrier.ring import Ring
 from router.engine.dispatch import ServePart
 from router.log import logger
+
+_TRIES, _TRY_S = 100, 0.0002
 
 _RECORD = Struct("@IIQqqqIIIIII")
 """`struct message_record`."""
@@ -38,9 +41,10 @@ class Worker:
     `counts` belong to the thread, which takes off what waits what it has served.
     """
 
-    def __init__(self, name: str, ring: Ring, counts: list[int], failed: Callable[[Exception], None]) -> None:
+    def __init__(self, name: str, ring: Ring, failed: Callable[[Exception], None]) -> None:
         self.ring = ring
-        self._counts = counts
+        self.counts: list[int] = []
+        self._edition = 0  # odd while a message is served
         self._failed = failed
         self._stages: dict[int, Stage] = {}
         self._stage: Stage | None = None
@@ -52,6 +56,16 @@ class Worker:
     @property
     def name(self) -> str:
         return self._thread.name
+
+    def copy_counts(self, size: int) -> list[int]:
+        """Return the first counts as they are between two messages, unless the thread is stuck in one."""
+        for _ in range(_TRIES):
+            edition = self._edition
+            copy = self.counts[:size]
+            if edition % 2 == 0 and edition == self._edition:
+                break
+            sleep(_TRY_S)
+        return copy
 
     def prepare(self, stage: Stage) -> None:
         """Have messages of the stage's generation served by it. To be called before there are any."""
@@ -114,7 +128,7 @@ class Worker:
             del self._stages[earlier]
 
     def _serve(self, records: memoryview) -> None:
-        counts, position, end, head = self._counts, 0, len(records), _RECORD.size
+        counts, position, end, head = self.counts, 0, len(records), _RECORD.size
         stage = self._stage
         while position < end:
             (
@@ -139,12 +153,14 @@ class Worker:
             data = position + head
             payload = bytes(records[data + start : data + start + payload_length]) if is_single else None
             datagram = bytes(records[data : data + length])
+            self._edition += 1
             try:
                 function(payload, datagram, received_at, now, stage.sources[column], born)
             except Exception as error:  # noqa: BLE001 as above
                 self._failed(error)
             for index in waiting:
                 counts[index] -= 1
+            self._edition += 1
             position += size
 
 

@@ -45,7 +45,8 @@ class Stale(Exception):
 class Report:
     """A loss. `kind` is `drop` (of one target), `reject` (of a whole datagram) or `deadman` (of its own datagram).
 
-    `place` is the listener for a reject, else the route; `target` is empty for a reject.
+    `place` is the listener for a reject, else the route; `target` is empty for a reject. `times` is how many such
+    losses there were since the last report of them.
     """
 
     kind: str
@@ -54,6 +55,7 @@ class Report:
     reason: str
     error: BaseException | None = None
     detail: str = ""
+    times: int = 1
 
 
 class Outcome:

@@ -91,15 +91,18 @@ class Listener:
     """A bound socket: the inherited one with this address and interface if there is one, else a new one.
 
     Raises StartError with the position in the table and a remedy. Datagrams that are not received from an inherited
-    socket wait for the next process, and its kernel drops may be older than this process.
+    socket wait for the next process, and its kernel drops may be older than this process. `is_stamped`: each datagram
+    comes with the time at which the kernel got it; else `arrived_at` returns that of the last one.
     """
 
-    def __init__(self, settings: model.Listener) -> None:
+    def __init__(self, settings: model.Listener, *, is_stamped: bool = False) -> None:
         self._settings = settings
         handed_over = inherited().take(settings.bound_to)
         self.is_inherited = handed_over is not None
         self.socket = handed_over or socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
+            if is_stamped:
+                self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             if handed_over is None:
                 if settings.interface is not None:
                     self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, settings.interface.encode())

@@ -28,19 +28,19 @@ Asked = Callable[[], Iterable[tuple[Sequence[str], float]]]
 class CountersCollector(Collector):
     """All series of the counters, each from its first scrape on, at 0 while nothing has happened.
 
-    `counts` has the list of each thread that counts: a counter or level is their sum, a number or time their largest.
+    `counts()` copies the list of each thread that counts: a counter or level is their sum, a number or time the
+    largest.
     `asked` has functions that are called at each scrape instead, by metric. `build`: the labels of `router_build_info`.
     """
 
     def __init__(
         self,
         counters: Counters,
-        counts: Sequence[list[int]],
+        counts: Callable[[], Sequence[Sequence[int]]],
         asked: Mapping[str, Asked],
         build: Mapping[str, str],
     ) -> None:
         self._counts = counts
-        self._size = counters.size
         self._asked = asked
         self._build = InfoMetricFamily(f"{PREFIX}build", "What is running.", dict(build))
         self._indexes: dict[str, list[tuple[dict[str, str], int]]] = {metric.name: [] for metric in METRICS}
@@ -50,15 +50,14 @@ class CountersCollector(Collector):
                 self._indexes[series.metric].append((labels, index))
 
     def collect(self) -> Iterator[Family]:
-        # At one instant each, as far as Python counts: slicing holds the interpreter lock.
-        threads = [counts[: self._size] for counts in self._counts]
+        threads = self._counts()
         for metric in METRICS:
             family = Family(PREFIX + metric.name, metric.help, _EXPORTED_AS.get(metric.kind, metric.kind))
             family.samples = _with_rests(self._samples(metric, threads))  # type: ignore[assignment]  # read once, in order
             yield family
         yield self._build
 
-    def _samples(self, metric: Metric, threads: Sequence[list[int]]) -> Iterator[Sample]:
+    def _samples(self, metric: Metric, threads: Sequence[Sequence[int]]) -> Iterator[Sample]:
         name = PREFIX + metric.name
         suffix = "_total" if metric.kind == "counter" else ""
         if metric.name in self._asked:
@@ -88,7 +87,7 @@ def _with_rests(samples: Iterator[Sample]) -> Iterator[Sample]:
         yield sample
 
 
-def _histogram(name: str, labels: dict[str, str], threads: Iterable[list[int]]) -> Iterator[Sample]:
+def _histogram(name: str, labels: dict[str, str], threads: Iterable[Sequence[int]]) -> Iterator[Sample]:
     *parts, sum_ns = map(sum, zip(*threads, strict=True))
     cumulative = list(accumulate(parts))
     for bound, count in zip(_BOUNDS, cumulative, strict=True):

@@ -162,12 +162,12 @@ class Site:
         return {name: datagrams for name, datagrams in found.items() if datagrams}
 
     def scrape(self) -> Counter[str]:
-        """All counters of the router, without the prefix `router_` and the suffix `_total`."""
+        """All counters of the router and what waits, without the prefix `router_` and the suffix `_total`."""
         return Counter(
             {
                 name.replace("_total{", "{"): int(value)
                 for name, value in self.samples().items()
-                if "_total{" in name or name.startswith(SERVED)
+                if "_total{" in name or name.startswith((SERVED, "messages_waiting{"))
             }
         )
 
@@ -195,7 +195,8 @@ class Site:
             now = self.changes(before)
             received, lost = total(now, "datagrams_received"), total(now, "kernel_drops")
             finished = total(now, "datagrams_rejected") + total(now, SERVED)
-            return received + lost >= datagrams and finished == received + messages
+            waiting = total(now, "messages_waiting")
+            return received + lost >= datagrams and finished == received + messages and not waiting
 
         wait_until(done, "the last datagram")
         return Counter({name: count for name, count in now.items() if not name.startswith(SERVED)})

@@ -53,7 +53,7 @@ class FakeRunning:
             metric: lambda: ()
             for metric in ("gateway_client_lag_seconds", "gateway_client_sent", "gateway_client_dropped")
         }
-        return CountersCollector(self.program.counters, [self.counts], asked, {"version": "1"}).collect()
+        return CountersCollector(self.program.counters, lambda: [self.counts], asked, {"version": "1"}).collect()
 
     def progress(self) -> int:
         self._turns += not self.is_stuck

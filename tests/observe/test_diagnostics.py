@@ -56,7 +56,7 @@ class Counting:
 
     def __post_init__(self) -> None:
         drops = {"kernel_drops": lambda: [(["rover"], self.kernel_drops)]}
-        self._collector = CountersCollector(self.program.counters, [self.counts], drops, {})
+        self._collector = CountersCollector(self.program.counters, lambda: [self.counts], drops, {})
         self.watch = Watch(cast("Running", self))
         self.add(1, "config_last_reload_successful")
 

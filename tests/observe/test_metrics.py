@@ -72,7 +72,9 @@ def scraped(monkeypatch: pytest.MonkeyPatch) -> Iterator[Scraped]:
     }
     threads = [counters.fresh_counts(), counters.fresh_counts()]
     result = Scraped(indexes, threads, 0, LOOPBACK)
-    collector = CountersCollector(counters, threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD)
+    collector = CountersCollector(
+        counters, lambda: threads, {"kernel_drops": lambda: [(["rover"], result.drops)]}, BUILD
+    )
     with closing(HttpServer(LOOPBACK, SPAN, cast("Running", collector), None)) as server:
         result.address = server.address
         yield result
@@ -134,4 +136,4 @@ def test_an_address_in_use_is_refused_with_who_has_it() -> None:
     with socket.create_server(LOOPBACK) as other:
         taken = Address(*other.getsockname())
         with pytest.raises(StartError, match=rf"rover.yaml:8:20: metrics cannot be served at {taken}: .*\(pid \d+\)"):
-            HttpServer(taken, SPAN, cast("Running", CountersCollector(Counters(), [[]], {}, BUILD)), None)
+            HttpServer(taken, SPAN, cast("Running", CountersCollector(Counters(), lambda: [[]], {}, BUILD)), None)

@@ -109,6 +109,10 @@ void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval) {
     eventfd_write(carrier->wake, 1);
 }
 
+bool carrier_counters(struct carrier *carrier, int64_t *to, uint32_t count) {
+    return counters_copy(&carrier->edition, carrier->counters, to, count);
+}
+
 void carrier_stop_receiving(struct carrier *carrier) {
     if (!carrier->has_started || carrier->has_stopped) return;
     atomic_store(&carrier->is_stopping, true);

@@ -159,6 +159,9 @@ void carrier_pulse(struct carrier *carrier);
 /* A number that grows at least every 50 ms unless the receive thread is stuck. */
 uint64_t carrier_turns(struct carrier *carrier);
 
+/* Copy the first counters of the receive thread as in `counters_copy`. */
+bool carrier_counters(struct carrier *carrier, int64_t *to, uint32_t count);
+
 /* Handle what the kernel holds, and end the receive thread; then `carrier_close` ends the timer thread too. */
 void carrier_stop_receiving(struct carrier *carrier);
 void carrier_close(struct carrier *carrier);

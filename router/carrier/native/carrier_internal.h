@@ -17,6 +17,7 @@ struct carrier {
     uint32_t mirror_lost; /* counter */
     int epoll;
     /* Shared: */
+    edition edition; /* of the counters */
     _Atomic(struct ring *) mirror;
     _Atomic(const struct change *) next, adopted;
     _Atomic bool is_held, is_stopping, is_closing;

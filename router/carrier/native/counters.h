@@ -2,7 +2,9 @@
 #ifndef COUNTERS_H
 #define COUNTERS_H
 
+#include <sched.h>
 #include <stdatomic.h>
+#include <stdbool.h>
 #include <stdint.h>
 
 typedef _Atomic int64_t counter;
@@ -15,6 +17,30 @@ static inline void counter_add(counter *counters, uint32_t index, int64_t amount
 
 static inline void counter_set(counter *counters, uint32_t index, int64_t value) {
     atomic_store_explicit(&counters[index], value, memory_order_relaxed);
+}
+
+/* Which state the counters of a thread are in: odd while it handles a message, whose counters belong together. */
+typedef _Atomic uint64_t edition;
+
+static inline void edition_begin(edition *of) {
+    atomic_fetch_add_explicit(of, 1, memory_order_relaxed);
+    atomic_thread_fence(memory_order_release);
+}
+
+static inline void edition_end(edition *of) { atomic_fetch_add_explicit(of, 1, memory_order_release); }
+
+/* Copy counters as they are between two messages, so that they balance. Return false if there was no such moment in
+ * many tries: the copy then shows a message that is being handled. */
+static inline bool counters_copy(edition *of, counter *counters, int64_t *to, uint32_t count) {
+    for (int tries = 1000; tries; tries--) {
+        uint64_t before = atomic_load_explicit(of, memory_order_acquire);
+        for (uint32_t index = 0; index < count; index++)
+            to[index] = atomic_load_explicit(&counters[index], memory_order_relaxed);
+        atomic_thread_fence(memory_order_acquire);
+        if (before % 2 == 0 && atomic_load_explicit(of, memory_order_relaxed) == before) return true;
+        sched_yield();
+    }
+    return false;
 }
 
 #endif

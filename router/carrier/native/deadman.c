@@ -62,9 +62,10 @@ void deadmen_close(struct deadmen *deadmen) {
 
 /* What follows, up to the public functions, is called with the lock held. */
 
-static void report(struct deadmen *deadmen, enum event_kind kind, const struct deadman *deadman, uint32_t destination,
-                   int error) {
-    struct deadman_event event = {sizeof event, kind, deadman->id, destination, error, 0}, oldest;
+static void report(struct deadmen *deadmen, enum event_kind kind, const struct deadman *deadman,
+                   const struct deadman_destination *to, int error) {
+    struct deadman_event event = {sizeof event, kind, deadman->id, to ? to->id : 0, error, to ? to->send_errors : 0};
+    struct deadman_event oldest;
     if (!deadmen->events) return;
     while (!ring_put(deadmen->events, &event, sizeof event)) ring_drop(deadmen->events, &oldest, sizeof oldest);
 }
@@ -101,7 +102,7 @@ static uint64_t send_all(struct deadmen *deadmen, const struct deadman *deadman)
         const struct deadman_destination *to = &deadman->destinations[index];
         int error = sender_send_checked(to->sender, to->datagram, to->size);
         counter_add(deadmen->counters, error ? to->send_errors : to->sent, 1);
-        if (error) report(deadmen, EVENT_DEADMAN_ERROR, deadman, to->id, error);
+        if (error) report(deadmen, EVENT_DEADMAN_ERROR, deadman, to, error);
         else if (index < MOST_REACHED) reached |= (uint64_t)1 << index;
     }
     return reached;
@@ -111,7 +112,7 @@ static void release(struct deadmen *deadmen, struct deadman *deadman) {
     if (!deadman->has_tripped) return;
     deadman->has_tripped = false;
     counter_set(deadmen->counters, deadman->active, 0);
-    report(deadmen, EVENT_RELEASED, deadman, 0, 0);
+    report(deadmen, EVENT_RELEASED, deadman, NULL, 0);
 }
 
 static void feed_one(struct deadmen *deadmen, const struct feed *feed, int64_t now) {
@@ -132,7 +133,7 @@ static void serve_one(struct deadmen *deadmen, struct deadman *deadman, int64_t 
     counter_set(deadmen->counters, deadman->active, 1);
     counter_add(deadmen->counters, deadman->trips, 1);
     send_all(deadmen, deadman);
-    report(deadmen, EVENT_TRIPPED, deadman, 0, 0);
+    report(deadmen, EVENT_TRIPPED, deadman, NULL, 0);
 }
 
 static bool sends_to(const struct deadman *deadman, const struct sender *sender) {

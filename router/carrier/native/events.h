@@ -1,5 +1,6 @@
 /* What native threads tell Python for its log, as records of a ring. Each begins with `size` and `kind`. Ids stand for
- * names that Python knows. At most so many are written per window of time; counters count everything. */
+ * names that Python knows. At most so many are written per window of time: Python reads in the counter that an event
+ * names how many there were. */
 #ifndef EVENTS_H
 #define EVENTS_H
 
@@ -11,7 +12,7 @@ struct deadman_event {
     uint32_t size, kind;           /* EVENT_TRIPPED, EVENT_RELEASED or EVENT_DEADMAN_ERROR */
     uint32_t deadman, destination; /* `destination` only of an error */
     int32_t error;                 /* errno */
-    uint32_t reserved;
+    uint32_t counter;              /* of such errors */
 };
 
 struct rejected_event {
@@ -19,7 +20,7 @@ struct rejected_event {
     uint32_t listener, reason; /* enum reason */
     uint32_t address, port;   /* of the sender, host byte order */
     uint32_t length;          /* of the datagram */
-    uint32_t reserved;
+    uint32_t counter;         /* of such rejections */
 };
 
 struct lost_event {
@@ -27,6 +28,8 @@ struct lost_event {
     uint32_t route, target;
     uint32_t reason;     /* enum loss */
     int32_t error;       /* errno, of LOSS_SEND_BUFFER_FULL and LOSS_SEND_ERROR */
+    uint32_t counter;    /* of such losses */
+    uint32_t reserved;
 };
 
 /* Why a target did not get a message, by the names of DROP_REASONS in compiler/metrics.py. */

@@ -56,8 +56,9 @@ static bool may_report(struct carrier *carrier, int64_t now) {
     return true;
 }
 
-static void report_loss(struct carrier *carrier, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error) {
-    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error};
+static void report_loss(struct carrier *carrier, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
+                        uint32_t counter) {
+    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error, counter, 0};
     if (may_report(carrier, now)) ring_put(carrier->events, &event, sizeof event);
 }
 
@@ -75,7 +76,8 @@ static void reject(struct carrier *carrier, const struct received *received, enu
                                      .reason = reason,
                                      .address = received->address,
                                      .port = received->port,
-                                     .length = (uint32_t)received->length};
+                                     .length = (uint32_t)received->length,
+                                     .counter = listener->rejected[reason]};
     memcpy(event + 1, carrier->datagram, kept);
     ring_put(carrier->events, event, event->size);
 }
@@ -129,8 +131,9 @@ static void forward(struct carrier *carrier, const struct route *route, const st
             counter_add(counters, to->stale, 1);
         } else {
             enum loss reason = loss_of(error);
-            counter_add(counters, reason == LOSS_SEND_ERROR ? to->send_error : to->send_buffer_full, 1);
-            report_loss(carrier, received->now, route->id, to->id, reason, error);
+            uint32_t counter = reason == LOSS_SEND_ERROR ? to->send_error : to->send_buffer_full;
+            counter_add(counters, counter, 1);
+            report_loss(carrier, received->now, route->id, to->id, reason, error, counter);
         }
     }
 }
@@ -149,7 +152,7 @@ static void drop_oldest(struct carrier *carrier, struct ring *ring, int64_t now)
         const struct waiting *target = &oldest.part->targets[index];
         counter_add(carrier->counters, target->waiting, -1);
         counter_add(carrier->counters, target->queue_full, 1);
-        report_loss(carrier, now, oldest.part->route, target->id, LOSS_QUEUE_FULL, 0);
+        report_loss(carrier, now, oldest.part->route, target->id, LOSS_QUEUE_FULL, 0, target->queue_full);
     }
 }
 
@@ -281,7 +284,9 @@ static bool receive_one(struct carrier *carrier, const struct listener *listener
     }
     struct received received = {.listener = listener, .length = (size_t)length,
                                 .address = ntohl(sender.sin_addr.s_addr), .port = ntohs(sender.sin_port)};
+    edition_begin(&carrier->edition);
     handle(carrier, &received, arrival(&message));
+    edition_end(&carrier->edition);
     return true;
 }
 
