@@ -123,7 +123,7 @@ class EventThread:
     ) -> None:
         """Report what was counted since the last report by this counter."""
         total = counters[counter]
-        reported = last[counter][0] if counter in last else total - 1  # at least the one of this event
+        reported = last[counter][0] if counter in last else 0
         if total < reported:  # the counter has gone with a table, and stands for something else
             reported = 0
         last[counter] = total, report

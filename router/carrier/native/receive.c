@@ -33,7 +33,7 @@ struct received {
     struct envelope envelope;
 };
 
-uint32_t histogram_cell(int64_t elapsed) {
+static uint32_t histogram_cell(int64_t elapsed) {
     uint32_t cell = 0;
     while (cell < HISTOGRAM_BOUNDS && elapsed > BOUNDS[cell]) cell++;
     return cell;
