@@ -111,10 +111,13 @@ class Trial:
             receiver = opened.enter_context(self._receiver(log))
             subject = opened.enter_context(self._start())
             subject.wait_until_bound()
-            before = metrics(place.metrics) if is_router else {}  # it answers when all else is there
+            if is_router:
+                metrics(place.metrics)  # which answers when all else is there
             self._sent(self._telemetry(WARM_UP, 1))
+            self._sent(self._telemetry(FLOOD_RATE, self._pressure.before / FLOOD_RATE))
             commander = opened.enter_context(self._commander(ros)) if ros else None
-            with self._pressure.press(Pressed(subject, place, self._flood)) as judge:
+            before = metrics(place.metrics) if is_router else {}
+            with self._pressure.press(Pressed(subject, place)) as judge:
                 meter, began = Meter(subject), time.monotonic()
                 if commander:
                     commander.go()
@@ -171,9 +174,6 @@ class Trial:
         helper.result()
         time.sleep(0.5)  # found in the graph is not yet matched on the wire
         return helper
-
-    def _flood(self, count: int) -> None:
-        self._sent(self._telemetry(FLOOD_RATE, count / FLOOD_RATE))
 
     def _sent(self, plan: traffic.Plan) -> tuple[traffic.Numbers, dict[str, Any]]:
         """Sends it; when each datagram was sent, and what `send` tells of it all."""
