@@ -35,6 +35,14 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "carrier_watchdog": (None, (c_void_p, c_int, c_int64)),
     "command_send": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32)),
     "command_send_at": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32, c_int64)),
+    "commands_counters": (None, (c_void_p, c_void_p, c_uint32)),
+    "commands_failures": (c_uint64, (c_void_p,)),
+    "commands_open": (c_void_p, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p)),
+    "commands_serve": (c_bool, (c_void_p, c_void_p)),
+    "commands_stop": (c_bool, (c_void_p,)),
+    "commands_unwatch": (None, (c_void_p, c_int)),
+    "commands_watch": (c_int, (c_void_p, c_int)),
+    "datagram_write": (c_bool, (c_void_p, c_size_t, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p)),
     "deadman_close": (None, (c_void_p, c_void_p)),
     "deadman_end": (None, (c_void_p, c_void_p)),
     "deadman_open": (
@@ -48,6 +56,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "deadmen_serve": (None, (c_void_p, c_int64)),
     "envelope_read": (c_int, (c_void_p, c_void_p, c_size_t, c_bool, c_void_p)),
     "freshness_born": (c_int64, (c_void_p, c_int64, c_int64, c_int64)),
+    "message_read": (c_bool, (c_void_p, c_size_t, c_void_p, c_size_t, c_void_p)),
     "ring_close": (None, (c_void_p,)),
     "ring_drop": (c_bool, (c_void_p, c_void_p, c_size_t)),
     "ring_open": (c_void_p, (c_size_t,)),
@@ -67,6 +76,10 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
 
 STRUCTURES: Mapping[str, type[ctypes.Structure]] = {
     "change": structures.Change,
+    "command_route": structures.CommandRoute,
+    "command_set": structures.CommandSet,
+    "command_target": structures.CommandTarget,
+    "command_topic": structures.CommandTopic,
     "deadman_destination": structures.DeadmanDestination,
     "destination": structures.Destination,
     "entry": structures.Entry,
@@ -79,11 +92,13 @@ STRUCTURES: Mapping[str, type[ctypes.Structure]] = {
     "payload_case": structures.Case,
     "peer": structures.Peer,
     "program": structures.Program,
+    "read_op": structures.ReadOp,
     "route": structures.Route,
     "waiting": structures.Waiting,
     "wire_field": structures.WireField,
     "wire_schema": structures.Schema,
     "wire_type": structures.WireType,
+    "write_op": structures.WriteOp,
 }
 """The structures that both sides declare, by their names in C."""
 

@@ -182,7 +182,11 @@ class _Writer:
     # routes
 
     def route(self, number: int, handler: Handler) -> c.Route:
-        destinations = [self._destination(handler, target) for target in self.outlets.carried(handler)]
+        arrays = self.made.arrays
+        destinations = [
+            native_destination(self.program, self.outlets, arrays, handler, target)
+            for target in self.outlets.carried(handler)
+        ]
         parts = [self._part(number, handler, part) for part in self.outlets.parts(handler)]
         return c.Route(
             ttl=handler.ttl or 0,
@@ -194,28 +198,6 @@ class _Writer:
             last_message=self.counters.index("route_last_message_timestamp_seconds", handler.route),
             duration=self.counters.index("route_duration_seconds", handler.route),
         )
-
-    def _destination(self, handler: Handler, target: TargetPlan) -> c.Destination:
-        counters, place = self.counters, (handler.route, target.label)
-        feeds = self.outlets.feeds(handler.route, target.deadmen) if target.deadmen else ()
-        made = c.Destination(
-            sender=self.outlets.senders[target.label],
-            feeds=self.array(c.Feed, [c.Feed(deadman=deadman, disarms=disarms) for deadman, disarms in feeds]),
-            feed_count=len(feeds),
-            trims=self.program.table.endpoints[target.label].trim_trailing_zeros,
-            id=self.outlets.names.number(target.label),
-            sent=counters.index("datagrams_sent", *place),
-            sent_bytes=counters.index("sent_bytes", *place),
-            stale=counters.index("messages_dropped", *place, "stale"),
-            rate_limited=counters.index("messages_dropped", *place, "rate_limited"),
-            send_buffer_full=counters.index("messages_dropped", *place, "send_buffer_full"),
-            send_error=counters.index("messages_dropped", *place, "send_error"),
-        )
-        if target.max_rate is not None:
-            limit = self.outlets.limit(handler, target)
-            made.limit = ctypes.pointer(limit)
-            self.made.arrays.append(limit)
-        return made
 
     def _part(self, number: int, handler: Handler, part: PartTargets) -> c.Part:
         topics = [self.outlets.wanted[target.label] for target in part.targets if target.is_topic]
@@ -241,6 +223,36 @@ class _Writer:
             queue_full=counters.index("messages_dropped", *place, "queue_full"),
             filtered=counters.index("messages_filtered", *place),
         )
+
+
+def native_destination(
+    program: Program, outlets: Outlets, arrays: list[object], handler: Handler, target: TargetPlan
+) -> c.Destination:
+    """A target that the carrier serves. `arrays` gets what has to live as long."""
+    counters, place = program.counters, (handler.route, target.label)
+    made = c.Destination(
+        sender=outlets.senders[target.label],
+        trims=program.table.endpoints[target.label].trim_trailing_zeros,
+        id=outlets.names.number(target.label),
+        sent=counters.index("datagrams_sent", *place),
+        sent_bytes=counters.index("sent_bytes", *place),
+        stale=counters.index("messages_dropped", *place, "stale"),
+        rate_limited=counters.index("messages_dropped", *place, "rate_limited"),
+        send_buffer_full=counters.index("messages_dropped", *place, "send_buffer_full"),
+        send_error=counters.index("messages_dropped", *place, "send_error"),
+    )
+    if target.deadmen:
+        feeds = [
+            c.Feed(deadman=deadman, disarms=disarms)
+            for deadman, disarms in outlets.feeds(handler.route, target.deadmen)
+        ]
+        made.feeds, made.feed_count = (c.Feed * len(feeds))(*feeds), len(feeds)
+        arrays.append(made.feeds)
+    if target.max_rate is not None:
+        limit = outlets.limit(handler, target)
+        made.limit = ctypes.pointer(limit)
+        arrays.append(limit)
+    return made
 
 
 def _number(host: str) -> int:

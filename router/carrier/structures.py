@@ -177,6 +177,80 @@ class Change(ctypes.Structure):
     )
 
 
+class ReadOp(ctypes.Structure):
+    """`struct read_op` in convert.h."""
+
+    _fields_ = (("kind", c_uint8), ("size", c_uint8), ("slot", c_uint16), ("count", c_uint32))
+
+
+class WriteOp(ctypes.Structure):
+    """`struct write_op` in convert.h."""
+
+    _fields_ = (
+        ("kind", c_uint8),
+        ("scalar", c_uint8),
+        ("encoding", c_uint8),
+        ("flags", c_uint8),
+        ("slot", c_uint16),
+        ("reserved", c_uint16),
+        ("tag", c_uint32),
+        ("least", c_uint32),
+        ("most", c_uint32),
+        ("start", c_uint32),
+        ("count", c_uint32),
+    )
+
+
+class CommandTarget(ctypes.Structure):
+    """`struct command_target` in commands.h."""
+
+    _fields_ = (
+        ("destination", Destination),
+        ("writes", POINTER(WriteOp)),
+        ("literals", POINTER(ctypes.c_char)),
+        ("write_count", c_uint32),
+        ("mapping_error", c_uint32),
+    )
+
+
+class CommandRoute(ctypes.Structure):
+    """`struct command_route` in commands.h."""
+
+    _fields_ = (
+        ("ttl", c_int64),
+        ("reads", POINTER(ReadOp)),
+        ("targets", POINTER(CommandTarget)),
+        ("read_count", c_uint32),
+        ("target_count", c_uint32),
+        ("id", c_uint32),
+        ("seconds", c_uint16),
+        ("nanoseconds", c_uint16),
+        ("received", c_uint32),
+        ("last_message", c_uint32),
+        ("duration", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+class CommandTopic(ctypes.Structure):
+    """`struct command_topic` in commands.h."""
+
+    _fields_ = (
+        ("subscription", c_void_p),
+        ("routes", POINTER(CommandRoute)),
+        ("route_count", c_uint32),
+        ("capacity", c_uint32),
+        ("eventfd", c_int32),
+        ("reserved", c_uint32),
+    )
+
+
+class CommandSet(ctypes.Structure):
+    """`struct command_set` in commands.h."""
+
+    _fields_ = (("topics", POINTER(CommandTopic)), ("count", c_uint32), ("reserved", c_uint32))
+
+
 class MessageRecord(ctypes.Structure):
     """`struct message_record` in carrier.h; the datagram follows."""
 
@@ -214,6 +288,10 @@ __all__ = [
     "REASONS",
     "Case",
     "Change",
+    "CommandRoute",
+    "CommandSet",
+    "CommandTarget",
+    "CommandTopic",
     "DeadmanDestination",
     "Destination",
     "Entry",
@@ -225,9 +303,11 @@ __all__ = [
     "Part",
     "Peer",
     "Program",
+    "ReadOp",
     "Route",
     "Schema",
     "Waiting",
     "WireField",
     "WireType",
+    "WriteOp",
 ]

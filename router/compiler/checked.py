@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from router.compiler.cdr import CdrReads
 from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
@@ -65,7 +66,7 @@ class CheckedSubscription:
 
     topic: Topic
     type: MessageType
-    reads: Reads
+    reads: CdrReads
     when: Typed | None
     for_each: Typed | None
     stamp: Typed | None

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman, CheckedRoute
+from router.compiler.commands import lower_commands
 from router.compiler.deadmen import deadman_plan
 from router.compiler.executors import Executors, executors
 from router.compiler.handlers import HandlerSource
@@ -62,7 +63,7 @@ def link(
     _open_counters(counters, table, envelope)
     _open_own_counters(counters, table)
     served = [checked for checked in routes if not checked.route.ignore]
-    executed_by = executors(served)
+    executed_by, lowered = executors(served), lower_commands(served)
     inbound: dict[int, tuple[Handler, ...]] = {}
     outbound: dict[str, tuple[Handler, ...]] = {}
     for checked in served:
@@ -91,7 +92,8 @@ def link(
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos=schema,
-        executors=executed_by,
+        executors={**executed_by, **lowered.executors},
+        commands=lowered.commands,
         gateways=tuple(gateways),
     )
 

@@ -11,6 +11,7 @@ from enum import Enum, auto
 from itertools import chain
 from types import CodeType
 
+from router.compiler.commands import Commands
 from router.compiler.executors import Executors
 from router.compiler.metrics import Counters
 from router.table.model import Endpoint, Gateway, Inbound, Keep, Listener, Priority, RouteTable
@@ -158,7 +159,8 @@ class Program:
     """A compiled table. `senders` are the endpoints that something is sent to, `executors` say who does that.
 
     `inbound` has the handlers by envelope field number: several where a case has several routes, which differ
-    in their sources. `outbound` has them by topic. `ignored` are the numbers of cases that the table ignores.
+    in their sources. `outbound` has them by topic, and `commands` the topics that the carrier can take. `ignored` are
+    the numbers of cases that the table ignores.
     """
 
     table: RouteTable
@@ -173,6 +175,7 @@ class Program:
     ignored: frozenset[int]
     protos: ProtoSchema
     executors: Executors
+    commands: Commands
     gateways: tuple[GatewayPlan, ...] = ()
 
     @property

@@ -37,6 +37,12 @@ _set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 # libc's `int eventfd_write(int fd, uint64_t value)` can be that callback, with the descriptor as user data.
 _ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
+TAKE, RESET = (
+    ctypes.cast(function, ctypes.c_void_p).value or 0
+    for function in (RCL.rcl_take_serialized_message, RCL.rcutils_reset_error)
+)
+"""Addresses of what a native thread calls to take messages, and to forget why it could not."""
+
 
 class RawSubscription:
     """A subscription whose messages are taken as CDR bytes. It holds up to `capacity` messages."""
@@ -65,6 +71,11 @@ class RawSubscription:
         self._subscription = subscription
         self.handle = subscription.handle
         self._message_class = message_class
+
+    @property
+    def address(self) -> int:
+        """That of its `rcl_subscription_t`, until it is closed."""
+        return int(self.handle.pointer)
 
     def take(self) -> tuple[bytes, int] | None:
         """Return the oldest message and when it set out, in ns of the wall clock; None if there is no message.

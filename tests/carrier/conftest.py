@@ -1,4 +1,4 @@
-"""The carrier's library: the one that set-up has built, or one of the present sources."""
+"""The carrier's library, the one that set-up has built or one of the present sources, and the interfaces of ROS."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 
 from router.carrier.build import LIBRARY, build, is_current
 from router.carrier.library import load
+from router.compiler.lookup import Definitions
 from tests.carrier import building
 from tests.carrier.building import sanitized_library
 
@@ -36,3 +37,8 @@ def library(built: Path) -> ctypes.CDLL:
 def seams(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     """What tests need beside it: see seams.c."""
     return building.seams(tmp_path_factory.mktemp("carrier") / "seams.so")
+
+
+@pytest.fixture(scope="session")
+def definitions() -> Definitions:
+    return Definitions()

@@ -51,7 +51,7 @@ def test_structures_have_their_fields_where_c_has_them(tmp_path: Path) -> None:
         for field in structure._fields_
     ]
     main = tmp_path / "offsets.c"
-    main.write_text(f'#include <stdio.h>\n#include "carrier.h"\nint main(void) {{ {" ".join(lines)} }}\n')
+    main.write_text(f'#include <stdio.h>\n#include "commands.h"\nint main(void) {{ {" ".join(lines)} }}\n')
     build.compile_c([str(main), f"-I{build.NATIVE}", "-o", str(tmp_path / "offsets")])
     printed = subprocess.check_output([tmp_path / "offsets"], text=True)
     assert printed.splitlines() == [

@@ -20,7 +20,7 @@ struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct 
     if (!carrier) return NULL;
     carrier->deadmen = deadmen;
     carrier->counters = counters;
-    carrier->events = events;
+    carrier->reporter.events = events;
     carrier->notify = -1;
     carrier->epoll = epoll_create1(EPOLL_CLOEXEC);
     carrier->wake = eventfd(0, EFD_CLOEXEC);
@@ -29,17 +29,6 @@ struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct 
         return NULL;
     }
     return carrier;
-}
-
-/* Start a thread that gets no signals: those are Python's. */
-static int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), struct carrier *carrier) {
-    sigset_t all, usual;
-    sigfillset(&all);
-    pthread_sigmask(SIG_SETMASK, &all, &usual);
-    int error = pthread_create(thread, NULL, run, carrier);
-    pthread_sigmask(SIG_SETMASK, &usual, NULL);
-    if (!error) pthread_setname_np(*thread, name);
-    return error;
 }
 
 int carrier_start(struct carrier *carrier, const struct change *first) {

@@ -5,15 +5,20 @@
 
 #include "carrier.h"
 
+/* Where a thread reports events, and how many it may still write: a flood is counted only. */
+struct reporter {
+    struct ring *events;
+    int64_t window_began;
+    uint32_t left;
+};
+
 struct carrier {
     /* Of the receive thread alone: */
     const struct program *program;
     counter *counters;
-    struct ring *events;
+    struct reporter reporter;
     struct deadmen *deadmen;
     struct freshness freshness;
-    int64_t window_began; /* of the events that may be reported */
-    uint32_t events_left;
     uint32_t mirror_lost; /* counter */
     int epoll;
     /* Shared: */
@@ -39,7 +44,28 @@ void *receive_thread(void *carrier);
 void *timer_thread(void *carrier);
 void carrier_adopt_first(struct carrier *carrier, const struct change *first);
 
+/* Start a thread that gets no signals: those are Python's. Return 0, or an errno. */
+int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void *argument);
+
+/* Whether an event may be written, which is then done. */
+bool may_report(struct reporter *reporter, int64_t now);
+
+/* Report that a target did not get a message. `counter` is that of such losses. */
+void report_loss(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
+                 uint32_t counter);
+
+/* Report that `destination_send` has returned an errno. */
+void report_send_error(struct reporter *reporter, int64_t now, uint32_t route, const struct destination *to, int error);
+
 /* Count a duration in ns in the histogram that begins at this counter. */
 void count_duration(counter *counters, uint32_t histogram, int64_t elapsed);
+
+/* Check that a message that was received at `now` has not expired (NEVER: it does not), and that `max_rate` lets it
+ * pass; else count it, and return false. */
+bool destination_may_send(counter *counters, const struct destination *to, int64_t now, int64_t expires);
+
+/* Send and count a datagram. Return what `command_send` does. */
+int destination_send(struct deadmen *deadmen, counter *counters, const struct destination *to, const uint8_t *data,
+                     size_t size, int64_t expires);
 
 #endif

@@ -12,6 +12,8 @@
  * A field whose number or wire type is not the declared one is unknown: it is skipped, and has to be well formed. */
 #include "envelope.h"
 
+#include "utf8.h"
+
 #include <string.h>
 
 enum { VARINT, I64, LEN, GROUP, GROUP_END, I32 };
@@ -94,34 +96,6 @@ static const struct wire_field *find_field(const struct wire_type *type, uint32_
     return NULL;
 }
 
-static inline bool is_continuation(uint8_t byte) { return (byte & 0xC0) == 0x80; }
-
-/* The size in bytes of the UTF-8 character at `at`, whose first byte is not ASCII, or 0 if it is none: too long for its
- * code point, a surrogate, or beyond U+10FFFF. The second byte's lowest and highest values say so. */
-static size_t utf8_size(const uint8_t *at, size_t size) {
-    uint8_t first = at[0], low = 0x80, high = 0xBF;
-    size_t needed = first < 0xC2 ? 0 : first < 0xE0 ? 2 : first < 0xF0 ? 3 : first < 0xF5 ? 4 : 0;
-    if (needed == 0 || needed > size) return 0;
-    if (first == 0xE0) low = 0xA0;
-    if (first == 0xED) high = 0x9F;
-    if (first == 0xF0) low = 0x90;
-    if (first == 0xF4) high = 0x8F;
-    if (at[1] < low || at[1] > high) return 0;
-    for (size_t index = 2; index < needed; index++) {
-        if (!is_continuation(at[index])) return 0;
-    }
-    return needed;
-}
-
-static bool is_utf8(struct bytes text) {
-    while (text.at < text.end) {
-        size_t size = *text.at < 0x80 ? 1 : utf8_size(text.at, left(&text));
-        if (size == 0) return false;
-        text.at += size;
-    }
-    return true;
-}
-
 /* Whether packed scalars are whole. */
 static bool is_packed(uint8_t kind, struct bytes values) {
     if (kind == WIRE_I64) return left(&values) % 8 == 0;
@@ -167,7 +141,7 @@ static bool read_known_len(struct walk *walk, const struct wire_type *type, uint
         walk->rest.at = value.at;
         return enter(walk, value.end, &walk->schema->types[field->type], NO_GROUP);
     }
-    if (field->kind == WIRE_STRING) return is_utf8(value);
+    if (field->kind == WIRE_STRING) return is_utf8(value.at, left(&value));
     if (field->flags & WIRE_PACKABLE) return is_packed(field->kind, value);
     return true;
 }

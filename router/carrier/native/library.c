@@ -2,6 +2,7 @@
 #include <stddef.h>
 
 #include "carrier.h"
+#include "commands.h"
 
 struct structure_size {
     const char *name;
@@ -22,7 +23,8 @@ const struct structure_size *carrier_structure_sizes(void) {
         SIZE(wire_field),     SIZE(wire_type), SIZE(wire_schema), SIZE(limit), SIZE(feed),
         SIZE(destination),    SIZE(waiting),   SIZE(part),        SIZE(route), SIZE(entry),
         SIZE(payload_case),   SIZE(peer),      SIZE(listener),    SIZE(program), SIZE(change),
-        SIZE(message_record), SIZE(mirror_record), SIZE(deadman_destination), {NULL, 0},
+        SIZE(message_record), SIZE(mirror_record), SIZE(read_op), SIZE(write_op), SIZE(command_target), SIZE(command_route),
+        SIZE(command_topic), SIZE(command_set), SIZE(deadman_destination), {NULL, 0},
     };
     return sizes;
 }

@@ -13,15 +13,9 @@
 enum {
     TURN_MS = 50,              /* the longest wait for a datagram */
     MOST_DRAINED = 1 << 16,    /* datagrams: more than a receive buffer holds */
-    MOST_EVENTS = 32,          /* per EVENT_WINDOW: a flood is counted, not reported */
     LISTENERS_PER_WAIT = 16,
 };
-static const int64_t EVENT_WINDOW = 10000000, LONGEST_HOLD = 1000000000;
-
-/* HISTOGRAM_BOUNDS_NS in compiler/metrics.py; a cell for what is slower and one for the sum follow. */
-enum { HISTOGRAM_BOUNDS = 12 };
-static const int64_t BOUNDS[HISTOGRAM_BOUNDS] = {10000,   20000,   50000,   100000,   200000,   500000,
-                                                 1000000, 2000000, 5000000, 10000000, 20000000, 50000000};
+static const int64_t LONGEST_HOLD = 1000000000;
 
 /* A datagram that was received, with what is known about it. */
 struct received {
@@ -33,41 +27,14 @@ struct received {
     struct envelope envelope;
 };
 
-static uint32_t histogram_cell(int64_t elapsed) {
-    uint32_t cell = 0;
-    while (cell < HISTOGRAM_BOUNDS && elapsed > BOUNDS[cell]) cell++;
-    return cell;
-}
-
-void count_duration(counter *counters, uint32_t histogram, int64_t elapsed) {
-    counter_add(counters, histogram + histogram_cell(elapsed), 1);
-    counter_add(counters, histogram + HISTOGRAM_BOUNDS + 1, elapsed);
-}
-
 /* ---- events ---- */
-
-static bool may_report(struct carrier *carrier, int64_t now) {
-    if (now - carrier->window_began > EVENT_WINDOW) {
-        carrier->window_began = now;
-        carrier->events_left = MOST_EVENTS;
-    }
-    if (!carrier->events_left) return false;
-    carrier->events_left--;
-    return true;
-}
-
-static void report_loss(struct carrier *carrier, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
-                        uint32_t counter) {
-    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error, counter, 0};
-    if (may_report(carrier, now)) ring_put(carrier->events, &event, sizeof event);
-}
 
 static uint32_t padded_to_word(size_t size) { return (uint32_t)((size + 7) & ~(size_t)7); }
 
 static void reject(struct carrier *carrier, const struct received *received, enum reason reason) {
     const struct listener *listener = received->listener;
     counter_add(carrier->counters, listener->rejected[reason], 1);
-    if (reason == IGNORED || !may_report(carrier, received->now)) return;
+    if (reason == IGNORED || !may_report(&carrier->reporter, received->now)) return;
     struct rejected_event *event = (struct rejected_event *)carrier->record;
     size_t kept = received->length < MAX_DATAGRAM ? received->length : MAX_DATAGRAM;
     *event = (struct rejected_event){.size = padded_to_word(sizeof *event + kept),
@@ -79,7 +46,7 @@ static void reject(struct carrier *carrier, const struct received *received, enu
                                      .length = (uint32_t)received->length,
                                      .counter = listener->rejected[reason]};
     memcpy(event + 1, carrier->datagram, kept);
-    ring_put(carrier->events, event, event->size);
+    ring_put(carrier->reporter.events, event, event->size);
 }
 
 /* ---- the mirror ---- */
@@ -99,42 +66,13 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
 
 /* ---- targets ---- */
 
-static size_t without_trailing_zeros(const uint8_t *data, size_t size) {
-    while (size && !data[size - 1]) size--;
-    return size;
-}
-
-static enum loss loss_of(int error) {
-    bool is_full = error == EAGAIN || error == EWOULDBLOCK || error == ENOBUFS;
-    return is_full ? LOSS_SEND_BUFFER_FULL : LOSS_SEND_ERROR;
-}
-
 static void forward(struct carrier *carrier, const struct route *route, const struct received *received) {
-    counter *counters = carrier->counters;
     int64_t expires = route->ttl ? received->born + route->ttl : NEVER;
     for (uint32_t index = 0; index < route->destination_count; index++) {
         const struct destination *to = &route->destinations[index];
-        if (route->ttl && monotonic_ns() > expires) {
-            counter_add(counters, to->stale, 1);
-            continue;
-        }
-        if (to->limit && !limit_passes(to->limit, received->now)) {
-            counter_add(counters, to->rate_limited, 1);
-            continue;
-        }
-        size_t size = to->trims ? without_trailing_zeros(carrier->datagram, received->length) : received->length;
-        int error = command_send(carrier->deadmen, to->sender, carrier->datagram, size, expires, to->feeds, to->feed_count);
-        if (!error) {
-            counter_add(counters, to->sent, 1);
-            counter_add(counters, to->sent_bytes, (int64_t)size);
-        } else if (error == COMMAND_STALE) {
-            counter_add(counters, to->stale, 1);
-        } else {
-            enum loss reason = loss_of(error);
-            uint32_t counter = reason == LOSS_SEND_ERROR ? to->send_error : to->send_buffer_full;
-            counter_add(counters, counter, 1);
-            report_loss(carrier, received->now, route->id, to->id, reason, error, counter);
-        }
+        if (!destination_may_send(carrier->counters, to, received->now, expires)) continue;
+        int error = destination_send(carrier->deadmen, carrier->counters, to, carrier->datagram, received->length, expires);
+        if (error && error != COMMAND_STALE) report_send_error(&carrier->reporter, received->now, route->id, to, error);
     }
 }
 
@@ -152,7 +90,7 @@ static void drop_oldest(struct carrier *carrier, struct ring *ring, int64_t now)
         const struct waiting *target = &oldest.part->targets[index];
         counter_add(carrier->counters, target->waiting, -1);
         counter_add(carrier->counters, target->queue_full, 1);
-        report_loss(carrier, now, oldest.part->route, target->id, LOSS_QUEUE_FULL, 0, target->queue_full);
+        report_loss(&carrier->reporter, now, oldest.part->route, target->id, LOSS_QUEUE_FULL, 0, target->queue_full);
     }
 }
 

@@ -399,11 +399,15 @@ class CdrReads(Reads):
             if isinstance(inner, ast.Name) and inner.id in paths:
                 self._wanted[paths[inner.id]] = None
 
+    def steps(self) -> Sequence[Step]:
+        """The steps that read the fields, once all expressions are checked."""
+        return steps(self._message, self._wanted, self._variable)
+
     def write(self, out: Source, span: SourceSpan) -> None:
         with out.block("if cdr[:2] != CDR_LE:", span):
             out.line("refuse(cdr[:2])", span)
         code = ReadingCode(out, span)
-        code.write(steps(self._message, self._wanted, self._variable))
+        code.write(self.steps())
         if not code.is_checked:
             with out.block("if at > len(cdr):", span):
                 out.line("cut_off(cdr)", span)
