@@ -99,6 +99,11 @@ def test_installing_starts_it_at_once_and_at_boot(running: Machine) -> None:
     assert running.show("User") == "rover-router"
 
 
+def test_it_runs_on_the_carrier(running: Machine) -> None:
+    pid = running.show("MainPID")
+    assert f"{ROOT}/router/carrier/native/libcarrier.so" in running.shell(f"cat /proc/{pid}/maps")
+
+
 def test_installing_again_changes_nothing_and_restarts_it(running: Machine) -> None:
     before, sockets = running.show("MainPID"), running.show("ActiveEnterTimestamp", "rover-router.socket")
     running.shell(f"{ROOT}/deploy/install-service.sh")
@@ -197,7 +202,7 @@ def test_a_killed_router_comes_back(running: Machine) -> None:
     )
 
 
-def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_where(running: Machine) -> None:
+def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_what_python_does(running: Machine) -> None:
     running.shell(
         "mkdir -p /run/systemd/system/rover-router.service.d\n"
         "printf '[Service]\\nWatchdogSec=2s\\n' > /run/systemd/system/rover-router.service.d/test.conf\n"
@@ -213,7 +218,7 @@ def test_a_router_that_stands_still_is_ended_by_the_watchdog_and_says_where(runn
     running.shell("rm /run/systemd/system/rover-router.service.d/test.conf; systemctl daemon-reload")
     assert "Watchdog timeout" in running.journal()
     assert "Fatal Python error: Aborted" in running.journal()
-    assert re.search(r"receiver.py\", line \d+ in ", running.journal())
+    assert re.search(r"/router/\S+\.py\", line \d+ in ", running.journal())
 
 
 def test_a_reload_takes_a_good_table_and_refuses_a_bad_one(running: Machine) -> None:
