@@ -44,6 +44,14 @@ def test_functions_are_declared_as_in_the_headers() -> None:
     assert declared == FUNCTIONS
 
 
+def test_python_calls_nothing_that_is_not_declared() -> None:
+    """ctypes would cut its pointers to 32 bits."""
+    exported = {name for _, name, _ in PROTOTYPE.findall(HEADERS)}
+    router = build.NATIVE.parents[1]
+    called = {name for path in router.rglob("*.py") for name in re.findall(r"library\.(\w+)", path.read_text())}
+    assert called & exported <= FUNCTIONS.keys()
+
+
 def test_structures_have_their_fields_where_c_has_them(tmp_path: Path) -> None:
     lines = [
         f'printf("{name} {field[0]} %zu %zu\\n", offsetof(struct {name}, {field[0]}), sizeof(struct {name}));'
