@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from queue import SimpleQueue
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
+from router.log import logger
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -118,6 +120,18 @@ class DaemonThread(Executor):
         while (call := self._calls.get()) is not None:
             call.run()
             del call  # or its arguments and result would live until the next call
+
+
+LEAVING_S = 1.0
+"""Seconds for which a reload or a stop waits for a thread that may be stuck in the middleware."""
+
+
+def join_or_leave(thread: threading.Thread, timeout: float = LEAVING_S) -> bool:
+    """Wait for the end of a daemon thread. If it is stuck, log that, leave it, and return False."""
+    thread.join(timeout)
+    if thread.is_alive():
+        logger.error("a thread is stuck, and is left", thread=thread.name)
+    return not thread.is_alive()
 
 
 class StuckError(RuntimeError):

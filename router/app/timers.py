@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 from router.clock import monotonic_ns
 from router.engine.timers import P, R, Timer
-from router.threads import WakeEvent
+from router.log import logger
+from router.threads import LEAVING_S, WakeEvent, join_or_leave
 
 _NEVER = 1 << 63
 _RETRY = 100_000_000
@@ -31,7 +33,7 @@ class TimerThread:
         self._wake = WakeEvent()
         self._waits_until = 0  # while the thread does not wait
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name=name)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def add(self, timer: Timer) -> None:
         """Serve `timer` from now on. Idempotent."""
@@ -62,21 +64,43 @@ class TimerThread:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread, and then the timers in reverse order: those added later may pass on to earlier ones."""
-        with self._lock:
+        """End the thread, and then the timers in reverse order: those added later may pass on to earlier ones.
+
+        A timer that is stuck in the middleware is left with all others of its thread.
+        """
+        with self._locked_unless_stuck() as is_locked:
+            if not is_locked:
+                return
             if not self._stopping:
                 self._wake.set()
             self._stopping, self._waits_until = True, 0
-        if self._thread.ident is not None:  # it was started
-            self._thread.join()
+        if self._thread.ident is not None and not join_or_leave(self._thread):
+            return
         with self._lock:
             for timer in reversed(self._timers):
                 self._end(timer)
         self._wake.close()
 
+    @contextmanager
+    def _locked_unless_stuck(self) -> Iterator[bool]:
+        """Hold the lock; what is called under it may be stuck in the middleware: then log that and yield False."""
+        if not self._lock.acquire(timeout=LEAVING_S):
+            logger.error("a thread is stuck, and is left", thread=self._thread.name)
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            self._lock.release()
+
     def release(self, candidates: Sequence[object]) -> None:
-        """End and remove those of its timers that are among the candidates, in reverse order."""
-        with self._lock:
+        """End and remove those of its timers that are among the candidates, in reverse order.
+
+        If one is stuck in the middleware, they stay, and end when they are due.
+        """
+        with self._locked_unless_stuck() as is_locked:
+            if not is_locked:
+                return
             for timer in [each for each in reversed(self._timers) if any(each is one for one in candidates)]:
                 self._timers.remove(timer)
                 self._end(timer)
@@ -112,14 +136,14 @@ class TimerThread:
 class Timers:
     """The router's timer threads: deadmen, paced and held messages, and open frames.
 
-    Deadmen have a thread of their own, and those behind gateways another one, because they publish, which may block in
-    the middleware.
+    Deadmen have a thread of their own. So have those behind gateways, and held messages of topics: they publish, which
+    may block in the middleware.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
-        self.deadman, self.inbound_deadman, self.pacing, self.collecting = self._threads = tuple(
-            TimerThread(name, failed) for name in ("deadman", "inbound deadman", "pacing", "collect")
-        )
+        names = "deadman", "inbound deadman", "pacing", "holding", "collect"
+        self._threads = tuple(TimerThread(name, failed) for name in names)
+        self.deadman, self.inbound_deadman, self.pacing, self.holding, self.collecting = self._threads
 
     def start(self) -> None:
         for thread in self._threads:

@@ -46,10 +46,10 @@ class ThreadCounts:
         """The length of a list that cannot grow, if there is one."""
         self.lists: list[list[int]] = []
         self._copies: list[Callable[[int], list[int]]] = []
-        for _ in range(9):
+        for _ in range(10):
             self.add(counters.fresh_counts())
-        self.receive, self.ros, self.deadman, self.gateway_deadmen, self.pacing, self.collecting = self.lists[:6]
-        self.gateways, self.events, self.own = self.lists[6:]
+        self.receive, self.ros, self.deadman, self.gateway_deadmen, self.pacing, self.holding = self.lists[:6]
+        self.collecting, self.gateways, self.events, self.own = self.lists[6:]
 
     def add(self, counts: list[int], copy: Callable[[int], list[int]] | None = None) -> None:
         """Count in another list too. `copy(size)` returns its beginning at a time at which it balances."""
@@ -253,6 +253,7 @@ def engine_context(
         clock_ns=monotonic_ns,
         wall_ns=wall_ns,
         pacing=TimerGroup(counts.pacing, timers.pacing.locked),
+        holding=TimerGroup(counts.holding, timers.holding.locked),
         collecting=TimerGroup(counts.collecting, timers.collecting.locked),
         command=command,
         publish_errors=publish_errors,

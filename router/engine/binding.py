@@ -74,7 +74,8 @@ class EngineContext:
     message that has a `ttl` or deadmen (see engine.deadman). `publish` takes CDR bytes, by topic, and may raise
     `publish_errors`. `wanted`, by topic, is a flag that its owner keeps up to date: whether anybody subscribes.
     `report` is called for losses only. `counts` belong to the thread that calls the handlers. `pacers` are those of
-    the endpoints with a budget, in the group `pacing`; frames are collected in the group `collecting`.
+    the endpoints with a budget, in the group `pacing` like messages that wait for endpoints; `holding` has those that
+    wait for topics. Frames are collected in the group `collecting`.
     """
 
     counts: list[int]
@@ -85,6 +86,7 @@ class EngineContext:
     clock_ns: Callable[[], int]
     wall_ns: Callable[[], int]
     pacing: TimerGroup
+    holding: TimerGroup
     collecting: TimerGroup
     command: CommandMaker
     publish_errors: tuple[type[Exception], ...] = ()
@@ -122,7 +124,8 @@ def _target_names(target: TargetPlan, handler: Handler, counters: Counters, cont
     if target.is_topic:
         names[f"wanted_{name}"] = context.wanted[target.label]
     if target.is_deferred:
-        outcome = Outcome(counters, context.pacing.counts, route, target, context.report)
+        group = context.holding if target.is_topic else context.pacing
+        outcome = Outcome(counters, group.counts, route, target, context.report)
         names[f"deliver_{name}"] = _deliver(place, outcome, context)
     elif target.is_topic:
         names[f"publish_{name}"] = context.publish[target.label]
@@ -157,7 +160,8 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
 
     Deadmen are fed when a message leaves: their lock is taken while that of `pacing` is held, never in reverse order.
     """
-    (route, _, target), locked = place, context.pacing.locked
+    route, _, target = place
+    locked = context.holding.locked if target.is_topic else context.pacing.locked
     destination: object
     pacer = None if target.is_topic else context.pacers.get(target.label)
     if pacer is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Iterable, Iterator
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,10 +29,11 @@ from router.gateway.transport.stream import Limits
 from router.gateway.transport.tcp import TcpTransport
 from router.gateway.transport.udp import UdpTransport
 from router.gateway.transport.websocket import WebsocketTransport
+from router.log import logger
 from router.table.keys import are_same
 from router.table.model import Gateway, GatewayFormat
 from router.table.model import Transport as TransportKind
-from router.threads import DaemonThread
+from router.threads import DaemonThread, StuckError, join_or_leave
 from router.types.ros import ros_interfaces
 
 if TYPE_CHECKING:  # which imports rclpy
@@ -41,6 +43,9 @@ T = TypeVar("T")
 
 MOST_REQUEST = 4096
 """Bytes of a message from a client that may publish nothing: it can only request schemas."""
+
+_PATIENCE_S = 5.0
+"""Seconds for which a change of gateways waits for the event loop: opening a Zenoh session takes some."""
 
 PAGE = Path(__file__).with_name("page.html")
 
@@ -77,7 +82,7 @@ class GatewayThread:
         self._converting = DaemonThread("gateway bulk")
         self._loop = asyncio.new_event_loop()
         self._loop.set_exception_handler(self._on_fault)
-        self._thread = threading.Thread(target=self._loop.run_forever, name="gateway")
+        self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
         self._services: dict[str, GatewayService] = {}
         self._subscriptions = Subscriptions(ros.topics, ros_interfaces(), self._loop)
         self._context = GatewayContext(self._subscriptions, self._converting, failed, monotonic_ns, wall_ns)
@@ -176,18 +181,25 @@ class GatewayThread:
                 yield (service.name, str(each.number)), value(each)
 
     def stop(self) -> None:
-        """Close all gateways and end the thread."""
+        """Close all gateways and end the thread. If it is stuck in the middleware, that is logged, and it is left."""
         try:
             self._call(_close(self._services.values()))
+        except StuckError as error:
+            logger.error("gateways are left open", why=str(error))
         finally:  # a running thread would keep the process
             self._loop.call_soon_threadsafe(self._subscriptions.close)
             self._loop.call_soon_threadsafe(self._loop.stop)
-            self._thread.join()
             self._converting.shutdown()
-            self._loop.close()
+            if join_or_leave(self._thread):
+                self._loop.close()
 
     def _call(self, work: Coroutine[Any, Any, T]) -> T:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+        """Do work in the loop. Raises StuckError if the loop is stuck, as when a client's message is published."""
+        done = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return done.result(_PATIENCE_S)
+        except FutureTimeoutError as error:
+            raise StuckError("the gateways are stuck in the middleware") from error
 
     def _on_fault(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Report what a callback of the loop raised: a fault of the router."""

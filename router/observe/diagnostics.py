@@ -19,7 +19,7 @@ from router.log import logger
 from router.observe.running import Running
 from router.observe.snapshot import Labels, Snapshot, snapshot
 from router.table.model import Endpoint, Route
-from router.threads import background_threads
+from router.threads import background_threads, join_or_leave
 
 PERIOD = 1.0
 """Seconds."""
@@ -90,13 +90,13 @@ class Diagnostics:
         self._watch = Watch(running)
         self._publish = publish
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="diagnostics")
+        self._thread = threading.Thread(target=self._run, name="diagnostics", daemon=True)
         with background_threads():
             self._thread.start()
 
     def close(self) -> None:
         self._stopping.set()
-        self._thread.join()
+        join_or_leave(self._thread)
 
     def _run(self) -> None:
         has_failed = False

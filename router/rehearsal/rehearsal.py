@@ -186,6 +186,7 @@ class Rehearsal:
             clock_ns=lambda: self.now,
             wall_ns=lambda: self.now,
             pacing=group,
+            holding=group,
             collecting=group,
             command=commander(send, deadmen, self._locked, lambda: self.now),
             pacers=pacers,

@@ -20,6 +20,7 @@ from router.compiler.metrics import QOS_POLICIES
 from router.compiler.program import TopicPlan
 from router.log import logger
 from router.ros.qos import ActualQos, incompatible_policies
+from router.threads import join_or_leave
 
 if TYPE_CHECKING:
     from router.ros.endpoints import Publication, Subscription
@@ -192,7 +193,7 @@ class EventThread:
         self._context = node.context
         self._check = check
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="ros events")
+        self._thread = threading.Thread(target=self._run, name="ros events", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
@@ -200,9 +201,9 @@ class EventThread:
     def stop(self) -> None:
         self._stopping = True
         self._waited_for.wake()
-        self._thread.join()
-        self._waited_for.close()
-        self._polled.close()
+        if join_or_leave(self._thread):
+            self._waited_for.close()
+            self._polled.close()
 
     def _run(self) -> None:
         check_at = 0

@@ -19,7 +19,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 
 from router.clock import wall_ns
 from router.ros.node import RCL
-from router.threads import paused
+from router.threads import join_or_leave, paused
 
 Receive = Callable[[bytes, int], None]
 """Called with CDR bytes, and the time at which the message set out, in ns of the wall clock."""
@@ -185,7 +185,7 @@ class MessageThread:
         self._arrivals = Arrivals([])
         self._tasks: deque[Callable[[], None]] = deque()
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="ros")
+        self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
 
     @classmethod
     def serving(cls, receive: Mapping[RawSubscription, Receive], failed: Callable[[Exception], None]) -> MessageThread:
@@ -201,8 +201,8 @@ class MessageThread:
     def stop(self) -> None:
         self._stopping = True
         self._arrivals.wake()
-        self._thread.join()
-        self._arrivals.close()
+        if join_or_leave(self._thread):
+            self._arrivals.close()
 
     def paused(self) -> AbstractContextManager[None]:
         """The thread takes no message inside. Raises StuckError."""

@@ -160,6 +160,7 @@ class Rig:
             clock_ns=lambda: self.now,
             wall_ns=lambda: self.WALL + self.now,
             pacing=group,
+            holding=group,
             collecting=group,
             command=commander(send, deadmen, self._locked, lambda: self.now),
             publish_errors=(PublishError,),
