@@ -194,12 +194,14 @@ class CommandThread:
         """Serve what has arrived, and end.
 
         Return False if the thread is stuck in the middleware after 1 s: then it is left, and the subscriptions must
-        stay open. It feeds and sends nothing any more.
+        stay open. It feeds and sends nothing any more. Idempotent.
         """
-        if not self._library.commands_stop(self._address):
+        address, self._address = self._address, 0
+        if not address:
+            return self not in _left
+        if not self._library.commands_stop(address):
             _left.append(self)
             return False
-        self._address = 0
         for subscription, eventfd in (self._served.eventfds if self._served else {}).items():
             subscription.announce_to(None)
             os.close(eventfd)

@@ -1,0 +1,172 @@
+"""A program whose commands from ROS the carrier serves, between a middleware of tests and sockets in memory."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from ctypes import c_bool, c_int, c_int64, c_size_t, c_void_p
+from pathlib import Path
+from typing import Any, cast
+
+from router.carrier import structures as c
+from router.carrier.build import NATIVE, compile_c
+from router.carrier.commands import CommandThread, native_commands
+from router.carrier.deadmen import Deadmen, NativeDeadman
+from router.carrier.program import Names, Outlets
+from router.carrier.ring import Ring
+from router.carrier.sender import NativeSender
+from router.compiler.program import Handler, Program, TargetPlan
+from router.engine.pacing import RateLimit
+from tests.engine.rig import Ledger
+
+MOST_COUNTERS = 1 << 16
+
+_MIDDLEWARE: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
+    "middleware_open": (c_void_p, ()),
+    "middleware_put": (None, (c_void_p, c_void_p, c_size_t, c_int64, c_int64)),
+    "middleware_set": (None, (c_void_p, c_bool, c_bool)),
+    "middleware_take": (c_int, (c_void_p, c_void_p, c_void_p, c_void_p)),
+    "middleware_takers": (c_int, (c_void_p,)),
+}
+
+
+def middleware(output: Path) -> ctypes.CDLL:
+    """The functions of middleware.c, in a library that is made as `output`."""
+    source = Path(__file__).with_name("middleware.c")
+    compile_c(["-shared", "-fPIC", str(source), f"-I{NATIVE}", "-o", str(output)])
+    loaded = ctypes.CDLL(str(output))
+    for name, (returned, taken) in _MIDDLEWARE.items():
+        function = getattr(loaded, name)
+        function.restype, function.argtypes = returned, taken
+    return loaded
+
+
+class Subscription:
+    """As `ros.receiving.RawSubscription`."""
+
+    capacity = 1000
+
+    def __init__(self, functions: ctypes.CDLL) -> None:
+        self._functions = functions
+        self.address: int = functions.middleware_open()
+        self._eventfd: int | None = None
+
+    def announce_to(self, eventfd: int | None) -> None:
+        self._eventfd = eventfd
+
+    def put(self, message: bytes, sent: int, received: int = 0) -> None:
+        self._functions.middleware_put(self.address, message, len(message), sent, received)
+        if self._eventfd is not None:
+            os.eventfd_write(self._eventfd, 1)
+
+    def set(self, *, is_stuck: bool = False, refuses: bool = False) -> None:
+        self._functions.middleware_set(self.address, is_stuck, refuses)
+
+    @property
+    def is_taken_from(self) -> bool:
+        """Whether the thread is in the middleware now."""
+        return bool(self._functions.middleware_takers(self.address))
+
+    def take_all(self) -> Sequence[object]:
+        taken = []
+        while not self._functions.middleware_take(self.address, None, None, None):
+            taken.append(object())
+        return taken
+
+
+class Board:
+    """What an endpoint gets. `address` is that of a `struct sender`."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._near.setblocking(False)
+        self._far.setblocking(False)
+        self.address: int = library.sender_open(self._near.fileno(), 0, 0)
+
+    def break_down(self) -> None:
+        """Sending fails from now on."""
+        broken = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(broken, self._near.fileno(), inheritable=False)
+        os.close(broken)
+
+    def received(self) -> list[bytes]:
+        """Return what has come since the last call."""
+        return list(self._take())
+
+    def _take(self) -> Iterator[bytes]:
+        with suppress(BlockingIOError):
+            while True:
+                yield self._far.recv(1 << 16)
+
+    def close(self) -> None:
+        self._near.close()
+        self._far.close()
+
+
+class Commanding:
+    """The thread with the commands of a program. It serves nothing before `serve`."""
+
+    def __init__(self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack) -> None:
+        self.program = program
+        self.library = library
+        self.counters = (c_int64 * MOST_COUNTERS)()
+        self._braked = (c_int64 * MOST_COUNTERS)()
+        self.names = Names()
+        self.events = Ring(library, 1 << 16)
+        self.boards = {endpoint.name: Board(library) for endpoint in program.senders}
+        for board in self.boards.values():
+            stack.callback(board.close)
+        self.deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self.names)
+        senders = cast("Mapping[str, NativeSender]", self.boards)
+        self.by_route: dict[str, NativeDeadman] = {
+            plan.route: self.deadmen.add(plan, program.counters, senders) for plan in program.deadmen
+        }
+        self._limits: dict[object, c.Limit] = {}
+        outlets = Outlets(
+            listeners={},
+            senders={endpoint: board.address for endpoint, board in self.boards.items()},
+            wanted={},
+            feeds=lambda route, names: [(self.by_route[name].address, name != route) for name in names],
+            limit=self._limit,
+            carried=lambda _: (),
+            parts=lambda _: (),
+            names=self.names,
+        )
+        self.commands = native_commands(program, outlets)
+        self.subscriptions = {topic: Subscription(functions) for topic in self.commands.topics}
+        take, reset = (ctypes.cast(getattr(functions, name), c_void_p).value for name in _CALLED)
+        assert take
+        assert reset
+        self.thread = CommandThread(library, self.deadmen.address, self.counters, self.events, take, reset)
+        stack.callback(self.thread.stop)
+
+    def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
+        assert target.max_rate is not None
+        period = RateLimit.period(target.max_rate)
+        return self._limits.setdefault(
+            (handler.route, handler.topic, target), c.Limit(period, period - period // 2, -period)
+        )
+
+    def serve(self, subscriptions: Mapping[str, Subscription] | None = None) -> None:
+        self.thread.serve(self.commands, subscriptions or self.subscriptions)
+
+    def ledger(self) -> Ledger:
+        size = max(index for _, index in self.program.counters.series()) + 1
+        return Ledger(self.program, self.thread.counters(size))
+
+    def count(self, metric: str, *labels: str) -> int:
+        return self.thread.counters(MOST_COUNTERS)[self.program.counters.index(metric, *labels)]
+
+    def losses(self) -> list[tuple[Any, ...]]:
+        """The route, target, reason and errno of each event since the last call."""
+        records, found = bytes(self.events.take()), []
+        for at in range(0, len(records), 32):
+            _, _, route, target, reason, error, _, _ = memoryview(records[at : at + 32]).cast("i")
+            found.append((self.names.name(route), self.names.name(target), reason, error))
+        return found
+
+
+_CALLED = "middleware_take", "middleware_reset"

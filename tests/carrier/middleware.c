@@ -1,0 +1,87 @@
+/* A middleware for tests, whose messages Python puts. `take` is what the carrier's thread gets. A library of its own. */
+#include <pthread.h>
+#include <stdbool.h>
+#include <string.h>
+
+#include "rcl_types.h"
+
+enum { MOST_MESSAGES = 4096, REFUSED = 1 };
+
+struct message {
+    uint8_t *data;
+    size_t size;
+    int64_t sent, received;
+};
+
+struct subscription {
+    pthread_mutex_t lock;
+    pthread_cond_t changed;
+    struct message messages[MOST_MESSAGES];
+    size_t first, count;
+    bool is_stuck, refuses;
+    int takers; /* that are inside now */
+};
+
+struct subscription *middleware_open(void) {
+    struct subscription *made = calloc(1, sizeof *made);
+    pthread_mutex_init(&made->lock, NULL);
+    pthread_cond_init(&made->changed, NULL);
+    return made;
+}
+
+void middleware_put(struct subscription *to, const void *data, size_t size, int64_t sent, int64_t received) {
+    pthread_mutex_lock(&to->lock);
+    struct message *message = &to->messages[(to->first + to->count++) % MOST_MESSAGES];
+    *message = (struct message){malloc(size ? size : 1), size, sent, received};
+    memcpy(message->data, data, size);
+    pthread_mutex_unlock(&to->lock);
+}
+
+/* Have whoever takes wait, or go on. */
+void middleware_set(struct subscription *of, bool is_stuck, bool refuses) {
+    pthread_mutex_lock(&of->lock);
+    of->is_stuck = is_stuck;
+    of->refuses = refuses;
+    pthread_cond_broadcast(&of->changed);
+    pthread_mutex_unlock(&of->lock);
+}
+
+int middleware_takers(struct subscription *of) {
+    pthread_mutex_lock(&of->lock);
+    int takers = of->takers;
+    pthread_mutex_unlock(&of->lock);
+    return takers;
+}
+
+static int take_first(struct subscription *from, struct serialized_message *to, struct message_info *info) {
+    if (from->refuses) return REFUSED;
+    if (!from->count) return TAKE_FAILED;
+    struct message message = from->messages[from->first];
+    from->first = (from->first + 1) % MOST_MESSAGES;
+    from->count--;
+    if (to) {
+        if (to->capacity < message.size) {
+            to->buffer = to->allocator.reallocate(to->buffer, message.size, to->allocator.state);
+            to->capacity = message.size;
+        }
+        memcpy(to->buffer, message.data, message.size);
+        to->length = message.size;
+        info->source_timestamp = message.sent;
+        info->received_timestamp = message.received;
+    }
+    free(message.data);
+    return 0;
+}
+
+int middleware_take(struct subscription *from, struct serialized_message *to, struct message_info *info, void *unused) {
+    (void)unused;
+    pthread_mutex_lock(&from->lock);
+    from->takers++;
+    while (from->is_stuck) pthread_cond_wait(&from->changed, &from->lock);
+    int error = take_first(from, to, info);
+    from->takers--;
+    pthread_mutex_unlock(&from->lock);
+    return error;
+}
+
+void middleware_reset(void) {}

@@ -1,0 +1,409 @@
+"""The thread for commands from ROS: what becomes of each message, reloads, stops, a middleware that is stuck."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import struct
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+from router.carrier.build import NATIVE, compile_c
+from router.carrier.commands import NativeCommands
+from router.clock import monotonic_ns, wall_ns
+from router.compiler.metrics import HISTOGRAM_CELLS
+from router.threads import StuckError
+from tests.carrier.commanding import Commanding, Subscription, middleware
+from tests.engine.rig import Rig, program
+
+ROUTES = """\
+  drive_motor:
+    source: ros
+    topics: [{topic: drive, type: comms/msg/DrivingBoardMotorMessage}]
+    fields: auto
+    destinations: [driving_board, {endpoint: recorder, max_rate: 0.001 Hz}]
+    ttl: 200ms
+    deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], repeat: 100ms,
+              hands_over_to: [arm_target]}
+  arm_target:
+    source: ros
+    topics: [{topic: arm, type: comms/msg/ArmBoardTargetMovement}]
+    fields: auto
+    destinations: [driving_board]
+    deadman: a target is sent once
+  arm_ctrl:
+    source: ros
+    topics: [{topic: arm, type: comms/msg/ArmBoardTargetMovement}]
+    fields: {control_base: target_x}
+    destinations: [driving_board]
+    deadman: for tests
+"""
+STAMPED = """\
+  drive_motor:
+    source: ros
+    topics: [{topic: drive, type: geometry_msgs/msg/TwistStamped}]
+    fields: {distance_to_go: float32(twist.linear.x), turning_radius: float32(twist.angular.z)}
+    destinations: [driving_board]
+    ttl: 200ms
+    deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], repeat: 100ms}
+"""
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="session")
+def functions(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    return middleware(tmp_path_factory.mktemp("middleware") / "middleware.so")
+
+
+Open = Callable[..., Commanding]
+
+
+@pytest.fixture
+def opened(library: ctypes.CDLL, functions: ctypes.CDLL, tmp_path: Path) -> Iterator[Open]:
+    """Opens a table of these routes, and serves it."""
+    with ExitStack() as stack:
+
+        def made(routes: str = ROUTES) -> Commanding:
+            commanding = Commanding(library, functions, program(tmp_path, routes), stack)
+            commanding.serve()
+            return commanding
+
+        yield made
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    deadline = monotonic() + 20
+    while not condition():
+        assert monotonic() < deadline, "it never happened"
+        sleep(0.002)
+
+
+def drive(distance: float, radius: float = 0.0) -> bytes:
+    return b"\0\1\0\0" + struct.pack("<ff", distance, radius)
+
+
+def arm(x: float) -> bytes:
+    return b"\0\1\0\0" + struct.pack("<ffffB3xf", x, 0, 0, 0, 1, 0)
+
+
+def twist(x: float, stamp: int) -> bytes:
+    seconds, nanoseconds = divmod(stamp, SECOND)
+    head = struct.pack("<iII4x", seconds, nanoseconds, 1)
+    return b"\0\1\0\0" + head + struct.pack("<6d", x, 0, 0, 0, 0, -0.0)
+
+
+def of(datagram: bytes) -> float:
+    """The distance of a drive command that is not zero, behind the heads of envelope and field."""
+    distance: float = struct.unpack_from("<f", datagram, 3)[0]
+    return distance
+
+
+# ---- against the engine in Python
+
+Messages = Mapping[str, list[tuple[Callable[[int], bytes], int]]]
+"""By topic: messages made with the wall clock, and how long ago (ns) they were sent."""
+
+
+def compare(commanding: Commanding, messages: Messages) -> None:
+    """Both engines serve the messages: the same counts and the same datagrams."""
+    rig = Rig(commanding.program)
+    rig.now = SECOND * 1000
+    taken = 0
+    for topic, sent in messages.items():
+        for make, age in sent:
+            now = wall_ns()
+            commanding.subscriptions[topic].put(make(now), now - age)
+            rig.arrived_before = age
+            rig.take(topic, make(rig.WALL + rig.now))
+        handlers = commanding.program.outbound[topic]
+        taken += len(sent) * len(handlers)
+        wait_until(lambda: commanding.ledger().total("messages_received") == taken)  # noqa: B023 - at once
+    counted = ("messages_", "datagrams_", "sent_")
+    assert commanding.ledger().counted(*counted) == rig.counted(*counted)
+    for endpoint, board in commanding.boards.items():
+        assert board.received() == [datagram for name, datagram in rig.sent if name == endpoint]
+    assert list(commanding.ledger().imbalances()) == []
+    losses = [(route, target) for route, target, *_ in commanding.losses()]
+    assert losses == [(report.place, report.target) for report in rig.reports]
+    for route in {handler.route for handlers in commanding.program.outbound.values() for handler in handlers}:
+        timed = sum(
+            commanding.thread.counters(1 << 16)[
+                commanding.program.counters.index("route_duration_seconds", route) + part
+            ]
+            for part in range(HISTOGRAM_CELLS - 1)
+        )
+        assert timed == commanding.ledger().total("messages_received", route)
+        last = commanding.count("route_last_message_timestamp_seconds", route)
+        assert abs(wall_ns() - last) < 60 * SECOND if timed else last == 0
+
+
+def test_messages_come_to_what_they_come_to_in_python(opened: Open) -> None:
+    compare(
+        opened(),
+        {
+            "drive": [
+                (lambda _: drive(1.5, -2), 0),
+                (lambda _: drive(2.5), SECOND),  # stale
+                (lambda _: drive(0.0, -0.0), 0),  # its second destination is limited
+                (lambda _: drive(3)[:9], 0),  # cut
+                (lambda _: b"\0\0" + drive(3)[2:], 0),  # big-endian
+                (lambda _: b"", 0),
+                (lambda _: drive(4) + b"more", 0),
+            ],
+            "arm": [(lambda _: arm(7), 100 * SECOND), (lambda _: arm(8)[:8], 0)],
+        },
+    )
+
+
+def test_the_age_counts_from_the_stamp_where_there_is_one(opened: Open) -> None:
+    compare(
+        opened(STAMPED),
+        {
+            "drive": [
+                (lambda now: twist(1, now), 0),
+                (lambda now: twist(2, now - SECOND), 0),  # stale by its stamp
+                (lambda now: twist(3, now), SECOND),  # stale as it was sent long ago
+                (lambda _: twist(4, 0), 0),  # without a stamp
+                (lambda now: twist(5, now + SECOND), 0),  # by a clock that is ahead
+                (lambda now: twist(1e39, now), 0),  # no float32
+            ]
+        },
+    )
+
+
+def test_a_message_without_times_is_as_old_as_its_receipt(opened: Open) -> None:
+    commanding = opened()
+    commanding.subscriptions["drive"].put(drive(1), 0, 0)
+    commanding.subscriptions["drive"].put(drive(2), 0, wall_ns() - SECOND)
+    commanding.subscriptions["drive"].put(drive(3), wall_ns(), wall_ns() - SECOND)
+    commanding.subscriptions["drive"].put(drive(4), wall_ns() + SECOND, wall_ns())
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 4)
+    assert [of(each) for each in commanding.boards["driving_board"].received()] == [1, 4]
+
+
+def test_what_cannot_be_sent_is_counted_and_reported(opened: Open) -> None:
+    commanding = opened()
+    commanding.boards["driving_board"].break_down()
+    commanding.subscriptions["drive"].put(drive(1), wall_ns())
+    wait_until(lambda: commanding.count("messages_dropped", "drive_motor", "driving_board", "send_error"))
+    assert commanding.losses() == [("drive_motor", "driving_board", 6, errno.ENOTSOCK)]
+    assert len(commanding.boards["recorder"].received()) == 1
+
+
+# ---- order
+
+
+def test_commands_leave_in_the_order_in_which_they_came(opened: Open) -> None:
+    commanding = opened()
+    for number in range(1, 101):  # more than one turn
+        commanding.subscriptions["drive"].put(drive(number), wall_ns())
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 100)
+    sent = [of(each) for each in commanding.boards["driving_board"].received()]
+    assert sent == sorted(sent)
+    assert sent[-1] == 100
+
+
+def test_a_brake_leaves_behind_the_last_command_and_commands_of_others_disarm_it(opened: Open) -> None:
+    commanding = opened()
+    deadmen = commanding.deadmen.address
+    board = commanding.boards["driving_board"]
+    commanding.subscriptions["drive"].put(drive(1), wall_ns())
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
+    commanding.library.deadmen_serve(deadmen, monotonic_ns() + SECOND)
+    command, brake = board.received()
+    assert of(command) == 1
+    assert brake == commanding.program.deadmen[0].datagrams[0][1]
+    commanding.subscriptions["arm"].put(arm(1), wall_ns())
+    wait_until(lambda: commanding.count("messages_received", "arm_ctrl", "arm"))
+    assert len(board.received()) == 2
+    commanding.library.deadmen_serve(deadmen, monotonic_ns() + 10 * SECOND)
+    assert board.received() == []
+
+
+def test_a_stale_command_feeds_no_deadman(opened: Open) -> None:
+    commanding = opened()
+    commanding.subscriptions["drive"].put(drive(1), wall_ns() - SECOND)
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
+    commanding.library.deadmen_serve(commanding.deadmen.address, monotonic_ns() + SECOND)
+    assert commanding.boards["driving_board"].received() == []
+
+
+# ---- reloads and the stop
+
+
+def test_a_subscription_that_is_left_is_emptied_before_and_not_used_afterwards(
+    opened: Open, functions: ctypes.CDLL
+) -> None:
+    commanding = opened()
+    earlier = commanding.subscriptions["drive"]
+    later = Subscription(functions)
+    later.put(drive(1), wall_ns())  # which the earlier one has got as well, and served
+    earlier.announce_to(None)
+    earlier.put(drive(2), wall_ns())
+    commanding.serve({**commanding.subscriptions, "drive": later})
+    assert [of(each) for each in commanding.boards["driving_board"].received()] == [2]
+    earlier.put(drive(3), wall_ns())
+    later.put(drive(4), wall_ns())
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 2)
+    assert [of(each) for each in commanding.boards["driving_board"].received()] == [4]
+
+
+def test_what_came_before_a_topic_is_served_is_served_then(opened: Open) -> None:
+    commanding = opened()
+    commanding.thread.serve(NativeCommands(), {})
+    commanding.subscriptions["drive"].put(drive(1), wall_ns())
+    assert commanding.count("messages_received", "drive_motor", "drive") == 0
+    commanding.serve()
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive"))
+    assert len(commanding.boards["driving_board"].received()) == 1
+
+
+def test_a_reload_while_messages_come_loses_none(opened: Open) -> None:
+    commanding = opened()
+    for number in range(1, 501):
+        commanding.subscriptions["drive"].put(drive(number), wall_ns())
+        if number % 10 == 0:
+            commanding.serve()
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 500)
+
+
+def test_stopping_serves_what_has_arrived(opened: Open) -> None:
+    commanding = opened()
+    for subscription in commanding.subscriptions.values():
+        subscription.announce_to(None)
+    commanding.subscriptions["drive"].put(drive(1), wall_ns())
+    commanding.subscriptions["arm"].put(arm(1), wall_ns())
+    assert commanding.thread.stop()
+    assert commanding.count("messages_received", "drive_motor", "drive") == 1
+    assert commanding.count("messages_received", "arm_target", "arm") == 1
+
+
+# ---- a middleware that is stuck, and one that refuses
+
+
+def test_a_reload_does_not_wait_for_the_middleware(opened: Open, functions: ctypes.CDLL) -> None:
+    commanding = opened()
+    subscription = commanding.subscriptions["drive"]
+    subscription.set(is_stuck=True)
+    subscription.put(drive(1), wall_ns())
+    wait_until(lambda: subscription.is_taken_from)
+    with pytest.raises(StuckError):
+        commanding.serve({**commanding.subscriptions, "drive": Subscription(functions)})
+    subscription.set(is_stuck=False)
+    subscription.put(drive(2), wall_ns())
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 2)
+    assert of(commanding.boards["driving_board"].received()[-1]) == 2
+
+
+def test_a_thread_that_is_stuck_is_left_and_sends_nothing_any_more(opened: Open) -> None:
+    commanding = opened()
+    subscription = commanding.subscriptions["drive"]
+    subscription.set(is_stuck=True)
+    subscription.put(drive(1), wall_ns())
+    wait_until(lambda: subscription.is_taken_from)
+    assert not commanding.thread.stop()
+    subscription.set(is_stuck=False)
+    wait_until(lambda: not subscription.is_taken_from)
+    assert commanding.count("messages_received", "drive_motor", "drive") == 0
+    assert commanding.boards["driving_board"].received() == []
+
+
+def test_a_middleware_that_refuses_is_counted(opened: Open) -> None:
+    commanding = opened()
+    subscription = commanding.subscriptions["drive"]
+    subscription.set(refuses=True)
+    subscription.put(drive(1), wall_ns())
+    wait_until(lambda: commanding.thread.failures)
+    subscription.set(refuses=False)
+    subscription.put(drive(2), wall_ns())
+    wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 2)
+
+
+# ---- what is lowered
+
+
+def test_a_topic_is_taken_by_one_executor(tmp_path: Path) -> None:
+    """What one of its routes needs Python for, all of them do."""
+    routes = ROUTES.replace("{control_base: target_x}", "{control_base: target_x * 2}")
+    made = program(tmp_path, routes)
+    assert list(made.commands) == ["drive"]
+    reasons = {key: executor.reason for key, executor in made.executors.items()}
+    needs_it = "`control_base: target_x * 2` needs it; its freshness is Python's"
+    assert reasons == {
+        ("drive_motor", "drive", "driving_board"): None,
+        ("drive_motor", "drive", "recorder"): None,
+        ("arm_target", "arm", "driving_board"): needs_it,
+        ("arm_ctrl", "arm", "driving_board"): needs_it,
+    }
+
+
+@pytest.mark.parametrize(
+    ("earlier", "later", "reason"),
+    [
+        ("BoardMotorMessage}", "BoardMotorMessage, when: turning_radius > 0}",
+         "`when: turning_radius > 0` needs it"),
+        ("[driving_board, {", "[{endpoint: driving_board, when: turning_radius > 0}, {",
+         "`when: turning_radius > 0` needs it"),
+        ("max_rate: 0.001 Hz}", "max_rate: 0.001 Hz, keep: latest}", "`keep: latest` needs it"),
+    ],
+)  # fmt: skip
+def test_what_may_be_sent_later_or_not_at_all_needs_python(
+    tmp_path: Path, earlier: str, later: str, reason: str
+) -> None:
+    made = program(tmp_path, ROUTES.replace(earlier, later))
+    executor = made.executors["drive_motor", "drive", "driving_board"]
+    assert executor.reason == f"{reason}; its freshness is Python's"
+    assert list(made.commands) == ["arm"]
+
+
+def test_topics_without_freshness_are_left_to_python(tmp_path: Path) -> None:
+    routes = """\
+  rover_localization:
+    source: ros
+    topics: [{topic: where, type: comms/msg/BasestationRoverLocalization}]
+    fields: auto
+    destinations: [basestation]
+"""
+    made = program(tmp_path, routes)
+    assert made.commands == {}
+    assert made.executors == {}
+
+
+# ---- types of rcl
+
+INCLUDE = Path(sys.prefix, "include")
+CHECK = """
+#include <stddef.h>
+#include "rcl/types.h"
+#include "rcutils/types/uint8_array.h"
+#include "rmw/types.h"
+#include "rcl_types.h"
+#define SAME(ours, our_field, theirs, their_field) \\
+    _Static_assert(offsetof(ours, our_field) == offsetof(theirs, their_field), #their_field)
+SAME(struct serialized_message, buffer, rcutils_uint8_array_t, buffer);
+SAME(struct serialized_message, length, rcutils_uint8_array_t, buffer_length);
+SAME(struct serialized_message, capacity, rcutils_uint8_array_t, buffer_capacity);
+SAME(struct serialized_message, allocator, rcutils_uint8_array_t, allocator);
+SAME(struct allocator, allocate, rcutils_allocator_t, allocate);
+SAME(struct allocator, deallocate, rcutils_allocator_t, deallocate);
+SAME(struct allocator, reallocate, rcutils_allocator_t, reallocate);
+SAME(struct allocator, zero_allocate, rcutils_allocator_t, zero_allocate);
+SAME(struct allocator, state, rcutils_allocator_t, state);
+SAME(struct message_info, source_timestamp, rmw_message_info_t, source_timestamp);
+SAME(struct message_info, received_timestamp, rmw_message_info_t, received_timestamp);
+_Static_assert(sizeof(struct serialized_message) == sizeof(rcutils_uint8_array_t), "size");
+_Static_assert(sizeof(struct message_info) >= sizeof(rmw_message_info_t), "room");
+_Static_assert(TAKE_FAILED == RCL_RET_SUBSCRIPTION_TAKE_FAILED, "code");
+"""
+
+
+@pytest.mark.skipif(not (INCLUDE / "rcl").exists(), reason="needs the headers of rcl")
+def test_the_types_of_rcl_are_as_we_declare_them(tmp_path: Path) -> None:
+    (tmp_path / "check.c").write_text(CHECK)
+    folders = [f"-I{folder}" for folder in (NATIVE, *(each for each in INCLUDE.iterdir() if each.is_dir()))]
+    compile_c(["-fsyntax-only", *folders, str(tmp_path / "check.c")])
