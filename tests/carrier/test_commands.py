@@ -18,6 +18,7 @@ from router.carrier.commands import NativeCommands
 from router.clock import monotonic_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
 from router.threads import StuckError
+from tests.carrier.building import MEMORY, RACES, run_program
 from tests.carrier.commanding import Commanding, Subscription, middleware
 from tests.engine.rig import Rig, program
 
@@ -322,6 +323,14 @@ def test_a_middleware_that_refuses_is_counted(opened: Open) -> None:
     subscription.set(refuses=False)
     subscription.put(drive(2), wall_ns())
     wait_until(lambda: commanding.count("messages_received", "drive_motor", "drive") == 2)
+
+
+@pytest.mark.parametrize(
+    "sanitizers",
+    ["", pytest.param(RACES, marks=pytest.mark.slow), pytest.param(MEMORY, marks=pytest.mark.slow)],
+)
+def test_programs_change_while_commands_come(tmp_path: Path, sanitizers: str) -> None:
+    run_program("commands", tmp_path, sanitizers=sanitizers)
 
 
 # ---- what is lowered

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import socket
 import struct
 from collections.abc import Iterator
@@ -12,7 +13,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.carrier.conftest import SANITIZED
+
 pytest.importorskip("rclpy", reason="needs ROS 2")
+if SANITIZED in os.environ:
+    pytest.skip("ROS does not start with sanitizers", allow_module_level=True)
 
 from rclpy.node import Node
 

@@ -10,15 +10,25 @@ import pytest
 
 from benchmarks.fuzz_carrier import fuzz
 from tests.carrier.decisions import SCHEMAS
+from tests.carrier.fuzz import build_convert
 from tests.carrier.fuzz.build import build
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
 def test_a_minute_of_libfuzzer(tmp_path: Path) -> None:
-    program = build(tmp_path)
-    command = [str(program), "-max_total_time=60", "-max_len=400", "-verbosity=0", f"-artifact_prefix={tmp_path}/"]
-    result = subprocess.run([*command, str(tmp_path / "corpus")], capture_output=True, text=True, check=False)
+    fuzz_for_a_minute(build(tmp_path), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
+def test_a_minute_of_libfuzzer_on_commands(tmp_path: Path) -> None:
+    fuzz_for_a_minute(build_convert.build(tmp_path), tmp_path)
+
+
+def fuzz_for_a_minute(program: Path, folder: Path) -> None:
+    command = [str(program), "-max_total_time=60", "-max_len=400", "-verbosity=0", f"-artifact_prefix={folder}/"]
+    result = subprocess.run([*command, str(folder / "corpus")], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
 
 
