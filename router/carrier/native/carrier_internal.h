@@ -50,9 +50,9 @@ int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void
 /* Whether an event may be written, which is then done. */
 bool may_report(struct reporter *reporter, int64_t now);
 
-/* Report that a target did not get a message. `counter` is that of such losses. */
+/* Report that a target did not get a message. `counted` is the counter of such losses. */
 void report_loss(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
-                 uint32_t counter);
+                 uint32_t counted);
 
 /* Report that `destination_send` has returned an errno. */
 void report_send_error(struct reporter *reporter, int64_t now, uint32_t route, const struct destination *to, int error);

@@ -50,8 +50,8 @@ bool may_report(struct reporter *reporter, int64_t now) {
 }
 
 void report_loss(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
-                 uint32_t counter) {
-    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error, counter, 0};
+                 uint32_t counted) {
+    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error, counted, 0};
     if (may_report(reporter, now)) ring_put(reporter->events, &event, sizeof event);
 }
 
