@@ -2,7 +2,8 @@
 
 Datagrams whose targets the carrier does not serve come by rings to two threads: `topics` publishes, which may block in
 the middleware, and `destinations` sends to endpoints that need Python. Each has its own engine with its own state, and
-changes to another program when it has served all that the earlier one received.
+changes to another program when it has served all that the earlier one received. Commands from ROS have a native thread
+(`ros_commands`), other messages from ROS the one in `ros`.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from socket import inet_ntoa
 from struct import Struct
 from typing import TYPE_CHECKING, cast
 
+from router.app.ros_commands import RosCommands, RosTopics
 from router.app.sockets import SocketChange
 from router.app.wiring import (
     RouterContext,
@@ -29,6 +31,7 @@ from router.app.wiring import (
 )
 from router.carrier import structures as c
 from router.carrier.carrier import Carrier
+from router.carrier.commands import native_commands
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.events import EventThread
 from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
@@ -71,6 +74,7 @@ class NativeWiring(Wiring):
     """`deadmen` are those of routes; `stages` by part."""
 
     native: NativeProgram
+    topics: RosTopics
     deadmen: Mapping[str, NativeDeadman]
     stages: Mapping[Part, Stage]
 
@@ -87,29 +91,40 @@ class NativeDatapath:
         self._wiring: NativeWiring | None = None
         self._is_running = False
         report, failed = context.reporter.report, context.reporter.failed
-        received, braked = Ring(library, _EVENTS), Ring(library, _EVENTS)
-        receive_counts, deadman_counts = _fixed_counts(), _fixed_counts()
+        received, commanded, braked = (Ring(library, _EVENTS) for _ in range(3))
+        receive_counts, command_counts, deadman_counts = (_fixed_counts() for _ in range(3))
         self._deadmen = Deadmen(library, deadman_counts, braked, self._names)
         self._carrier = Carrier(library, self._deadmen.address, receive_counts, received)
+        self._commands = RosCommands(library, self._deadmen.address, command_counts, commanded)
+        self._ros: RouterNode | None = None
         self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in _PARTS.items()}
         context.counts.add(_as_list(deadman_counts))
         context.counts.add(_as_list(receive_counts), self._carrier.counters)
+        context.counts.add(_as_list(command_counts), self._commands.counters)
         for worker in self._workers.values():
             context.counts.add(worker.counts, worker.copy_counts)
         self._mirrored = MirrorRing(Ring(library, _QUEUE), self._names)
         mirror.drain_by(self._mirrored.take)
         self._events = EventThread(
-            [(received, _as_list(receive_counts)), (braked, _as_list(deadman_counts))],
+            [
+                (received, _as_list(receive_counts)),
+                (commanded, _as_list(command_counts)),
+                (braked, _as_list(deadman_counts)),
+            ],
             self._names,
             report,
             context.deadman_changed,
             self._why_rejected,
-            self._carrier.pulse,
+            self._pulse,
         )
 
     @property
     def turns(self) -> int:
         return self._carrier.turns
+
+    def _pulse(self) -> None:
+        self._carrier.pulse()
+        self._commands.report_failures()
 
     def open_listener(self, settings: model.Listener) -> Listener:
         return Listener(settings, is_stamped=True)
@@ -185,17 +200,28 @@ class NativeDatapath:
             )
             for part in Part
         }
+        commands = native_commands(program, outlets)
+        commands.arrays += [senders, deadmen]
+        self._commands.open(commands)
+        self._ros = ros
         for part, stage in stages.items():
             self._workers[part].prepare(stage)
         return NativeWiring(
             program=program,
-            take={plan.label: outbound.taker(plan.label) for plan in program.subscriptions},
+            take={
+                plan.label: outbound.taker(plan.label)
+                for plan in program.subscriptions
+                if plan.label not in commands.topics
+            },
             feed=feeder(behind_gateways, timers.inbound_deadman.locked),
             states=states,
             gateway_deadmen=behind_gateways,
             pacers=pacers,
             engines=(outbound, *parts.values()),
             native=native,
+            topics=RosTopics(
+                commands, {topic: each.raw for topic, each in topics.subscriptions.items()} if topics else {}
+            ),
             deadmen=deadmen,
             stages=stages,
         )
@@ -226,8 +252,15 @@ class NativeDatapath:
 
     # running
 
-    def between(self, swap: Callable[[], None]) -> None:
-        swap()
+    def between(self, wiring: Wiring, swap: Callable[[], None]) -> None:
+        assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
+        assert self._wiring is not None  # noqa: S101 - another program runs
+        self._commands.leave(wiring.topics, keeps=wiring.deadmen == self._wiring.deadmen)
+        try:
+            swap()
+        except BaseException:
+            self._commands.stay()
+            raise
 
     def adopt(self, wiring: Wiring, earlier: Wiring | None, left: Sequence[Listener], now: Sequence[Listener]) -> None:
         assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
@@ -237,6 +270,7 @@ class NativeDatapath:
             for listener in left:
                 listener.end_input()
             self._change(wiring, earlier)
+        self._commands.serve(wiring.topics)
         self._wiring = wiring
 
     def _change(self, wiring: NativeWiring, earlier: NativeWiring) -> None:
@@ -273,7 +307,8 @@ class NativeDatapath:
         assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
         if not self._is_running:
             return True
-        return not left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
+        late = left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
+        return not late and self._commands.has_passed
 
     def observe(self, *, is_observed: bool) -> None:
         lost = self._context.counts.counters.index("mirror_dropped")
@@ -291,8 +326,14 @@ class NativeDatapath:
         stuck = [worker.name for worker in self._workers.values() if not worker.stop(_PATIENCE_S)]
         if stuck:
             logger.error("a thread is stuck, and the router ends without it", threads=stuck)
+        self._stop_commands()
+
+    def _stop_commands(self) -> None:
+        if not self._commands.stop() and self._ros is not None:
+            self._ros.leave_open()
 
     def close(self) -> None:
+        self._stop_commands()  # if the start has failed
         for deadman in self._wiring.deadmen.values() if self._wiring else ():
             deadman.end()
         self._events.close()
@@ -366,7 +407,8 @@ def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
     rate = target.max_rate
     assert rate is not None  # noqa: S101 - asked for by the caller
     period = RateLimit.period(rate)
-    return state.keep(("native limit", handler.route, target), lambda: c.Limit(period, period - period // 2, -period))
+    key = "native limit", handler.route, handler.topic, target
+    return state.keep(key, lambda: c.Limit(period, period - period // 2, -period))
 
 
 def _moves_to_carrier(earlier: Program, later: Program) -> bool:

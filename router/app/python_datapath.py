@@ -113,7 +113,7 @@ class PythonDatapath:
     def abandon(self, wiring: Wiring) -> None:
         """There is nothing but timers, which the caller releases."""
 
-    def between(self, swap: Callable[[], None]) -> None:
+    def between(self, wiring: Wiring, swap: Callable[[], None]) -> None:
         self._receiving.call_between(swap)
 
     def adopt(self, wiring: Wiring, earlier: Wiring | None, left: Sequence[Listener], now: Sequence[Listener]) -> None:

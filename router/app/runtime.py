@@ -115,7 +115,7 @@ class Runtime:
         try:
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
-            self.datapath.between(lambda: self._swap(change))
+            self.datapath.between(change.wiring, lambda: self._swap(change))
         except BaseException:
             change.undo.close()
             raise

@@ -200,8 +200,11 @@ class Datapath(Protocol):
     def abandon(self, wiring: Wiring) -> None:
         """Undo `wire`, for a program that will not run."""
 
-    def between(self, swap: Callable[[], None]) -> None:
-        """Call `swap`, which calls `adopt`, when no function of the running program is called by the datapath."""
+    def between(self, wiring: Wiring, swap: Callable[[], None]) -> None:
+        """Call `swap`, which calls `adopt` with this wiring, when it does not disturb what the running program does.
+
+        Raises StuckError, and what `swap` raises, with nothing changed.
+        """
 
     def adopt(self, wiring: Wiring, earlier: Wiring | None, left: Sequence[Listener], now: Sequence[Listener]) -> None:
         """Receive with another program from the listeners `now`, and no longer from `left`, which are emptied.

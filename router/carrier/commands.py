@@ -181,7 +181,7 @@ class CommandThread:
                     eventfds[subscription] = eventfd = self._watched(subscription)
                     adding.callback(self._leave, subscription, eventfd)
             if earlier:
-                _forget_what_is_served(earlier.subscriptions, subscriptions)
+                forget_what_is_served(earlier.subscriptions, subscriptions)
             served = _served(commands, subscriptions, {each: eventfds[each] for each in subscriptions.values()})
             if not self._library.commands_serve(self._address, ctypes.byref(served.structure)):
                 raise StuckError("the thread for commands from ROS is stuck in the middleware: try again")
@@ -246,7 +246,7 @@ def _served(
     return _Served(commands, subscriptions, eventfds, array, c.CommandSet(topics=array, count=len(topics)))
 
 
-def _forget_what_is_served(earlier: Mapping[str, Subscription], later: Mapping[str, Subscription]) -> None:
+def forget_what_is_served(earlier: Mapping[str, Subscription], later: Mapping[str, Subscription]) -> None:
     """Take from subscriptions that replace others what the earlier ones have got as well, and serve."""
     replacing = [each for topic, each in later.items() if earlier.get(topic, each) is not each]
     for subscription in replacing:

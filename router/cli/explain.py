@@ -11,6 +11,7 @@ from router.cli.findings import is_coloured, print_findings
 from router.cli.tool_options import positive
 from router.compiler import Checked, check_table
 from router.compiler.checked import CheckedRoute
+from router.compiler.commands import lower_commands
 from router.compiler.executors import Executors, executors
 from router.compiler.link import compile_handlers
 from router.compiler.lookup import Definitions
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     for name in args.names:
         if name not in known:
             raise UsageError(f"{args.table} has no route or gateway '{name}'; {did_you_mean(name, known)}")
-    executed_by = executors(checked.routes)
+    executed_by = {**executors(checked.routes), **lower_commands(checked.routes).executors}
     topics = known_topics(checked.table) if args.live is None else seen_topics(checked.table, args.live)
     for name in args.names or known:
         for route in routes.get(name, ()):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from time import sleep
@@ -221,14 +221,18 @@ def left_by(kept: Mapping[str, Opened], now: Mapping[str, Opened]) -> list[Opene
 
 
 def hand_over(
-    messages: MessageThread, now: Mapping[str, Subscription], then: Mapping[str, Subscription]
+    messages: MessageThread,
+    now: Mapping[str, Subscription],
+    then: Mapping[str, Subscription],
+    received: Container[str],
 ) -> list[tuple[str, bytes, int]]:
-    """Serve what has arrived on subscriptions that are not kept, while `messages` is paused.
+    """Serve what has arrived on subscriptions of `messages` that are not kept, while it is paused.
 
     A topic whose subscription is replaced receives each message twice: those that came until now are served from the
-    old subscription. Returns those that only the new one has: topic, CDR bytes and time at which they set out.
+    old subscription. Returns those that only the new one has, of topics that are `received`: topic, CDR bytes and time
+    at which they set out.
     """
-    left = left_by(then, now)
+    left = [each for each in left_by(then, now) if messages.serves(each.raw)]
     replaced = {each.plan.label: then[each.plan.label] for each in left if each.plan.label in then}
     if replaced:
         sleep(_IN_TRANSIT_S)  # then what was served before the pause has reached the new subscription as well
@@ -240,6 +244,7 @@ def hand_over(
     return [
         (topic, *message)
         for topic, each in replaced.items()
+        if topic in received
         for message in each.raw.take_all()
         if message not in served[topic]
     ]

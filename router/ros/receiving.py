@@ -198,11 +198,14 @@ class MessageThread:
             opening.pop_all()
         return thread
 
-    def stop(self) -> None:
+    def stop(self) -> bool:
+        """Return False if the thread is stuck in the middleware, and left: then subscriptions must stay open."""
         self._stopping = True
         self._arrivals.wake()
-        if join_or_leave(self._thread):
+        has_ended = join_or_leave(self._thread)
+        if has_ended:
             self._arrivals.close()
+        return has_ended
 
     def paused(self) -> AbstractContextManager[None]:
         """The thread takes no message inside. Raises StuckError."""
@@ -221,6 +224,9 @@ class MessageThread:
         for subscription in self._receive.keys() - receive.keys():
             self._arrivals.remove(subscription)
         self._receive = dict(receive)
+
+    def serves(self, subscription: RawSubscription) -> bool:
+        return subscription in self._receive
 
     def finish(self, subscription: RawSubscription) -> list[tuple[bytes, int]]:
         """Serve what has arrived on a subscription that is going to be removed, and return it. While paused."""

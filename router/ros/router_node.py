@@ -52,6 +52,7 @@ class RouterNode:
         self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
         self._is_stuck = False
+        self._is_taken_from = False  # by a thread that is left
         self._failed: Callable[[Exception], None] | None = None
         self._peers = PeerEvents(incompatible, subscriber_joined)
         self.subscribed: Collection[str] = self._peers.subscribed
@@ -71,7 +72,7 @@ class RouterNode:
     def start(self, receive: Mapping[str, Receive], failed: Callable[[Exception], None]) -> None:
         """Pass each message to `receive[topic]`, in one thread. `failed` is called with what that raises.
 
-        Raises StartError.
+        Subscriptions of other topics are left to whoever takes their messages. Raises StartError.
         """
         self._failed = failed
         self._receive(self._subscriptions, receive)
@@ -79,8 +80,13 @@ class RouterNode:
     def stop_receiving(self) -> None:
         """Serve what has arrived, and stop receiving. Publishing goes on."""
         if self._messages:
-            self._messages.stop()
+            if not self._messages.stop():
+                self.leave_open()
             self._messages = None
+
+    def leave_open(self) -> None:
+        """Have `close` leave subscriptions and node open: a thread is stuck where it takes messages."""
+        self._is_taken_from = self._is_stuck = True
 
     def close(self) -> None:
         """To be called when no thread publishes."""
@@ -132,7 +138,8 @@ class RouterNode:
             *left_by(change.publications, self._publications),
             *left_by(change.subscriptions, self._subscriptions),
         ]
-        more = hand_over(self._messages, self._subscriptions, change.subscriptions) if self._messages else ()
+        messages, now = self._messages, self._subscriptions
+        more = hand_over(messages, now, change.subscriptions, receive) if messages else ()
         self._receive(change.subscriptions, receive)
         self._use(change)
         for topic, cdr, sent_at in more:
@@ -156,7 +163,7 @@ class RouterNode:
         self.wanted.update((topic, each.wanted) for topic, each in change.publications.items())
 
     def _receive(self, subscriptions: Mapping[str, Subscription], receive: Mapping[str, Receive]) -> None:
-        served = {each.raw: receive[topic] for topic, each in subscriptions.items()}
+        served = {each.raw: receive[topic] for topic, each in subscriptions.items() if topic in receive}
         try:
             if self._messages:
                 self._messages.serve(served)
@@ -185,7 +192,8 @@ class RouterNode:
 
     def _close_one(self, endpoint: Publication | Subscription) -> None:
         if isinstance(endpoint, Subscription):
-            endpoint.close()
+            if not self._is_taken_from:
+                endpoint.close()
         elif not endpoint.close():
             self._is_stuck = True
 

@@ -1,0 +1,107 @@
+"""Commands from ROS that a native thread serves, from one program to the next.
+
+Topics that another thread is to serve, or from another subscription, are left before the swap. All others are served by
+the earlier program until the swap is done, unless deadmen change: those of two programs do not get feeds in turns.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from router.carrier.commands import CommandThread, NativeCommands, Subscription, forget_what_is_served
+from router.carrier.ring import Ring
+from router.errors import StartError
+from router.log import logger
+from router.threads import StuckError
+
+
+@dataclass(frozen=True, slots=True)
+class RosTopics:
+    """What a program makes of commands from ROS, and its subscriptions by topic: all of them, whoever serves them."""
+
+    commands: NativeCommands
+    subscriptions: Mapping[str, Subscription]
+
+
+class RosCommands:
+    """The thread, which starts with the first program that has commands for it.
+
+    `deadmen` is the address of the carrier's, `counts` the array that the thread counts in.
+    """
+
+    def __init__(self, library: ctypes.CDLL, deadmen: int, counts: ctypes.Array[ctypes.c_int64], events: Ring) -> None:
+        self._library = library
+        self._deadmen = deadmen
+        self._counts = counts
+        self._events = events
+        self._thread: CommandThread | None = None
+        self._served = RosTopics(NativeCommands(), {})
+        self._refused = 0
+        self.has_passed = True
+        """Whether the thread serves what it was last told to serve."""
+
+    def counters(self, count: int) -> list[int]:
+        """Return the first counters, as they are between two messages."""
+        return self._thread.counters(count) if self._thread else list(self._counts[:count])
+
+    def open(self, commands: NativeCommands) -> None:
+        """Start the thread if these need it. Raises StartError."""
+        if self._thread is not None or not commands.topics:
+            return
+        from router.ros.receiving import RESET, TAKE  # rclpy is there: the topics are open
+
+        try:
+            self._thread = CommandThread(self._library, self._deadmen, self._counts, self._events, TAKE, RESET)
+        except MemoryError as error:
+            raise StartError(str(error)) from error
+
+    def leave(self, next_one: RosTopics, *, keeps: bool) -> None:
+        """Cease to serve what the next program does not have, or everything, once what has arrived is served.
+
+        Raises StuckError, with nothing changed.
+        """
+        if self._thread is None:
+            return
+        now, then = self._served, next_one.subscriptions
+        kept = [topic for topic in now.commands.topics if keeps and topic in next_one.commands.topics]
+        kept = [topic for topic in kept if then[topic] is now.subscriptions[topic]]
+        forget_what_is_served(now.subscriptions, {topic: then[topic] for topic in now.commands.topics if topic in then})
+        commands = NativeCommands({topic: now.commands.topics[topic] for topic in kept}, now.commands.arrays)
+        self._thread.serve(commands, {topic: then[topic] for topic in kept})
+
+    def stay(self) -> None:
+        """Undo `leave`."""
+        self.serve(self._served)
+
+    def serve(self, next_one: RosTopics) -> None:
+        """Serve other topics, or by another program. What fails is logged; what was served before is served then."""
+        if self._thread is None:
+            return
+        try:
+            commands, subscriptions = next_one.commands, next_one.subscriptions
+            self._thread.serve(commands, {topic: subscriptions[topic] for topic in commands.topics})
+        except (StuckError, OSError, RuntimeError) as error:  # those of rcl are RuntimeErrors
+            logger.error("commands from ROS are not served as the table says until it is reloaded", why=str(error))
+            self.has_passed = False
+        else:
+            self._served = next_one
+            self.has_passed = True
+
+    def report_failures(self) -> None:
+        """Log how often the middleware has refused to hand out a message since the last call."""
+        refused = self._thread.failures if self._thread else 0
+        if refused > self._refused:
+            logger.error("the middleware has not handed out commands that it has", times=refused - self._refused)
+        self._refused = refused
+
+    def stop(self) -> bool:
+        """Serve what has arrived, and end. Return False if the thread is stuck: subscriptions must stay open then.
+
+        Idempotent.
+        """
+        has_ended = self._thread is None or self._thread.stop()
+        if not has_ended:
+            logger.error("the thread for commands from ROS is stuck, and the router ends without it")
+        return has_ended
