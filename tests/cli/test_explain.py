@@ -62,6 +62,17 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
     )
 
 
+def test_who_serves_commands_from_ros_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "table.yaml"
+    rover = ROUTES / "rover.yaml"
+    table.write_text(f"version: 1\nextends: {rover}\nroutes: {{arm_target: {{fields: {{target_x: target_x * 2}}}}}}\n")
+    told = explained(capsys, table, "drive_motor", "arm_target", "rover_localization", "--no-code")
+    assert [line.strip() for line in told.splitlines() if line.startswith("    by ")] == [
+        "by the carrier",
+        f"by Python: `target_x: target_x * 2` needs it; its freshness is Python's  ({table}:3:42)",
+    ]
+
+
 def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_element(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
