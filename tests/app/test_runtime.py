@@ -21,6 +21,8 @@ from structlog.testing import capture_logs
 
 from router.app import Router
 from router.app.native_datapath import NativeDatapath
+from router.carrier.carrier import Carrier
+from router.carrier.worker import Worker
 from router.engine.dispatch import Receive
 from router.errors import StartError
 from router.net.receiver import ReceiveThread
@@ -168,6 +170,21 @@ def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkey
         site.send(PH)
         assert site.basestation.recv(1000) == PH
     assert seen == [PH]
+
+
+def test_a_scrape_reads_what_was_served_before_what_was_received(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else what is received and served in between would be served without having waited: fewer than none would wait."""
+    read: list[str] = []
+
+    def noted(kind: type[Carrier | Worker], name: str) -> None:
+        original = getattr(kind, name)
+        monkeypatch.setattr(kind, name, lambda of, size: (read.append(kind.__name__), original(of, size))[1])
+
+    noted(Carrier, "counters")
+    noted(Worker, "copy_counts")
+    with Router(site.program(ROUTE)) as router:
+        list(router.collect())
+    assert read in ([], ["Worker", "Worker", "Carrier"])
 
 
 def test_metrics_are_served_while_it_runs(site: Site) -> None:

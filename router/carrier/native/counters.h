@@ -2,10 +2,10 @@
 #ifndef COUNTERS_H
 #define COUNTERS_H
 
-#include <sched.h>
 #include <stdatomic.h>
 #include <stdbool.h>
 #include <stdint.h>
+#include <unistd.h>
 
 typedef _Atomic int64_t counter;
 
@@ -38,7 +38,7 @@ static inline bool counters_copy(edition *of, counter *counters, int64_t *to, ui
             to[index] = atomic_load_explicit(&counters[index], memory_order_relaxed);
         atomic_thread_fence(memory_order_acquire);
         if (before % 2 == 0 && atomic_load_explicit(of, memory_order_relaxed) == before) return true;
-        sched_yield();
+        usleep(50); /* the thread may have been interrupted by others */
     }
     return false;
 }

@@ -272,14 +272,12 @@ static void adopt(struct carrier *carrier, const struct change *change) {
     atomic_store(&carrier->adopted, change);
 }
 
-/* Adopt the next program if there is one. Return whether there was one. */
-static bool has_changed(struct carrier *carrier) {
-    const struct change *next = atomic_load_explicit(&carrier->next, memory_order_acquire);
-    if (!next) return false;
-    atomic_store(&carrier->next, NULL);
+/* Adopt the next program if there is one. The caller must not use the earlier one any more: its memory may go. */
+static void adopt_next(struct carrier *carrier) {
+    const struct change *next = atomic_exchange(&carrier->next, NULL);
+    if (!next) return;
     adopt(carrier, next);
     wait_for_resume(carrier);
-    return true;
 }
 
 static bool is_stopping(struct carrier *carrier) {
@@ -289,7 +287,7 @@ static bool is_stopping(struct carrier *carrier) {
 static bool goes_on(struct carrier *carrier) {
     brake(carrier);
     atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_relaxed);
-    return !is_stopping(carrier) && !has_changed(carrier);
+    return !is_stopping(carrier) && !atomic_load_explicit(&carrier->next, memory_order_relaxed);
 }
 
 /* With one system call per datagram: a receive that blocks. */
@@ -321,6 +319,7 @@ void *receive_thread(void *of) {
     while (!is_stopping(carrier)) {
         if (carrier->program->listener_count == 1) receive_from_one(carrier);
         else receive_from_many(carrier, carrier->epoll);
+        adopt_next(carrier);
     }
     for (uint32_t index = 0; index < carrier->program->listener_count; index++)
         if (!carrier->program->listeners[index].keeps_input) drain(carrier, &carrier->program->listeners[index]);
