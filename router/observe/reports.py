@@ -14,7 +14,7 @@ class Reporter:
     def __init__(self) -> None:
         self._floods = FloodLog()
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._summarise, name="log")
+        self._thread = threading.Thread(target=self._summarise, name="log", daemon=True)  # the start may fail
         self._thread.start()
 
     def close(self) -> None:

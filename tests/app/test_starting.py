@@ -125,6 +125,13 @@ def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table
     end(process)
 
 
+def test_a_carrier_that_there_is_not_ends_the_start(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With no thread left that keeps the process alive, while signals are blocked."""
+    monkeypatch.setenv("ROUTER_CARRIER", "rust")
+    said = "router run: ROUTER_CARRIER is 'rust'; set it to 'native' or 'python', or unset it"
+    assert ended("run", table) == (78, [said])
+
+
 def test_a_machine_without_ros_is_told_what_to_do(table: Path, tmp_path: Path) -> None:
     without = tmp_path / "without_ros"
     without.mkdir()
