@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Sequence
+from threading import Lock
 
 from router.carrier import structures as c
 from router.carrier.program import NativeProgram
@@ -25,6 +26,7 @@ class Carrier:
         """Raises MemoryError."""
         self._library = library
         self._counters, self._events = counters, events
+        self._in_use = Lock()  # for those who may call while the carrier is closed
         self._carrier: int = library.carrier_open(deadmen, counters, events.address)
         self._running: tuple[object, ...] = ()
         if not self._carrier:
@@ -33,14 +35,16 @@ class Carrier:
     @property
     def turns(self) -> int:
         """A number that grows at least every 50 ms unless the receive thread is stuck."""
-        return int(self._library.carrier_turns(self._carrier)) if self._carrier else 0
+        with self._in_use:
+            return int(self._library.carrier_turns(self._carrier)) if self._carrier else 0
 
     def counters(self, count: int) -> list[int]:
         """Return the first counters, as they are between two datagrams."""
-        if not self._carrier:
-            return list(self._counters[:count])
         copy = (ctypes.c_int64 * count)()
-        self._library.carrier_counters(self._carrier, copy, count)
+        with self._in_use:
+            if not self._carrier:
+                return list(self._counters[:count])
+            self._library.carrier_counters(self._carrier, copy, count)
         return list(copy)
 
     def start(self, program: NativeProgram) -> None:
@@ -78,7 +82,9 @@ class Carrier:
 
         After `close`, nothing is received.
         """
-        if self._carrier:
+        with self._in_use:
+            if not self._carrier:
+                return
             self._library.carrier_mirror(self._carrier, ring.address if ring else None, lost)
 
     def watchdog(self, notify: int, interval: int) -> None:
@@ -94,5 +100,6 @@ class Carrier:
         self._library.carrier_stop_receiving(self._carrier)
 
     def close(self) -> None:
-        self._library.carrier_close(self._carrier)
-        self._carrier = 0
+        with self._in_use:
+            carrier, self._carrier = self._carrier, 0
+        self._library.carrier_close(carrier)

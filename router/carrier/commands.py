@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from threading import Lock
 from time import sleep
 from typing import Protocol
 
@@ -149,6 +150,7 @@ class CommandThread:
         self._library = library
         self._counters, self._events = counters, events
         self._served: _Served | None = None
+        self._in_use = Lock()  # for those who read counters while the thread may be stopped
         self._address: int = library.commands_open(deadmen, counters, events.address, take, reset)
         if not self._address:
             raise MemoryError("the thread for commands from ROS cannot be started")
@@ -156,14 +158,16 @@ class CommandThread:
     @property
     def failures(self) -> int:
         """How often the middleware refused to hand out a message."""
-        return int(self._library.commands_failures(self._address)) if self._address else 0
+        with self._in_use:
+            return int(self._library.commands_failures(self._address)) if self._address else 0
 
     def counters(self, count: int) -> list[int]:
         """Return the first counters, as they are between two messages."""
-        if not self._address:
-            return list(self._counters[:count])
         copy = (ctypes.c_int64 * count)()
-        self._library.commands_counters(self._address, copy, count)
+        with self._in_use:
+            if not self._address:
+                return list(self._counters[:count])
+            self._library.commands_counters(self._address, copy, count)
         return list(copy)
 
     def serve(self, commands: NativeCommands, subscriptions: Mapping[str, Subscription]) -> None:
@@ -196,7 +200,8 @@ class CommandThread:
         Return False if the thread is stuck in the middleware after 1 s: then it is left, and the subscriptions must
         stay open. It feeds and sends nothing any more. Idempotent.
         """
-        address, self._address = self._address, 0
+        with self._in_use:
+            address, self._address = self._address, 0
         if not address:
             return self not in _left
         if not self._library.commands_stop(address):

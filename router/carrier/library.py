@@ -35,7 +35,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "carrier_watchdog": (None, (c_void_p, c_int, c_int64)),
     "command_send": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32)),
     "command_send_at": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32, c_int64)),
-    "commands_counters": (None, (c_void_p, c_void_p, c_uint32)),
+    "commands_counters": (c_bool, (c_void_p, c_void_p, c_uint32)),
     "commands_failures": (c_uint64, (c_void_p,)),
     "commands_open": (c_void_p, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p)),
     "commands_serve": (c_bool, (c_void_p, c_void_p)),

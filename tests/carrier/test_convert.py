@@ -54,14 +54,21 @@ def as_ros(declared: Type) -> Any:
         case List():
             return List(as_ros(declared.element), declared.length, declared.bound)
         case MessageType():
-            possible = [field for field in declared.fields if not _is_list_of_lists(field.type)]
+            possible = [field for field in declared.fields if _exists_in_ros(field.type)]
             return MessageType(declared.name, tuple(Field(field.name, as_ros(field.type)) for field in possible))
         case _:
             return declared
 
 
-def _is_list_of_lists(declared: Type) -> bool:
-    return isinstance(declared, List) and isinstance(declared.element, (Bytes, List))
+def _exists_in_ros(declared: Type) -> bool:
+    """There are no lists of lists, and messages with nothing else in them have nothing in common with others."""
+    match declared:
+        case List():
+            return not isinstance(declared.element, (Bytes, List)) and _exists_in_ros(declared.element)
+        case MessageType():
+            return not declared.fields or any(_exists_in_ros(field.type) for field in declared.fields)
+        case _:
+            return True
 
 
 def messages(declared: MessageType) -> st.SearchStrategy[bytes]:

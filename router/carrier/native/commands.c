@@ -25,7 +25,9 @@ struct commands {
     /* Under the lock: */
     const struct command_set *current, *offered;
     bool is_stopping, has_ended, is_left;
-    uint64_t failures;
+    /* Written by the thread: */
+    edition edition; /* of the counters */
+    _Atomic uint64_t failures;
     /* Of the thread: */
     struct deadmen *deadmen;
     counter *counters;
@@ -125,11 +127,15 @@ static bool serve_one(struct commands *commands, const struct command_topic *top
     pthread_mutex_unlock(&commands->lock);
     int error = commands->take(subscription, &commands->message, &info, NULL);
     bool has_failed = error && error != TAKE_FAILED;
-    if (has_failed) commands->reset();
+    if (has_failed) {
+        commands->reset();
+        atomic_fetch_add_explicit(&commands->failures, 1, memory_order_relaxed);
+    }
     pthread_mutex_lock(&commands->lock);
-    commands->failures += has_failed;
     if (error || commands->is_left) return false;
+    edition_begin(&commands->edition);
     serve_message(commands, topic, sent_at(&info));
+    edition_end(&commands->edition);
     return true;
 }
 
@@ -293,15 +299,9 @@ bool commands_stop(struct commands *commands) {
 }
 
 uint64_t commands_failures(struct commands *commands) {
-    pthread_mutex_lock(&commands->lock);
-    uint64_t failures = commands->failures;
-    pthread_mutex_unlock(&commands->lock);
-    return failures;
+    return atomic_load_explicit(&commands->failures, memory_order_relaxed);
 }
 
-void commands_counters(struct commands *commands, int64_t *to, uint32_t count) {
-    pthread_mutex_lock(&commands->lock);
-    for (uint32_t index = 0; index < count; index++)
-        to[index] = atomic_load_explicit(&commands->counters[index], memory_order_relaxed);
-    pthread_mutex_unlock(&commands->lock);
+bool commands_counters(struct commands *commands, int64_t *to, uint32_t count) {
+    return counters_copy(&commands->edition, commands->counters, to, count);
 }

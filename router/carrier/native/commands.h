@@ -75,7 +75,7 @@ bool commands_stop(struct commands *commands);
 /* How often the middleware refused to hand out a message. */
 uint64_t commands_failures(struct commands *commands);
 
-/* Copy the first counters, as they are between two messages. */
-void commands_counters(struct commands *commands, int64_t *to, uint32_t count);
+/* Copy the first counters as in `counters_copy`. */
+bool commands_counters(struct commands *commands, int64_t *to, uint32_t count);
 
 #endif
