@@ -1,1 +1,1 @@
-"""What listeners receive, in MCAP files: the mirror, the ring, the writer, the reader."""
+"""What listeners receive, in MCAP files: the mirror, the last minute in memory, the writer, the reader."""
