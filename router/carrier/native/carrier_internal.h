@@ -47,6 +47,10 @@ void carrier_adopt_first(struct carrier *carrier, const struct change *first);
 /* Start a thread that gets no signals: those are Python's. Return 0, or an errno. */
 int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void *argument);
 
+/* Have Linux run the calling thread as soon as it wakes up, in place of one that computes: it will not compute for long.
+ * Otherwise a thread of Python may finish its slice of some milliseconds first. */
+void ask_for_short_slices(void);
+
 /* Whether an event may be written, which is then done. */
 bool may_report(struct reporter *reporter, int64_t now);
 
