@@ -51,7 +51,7 @@ void carrier_change(struct carrier *carrier, const struct change *change) {
 void carrier_resume(struct carrier *carrier) { atomic_store(&carrier->is_held, false); }
 
 void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost) {
-    carrier->mirror_lost = lost;
+    atomic_store_explicit(&carrier->mirror_lost, lost, memory_order_relaxed);
     atomic_store_explicit(&carrier->mirror, mirror, memory_order_release);
 }
 

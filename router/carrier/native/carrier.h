@@ -146,7 +146,7 @@ int carrier_start(struct carrier *carrier, const struct change *first);
 void carrier_watchdog(struct carrier *carrier, int notify, int64_t interval);
 
 /* Adopt another program between two datagrams; return when that is done. Listeners that it does not have are emptied
- * before. */
+ * before. To be called while the receive thread runs. */
 void carrier_change(struct carrier *carrier, const struct change *change);
 void carrier_resume(struct carrier *carrier);
 

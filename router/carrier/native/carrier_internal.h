@@ -19,11 +19,11 @@ struct carrier {
     struct reporter reporter;
     struct deadmen *deadmen;
     struct freshness freshness;
-    uint32_t mirror_lost; /* counter */
     int epoll;
     /* Shared: */
     edition edition; /* of the counters */
     _Atomic(struct ring *) mirror;
+    _Atomic uint32_t mirror_lost; /* counter */
     _Atomic(const struct change *) next, adopted;
     _Atomic bool is_held, is_stopping, is_closing;
     _Atomic uint64_t turns;

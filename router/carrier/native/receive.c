@@ -61,7 +61,8 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
                                      .port = received->port,
                                      .length = (uint32_t)kept};
     memcpy(record + 1, carrier->datagram, kept);
-    if (!ring_put(to, record, record->size)) counter_add(carrier->counters, carrier->mirror_lost, 1);
+    uint32_t lost = atomic_load_explicit(&carrier->mirror_lost, memory_order_relaxed);
+    if (!ring_put(to, record, record->size)) counter_add(carrier->counters, lost, 1);
 }
 
 /* ---- targets ---- */
