@@ -45,6 +45,7 @@ class Worker:
         self.ring = ring
         self.counts: list[int] = []
         self._edition = 0  # odd while a message is served
+        self._balanced: list[int] = []  # the last copy between two messages
         self._failed = failed
         self._stages: dict[int, Stage] = {}
         self._stage: Stage | None = None
@@ -58,18 +59,21 @@ class Worker:
         return self._thread.name
 
     def copy_counts(self, size: int) -> list[int]:
-        """Return the first counts as they are between two messages, unless the thread is stuck in one."""
+        """Return the first counts as they are between two messages: if the thread is stuck in one, as last copied."""
         for _ in range(_TRIES):
             edition = self._edition
             copy = self.counts[:size]
             if edition % 2 == 0 and edition == self._edition:
-                break
+                self._balanced = copy
+                return copy
             sleep(_TRY_S)
-        return copy
+        balanced = self._balanced
+        return balanced[:size] + copy[len(balanced) :]
 
     def prepare(self, stage: Stage) -> None:
         """Have messages of the stage's generation served by it. To be called before there are any."""
         self._stages[stage.generation] = stage
+        self._balanced = []  # counters may stand for something else in this generation
 
     def abandon(self, stage: Stage) -> None:
         """Undo `prepare`, if nothing was received in that generation."""
