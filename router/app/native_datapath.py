@@ -36,6 +36,7 @@ from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.events import EventThread
 from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
 from router.carrier.ring import Ring
+from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker, left_behind
 from router.compiler.program import DeadmanPlan, Handler, Part, Program, TargetPlan
@@ -44,6 +45,7 @@ from router.engine.binding import State
 from router.engine.deadman import feeder
 from router.engine.pacing import RateLimit
 from router.engine.slow_path import Rejected, SlowPath
+from router.errors import StartError
 from router.log import logger
 from router.net.udp import Listener, Sender
 from router.recording.mirror import Mirror, Mirrored
@@ -188,7 +190,11 @@ class NativeDatapath:
             parts=lambda handler: list(parts_of(handler)),
             names=self._names,
         )
-        native = native_program(program, next(self._generations), outlets)
+        try:
+            native = native_program(program, next(self._generations), outlets)
+        except CannotCarry as error:
+            what = f"the carrier, which runs, cannot take these messages: {error}"
+            raise StartError(f"{what}; restart the router, and Python serves them") from error
         native.arrays += [senders, deadmen]
         numbers = {handler.route: number for number, handler in enumerate(native.handlers)}
         stages = {

@@ -44,6 +44,7 @@ METRICS = frozenset(
         "messages_published",
         "messages_received",
         "messages_sent",
+        "messages_waiting",
         "mirror_dropped",
         "record_dropped",
     }
@@ -52,6 +53,10 @@ METRICS = frozenset(
 
 ERRORS = frozenset({"send_error", "publish_error"})
 """Drop reasons that say that something is broken."""
+
+
+_DELIVERED = ("messages_published", "datagrams_sent")
+"""The metrics of what a target got."""
 
 
 class Level(enum.IntEnum):
@@ -224,7 +229,7 @@ class Report:
         problems = self._deadman(name)
         if sources and all(self._is_stale(source) for source in sources):
             problems += [self._stale(source.name) for source in sources]
-        problems += _drops(self._grown("messages_dropped", name))
+        problems += [*_drops(self._grown("messages_dropped", name)), *self._stalled(name)]
         received = self.now.total("messages_received", name)
         fresh = sum(n for _, n in self._grown("messages_received", name))
         values = [
@@ -232,6 +237,7 @@ class Report:
             ("received per second", f"{fresh / self.seconds:.1f}"),
             *((f"sent to {target}", n) for (target,), n in self._counted("datagrams_sent", name)),
             *((f"published on {topic}", n) for (topic,), n in self._counted("messages_published", name)),
+            *((f"waiting for {target}", n) for (target,), n in self._counted("messages_waiting", name)),
             *self._dropped(name),
             *((f"sent by the deadman to {to}", n) for (to,), n in self._counted("deadman_datagrams_sent", name)),
         ]
@@ -262,6 +268,14 @@ class Report:
         if self.now.total("deadman_active", route):
             problems.append(Problem(Level.ERROR, "commands stopped coming: the deadman sends in their place"))
         return problems
+
+    def _stalled(self, route: str) -> Iterator[Problem]:
+        """Targets for which messages have waited all the time, and that got none."""
+        waited = self.before.of("messages_waiting", route)
+        served = {rest for metric in _DELIVERED for rest, _ in self._grown(metric, route)}
+        for rest, n in self._counted("messages_waiting", route):
+            if waited.get(rest) and rest not in served:
+                yield _warning(f"{n} wait for {rest[0]}, which is stuck")
 
     def _is_stale(self, endpoint: Endpoint) -> bool:
         return endpoint.stale_after is not None and self.silent.get(endpoint.name, 0) > endpoint.stale_after

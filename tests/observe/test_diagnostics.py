@@ -135,6 +135,18 @@ def test_who_was_never_heard_is_silent_since_the_start_where_he_is_expected_to_s
         assert much_later[never_stale].level == Level.OK
 
 
+def test_a_topic_for_which_messages_wait_without_end_is_stuck(router: Counting) -> None:
+    router.set_to(3, "messages_waiting", "imu_info", "imu_data")
+    assert router.after(1)["route/imu_info"].level == Level.OK  # they may just have come
+    for _ in range(SNAPSHOTS):
+        router.hear("sensor_board")
+        stuck = router.after(1)["route/imu_info"]
+    assert (stuck.level, stuck.message) == (Level.WARN, "3 wait for imu_data, which is stuck")
+    router.add(1, "messages_published", "imu_info", "imu_data")
+    router.hear("sensor_board")
+    assert router.after(1)["route/imu_info"].level == Level.OK
+
+
 @pytest.mark.parametrize("shift", [-3600 * SECOND, 3600 * SECOND])
 def test_a_clock_that_jumps_makes_nobody_silent_and_nobody_heard(router: Counting, shift: int) -> None:
     router.hear("sensor_board")
