@@ -65,7 +65,7 @@ WHOLE = f"""\
     destinations: [{{endpoint: recorder, max_rate: 10 Hz, keep: latest}}]
     topics: [{{topic: ph, {_FLOAT}1 / ph_value}}, max_rate: 10 Hz, keep: latest}}]
     ttl: 400ms
-  drive_diag: {{source: any, destinations: [basestation, arm_board]}}
+  drive_diag: {{source: any, destinations: [{{endpoint: basestation, max_rate: 12 Hz}}, arm_board]}}
   arm_diag: {{ignore: nobody wants it}}
   manual_drive:
     source: [basestation, left_tool]
@@ -85,7 +85,8 @@ WHOLE = f"""\
 """
 UNWANTED = frozenset({"unwanted", "unwanted_too"})
 PEERS = (
-    ("192.168.0.30", 8), ("192.168.0.30", 9), ("192.168.0.222", 8), ("192.168.0.10", 9000), ("192.168.0.20", 9000),
+    *3 * (("192.168.0.30", 8),), ("192.168.0.30", 9),
+    ("192.168.0.222", 8), ("192.168.0.10", 9000), ("192.168.0.20", 9000),
     ("192.168.0.60", 8001), ("192.168.0.60", 8002), ("192.168.0.60", 8003), ("192.168.0.81", 9000),
     ("192.168.0.99", 1), ("0.0.0.0", 0), ("255.255.255.255", 65535),
 )  # fmt: skip
