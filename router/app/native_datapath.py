@@ -102,7 +102,7 @@ class NativeDatapath:
         self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in _PARTS.items()}
         context.counts.add(_as_list(deadman_counts))
         for worker in self._workers.values():  # first: what they have served was received, so no less than 0 waits
-            context.counts.add(worker.counts, worker.copy_counts)
+            context.counts.add(worker.counts, worker.copy_counts, worker.forget_copy)
         context.counts.add(_as_list(receive_counts), self._carrier.counters)
         context.counts.add(_as_list(command_counts), self._commands.counters)
         self._mirrored = MirrorRing(Ring(library, _QUEUE), self._names)

@@ -215,7 +215,9 @@ class Router:
             "table_sha256": program.table.sha256,
             "protos_sha256": program.protos_sha256,
         }
-        return CountersCollector(program.counters, self._counts.copies, self._asked(), build)
+        # Of this program, whose counters are there before those of the running one are adopted, once nothing is stuck.
+        copies = partial(self._counts.copies, program.counters.size)
+        return CountersCollector(program.counters, copies, self._asked(), build)
 
 
 def _datapath(program: Program, context: RouterContext, mirror: Mirror, subscribed: Callable[[], bool]) -> Datapath:

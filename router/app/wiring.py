@@ -46,20 +46,29 @@ class ThreadCounts:
         """The length of a list that cannot grow, if there is one."""
         self.lists: list[list[int]] = []
         self._copies: list[Callable[[int], list[int]]] = []
+        self._forgetful: list[Callable[[], None]] = []
         for _ in range(10):
             self.add(counters.fresh_counts())
         self.receive, self.ros, self.deadman, self.gateway_deadmen, self.pacing, self.holding = self.lists[:6]
         self.collecting, self.gateways, self.events, self.own = self.lists[6:]
 
-    def add(self, counts: list[int], copy: Callable[[int], list[int]] | None = None) -> None:
-        """Count in another list too. `copy(size)` returns its beginning at a time at which it balances."""
+    def add(
+        self,
+        counts: list[int],
+        copy: Callable[[int], list[int]] | None = None,
+        forget: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Count in another list too. `copy(size)` returns its beginning at a time at which it balances.
+
+        After `forget`, it returns nothing that was counted before.
+        """
         self.counters.grow(counts)
+        self._forgetful.append(forget)
         self.lists.append(counts)
         self._copies.append(copy or (lambda size: counts[:size]))
 
-    def copies(self) -> list[list[int]]:
-        """Return what was counted, each list at one instant: between two messages, as far as that is known."""
-        size = self.counters.size
+    def copies(self, size: int) -> list[list[int]]:
+        """Return the first `size` counts, each list at one instant: between two messages, as far as that is known."""
         return [copy(size) for copy in self._copies]
 
     def total(self, metric: str) -> int:
@@ -82,6 +91,8 @@ class ThreadCounts:
     def replace(self, counters: Counters) -> None:
         """Adopt `counters`, once no thread counts by the earlier ones."""
         counters.settle(self.lists)
+        for forget in self._forgetful:  # what was freed there
+            forget()
         self.adopt(counters)
 
     def adopt(self, counters: Counters) -> None:

@@ -70,10 +70,14 @@ class Worker:
         balanced = self._balanced
         return balanced[:size] + copy[len(balanced) :]
 
+    def forget_copy(self) -> None:
+        """Copy anew from now on: counters were freed, and may stand for something else."""
+        self._balanced = []
+
     def prepare(self, stage: Stage) -> None:
         """Have messages of the stage's generation served by it. To be called before there are any."""
         self._stages[stage.generation] = stage
-        self._balanced = []  # counters may stand for something else in this generation
+        self.forget_copy()
 
     def abandon(self, stage: Stage) -> None:
         """Undo `prepare`, if nothing was received in that generation."""

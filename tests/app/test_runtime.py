@@ -29,7 +29,7 @@ from router.net.receiver import ReceiveThread
 from router.net.udp import Listener
 from router.recording.recorder import Recorder, RecordError
 from tests.acceptance.site import wait_until
-from tests.app.conftest import BRAKE, DRIVE, Site, udp
+from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, udp
 from tests.recording.recorder_rig import read
 
 ROOT = Path(__file__).parents[2]
@@ -185,6 +185,25 @@ def test_a_scrape_reads_what_was_served_before_what_was_received(site: Site, mon
     with Router(site.program(ROUTE)) as router:
         list(router.collect())
     assert read in ([], ["Worker", "Worker", "Carrier"])
+
+
+def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread that is stuck in the middleware delays that."""
+    scraped: list[set[str]] = []
+    with Router(site.program(ROUTE)) as router:
+        passed = router._runtime.datapath.has_passed
+
+        def scrape(wiring: Any) -> bool:
+            scraped.append({sample.labels.get("route", "") for family in router.collect() for sample in family.samples})
+            return passed(wiring)
+
+        monkeypatch.setattr(router._runtime.datapath, "has_passed", scrape)
+        site.program(ROUTE + TURNS)
+        let_rest(router.program.table.path)
+        assert router.reload().ok
+    assert [routes >= {"ph_info", "manual_drive"} for routes in scraped] == [True]
 
 
 def test_metrics_are_served_while_it_runs(site: Site) -> None:

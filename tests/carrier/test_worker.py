@@ -46,6 +46,8 @@ def test_counts_balance_while_a_message_is_stuck_after_its_first_target() -> Non
     records.queue.put(bytes(record))
     assert stuck.wait(60)
     assert worker.copy_counts(2) == [0, 0]
+    worker.forget_copy()
+    assert worker.copy_counts(2) == [0, 1]
     goes_on.set()
     assert worker.stop(60)
     assert worker.copy_counts(2) == [-1, 1]
