@@ -178,7 +178,12 @@ def test_a_scrape_reads_what_was_served_before_what_was_received(site: Site, mon
 
     def noted(kind: type[Carrier | Worker], name: str) -> None:
         original = getattr(kind, name)
-        monkeypatch.setattr(kind, name, lambda of, size: (read.append(kind.__name__), original(of, size))[1])
+
+        def note(of: Carrier | Worker, size: int) -> Any:
+            read.append(kind.__name__)
+            return original(of, size)
+
+        monkeypatch.setattr(kind, name, note)
 
     noted(Carrier, "counters")
     noted(Worker, "copy_counts")
