@@ -58,8 +58,8 @@ if TYPE_CHECKING:
 MOST_COUNTERS = 1 << 18
 """Counters of each native thread: their addresses stay the same, so they cannot grow."""
 
-_QUEUE, _EVENTS = 1 << 22, 1 << 18
-"""Bytes that may wait for a thread of Python: messages, and events."""
+_QUEUE, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
+"""Bytes that may wait for a thread of Python: messages for a part, received datagrams to observe, and events."""
 
 _PATIENCE_S = 1.0
 """How long a reload and a stop wait for a thread of Python that may be stuck in the middleware."""
@@ -105,7 +105,7 @@ class NativeDatapath:
             context.counts.add(worker.counts, worker.copy_counts, worker.forget_copy)
         context.counts.add(_as_list(receive_counts), self._carrier.counters)
         context.counts.add(_as_list(command_counts), self._commands.counters)
-        self._mirrored = MirrorRing(Ring(library, _QUEUE), self._names)
+        self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
         mirror.drain_by(self._mirrored.take)
         self._events = EventThread(
             [

@@ -2,6 +2,7 @@
 
 #include <poll.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/eventfd.h>
 #include <unistd.h>
 
@@ -11,7 +12,8 @@ struct ring *ring_open(size_t capacity) {
     struct ring *ring = calloc(1, sizeof *ring);
     if (!ring) return NULL;
     ring->capacity = capacity;
-    ring->words = calloc(capacity / WORD, WORD);
+    ring->words = malloc(capacity);
+    if (ring->words) memset((void *)ring->words, 0, capacity); /* now, or the writer would wait for each new page */
     ring->wake = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     if (!ring->words || ring->wake < 0) {
         ring_close(ring);
