@@ -11,13 +11,14 @@ import pytest
 from benchmarks.fuzz_carrier import fuzz
 from tests.carrier.decisions import SCHEMAS
 from tests.carrier.fuzz import build_convert
-from tests.carrier.fuzz.build import build
+from tests.carrier.fuzz.build import TARGETS, build
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("clang") is None, reason="needs clang")
-def test_a_minute_of_libfuzzer(tmp_path: Path) -> None:
-    fuzz_for_a_minute(build(tmp_path), tmp_path)
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_minute_of_libfuzzer(target: str, tmp_path: Path) -> None:
+    fuzz_for_a_minute(build(tmp_path, target), tmp_path)
 
 
 @pytest.mark.slow

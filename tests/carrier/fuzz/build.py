@@ -1,7 +1,8 @@
-"""Build the libFuzzer target for `envelope_read`, and seeds for it.
+"""Build the libFuzzer targets for `envelope_read` and for all that becomes of a datagram, and seeds for them.
 
     python -m tests.carrier.fuzz.build /tmp/fuzz
     cd /tmp/fuzz && ./envelope_fuzz -runs=100000000 -max_len=400 corpus
+    cd /tmp/fuzz && ./handle_fuzz -runs=100000000 -max_len=400 corpus
 
 Takes clang with its sanitizers. The folder is made; `corpus` in it grows while the target runs.
 """
@@ -14,7 +15,7 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from router.carrier.build import NATIVE, compile_c
+from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.schema import WireSchema, wire_schema
 from tests.carrier.datagrams import Maker
 from tests.carrier.decisions import SCHEMAS, TESTS, table
@@ -22,23 +23,25 @@ from tests.carrier.decisions import SCHEMAS, TESTS, table
 HERE = Path(__file__).parent
 GOLDEN = TESTS / "wire" / "golden_envelopes.json"
 SEEDS_OF_A_SCHEMA = 300
+TARGETS = ("envelope_fuzz", "handle_fuzz")
 
 
-def build(folder: Path) -> Path:
+def build(folder: Path, name: str = "envelope_fuzz") -> Path:
     """Return the program. `folder` gets it, `schemas.h` and `corpus`."""
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     declarations: list[str] = []
     noise = random.Random(1)
-    for index, name in enumerate(SCHEMAS):
-        made = table(name, folder)
+    for index, schema in enumerate(SCHEMAS):
+        made = table(schema, folder)
         declarations += _arrays(index, wire_schema(made.envelope, made.inbound))
         maker = Maker(made.envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
         seeds = [maker.datagram() for _ in range(SEEDS_OF_A_SCHEMA)]
-        if name == "rover":
+        if schema == "rover":
             seeds += [bytes.fromhex(each["hex"]) for each in json.loads(GOLDEN.read_text())]
         for number, seed in enumerate(seeds):
-            (corpus / f"{name}-{number}").write_bytes(seed)
+            (corpus / f"{schema}-{number}").write_bytes(seed)
+            (corpus / f"{schema}-{number}-sent").write_bytes(b"!" + seed)  # for handle_fuzz
     declarations.append(f"enum {{ SCHEMA_COUNT = {len(SCHEMAS)} }};")
     schemas = ", ".join(
         f"{{types_{index}, sizeof types_{index} / sizeof *types_{index}}}" for index in range(len(SCHEMAS))
@@ -46,8 +49,9 @@ def build(folder: Path) -> Path:
     declarations.append(f"static const struct wire_schema schemas[] = {{{schemas}}};")
     (folder / "schemas.h").write_text("\n".join(declarations) + "\n")
     flags = ["-O2", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
-    files = [HERE / "envelope_fuzz.c", NATIVE / "envelope.c"]
-    program = folder / "envelope_fuzz"
+    # A target that includes a source stands in its place.
+    files = [HERE / f"{name}.c", *(path for path in sources() if name != "handle_fuzz" or path.name != "receive.c")]
+    program = folder / name
     compile_c([*flags, f"-I{NATIVE}", f"-I{folder}", *map(str, files), "-o", str(program)], "clang")
     return program
 
@@ -66,7 +70,9 @@ def _arrays(index: int, lowered: WireSchema) -> Iterator[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
-    print(build(parser.parse_args().folder))
+    folder = parser.parse_args().folder
+    for name in TARGETS:
+        print(build(folder, name))
 
 
 if __name__ == "__main__":

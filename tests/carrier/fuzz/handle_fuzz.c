@@ -1,0 +1,83 @@
+/* A libFuzzer target: what the receive thread does with a datagram reads and writes only what it may, and the counters
+ * balance. The first byte of an input selects listener and sender, the rest is the datagram. */
+#include <stdlib.h>
+
+#include "receive.c"
+#include "schemas.h"
+
+enum { MOST_CASES = 64, COLUMNS = 3, LISTENERS = 2, OF_LISTENER = 3 + REASONS };
+/* Counters of the one route behind those of listeners. */
+enum { ROUTE = LISTENERS * OF_LISTENER, ACCEPTED = ROUTE, SENT, SENT_BYTES, STALE, LIMITED, FULL, FAILED, WAITING,
+       QUEUE_FULL, FILTERED, LAST_MESSAGE, SEEN, UNHANDLED_CASES, LOST, DURATION, COUNTERS = DURATION + 14 };
+
+int LLVMFuzzerInitialize(int *count, char ***arguments);
+int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size);
+
+static counter counters[COUNTERS];
+static struct limit limit = {1000, 500, -1000};
+static const uint8_t wanted = 1;
+static const uint8_t *const topics[] = {&wanted};
+static const struct waiting target = {1, WAITING, QUEUE_FULL, FILTERED};
+static struct sender nowhere = {.fd = -1};
+static const struct destination destinations[] = {
+    {.sender = &nowhere, .limit = &limit, .trims = 1, .sent = SENT, .sent_bytes = SENT_BYTES, .stale = STALE,
+     .rate_limited = LIMITED, .send_buffer_full = FULL, .send_error = FAILED}};
+static struct part part = {.wanted = topics, .targets = &target, .wanted_count = 1, .target_count = 1};
+static const struct route only = {.ttl = 1000000000, .destinations = destinations, .parts = &part, .destination_count = 1,
+                                  .part_count = 1, .last_message = LAST_MESSAGE, .duration = DURATION};
+static const struct peer peers[] = {{1, 7, 0, SEEN}, {1, 0, 1, SEEN}, {2, 9, 1, SEEN}};
+static const struct entry entries[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
+static struct payload_case cases[MOST_CASES];
+static struct listener listeners[LISTENERS];
+static struct program program = {.generation = 1, .listener_count = LISTENERS, .unknown_case = UNHANDLED_CASES,
+                                 .schema = &schemas[0], .listeners = listeners, .cases = cases, .routes = &only};
+static struct carrier *carrier;
+
+static void demand(bool condition) {
+    if (!condition) abort();
+}
+
+int LLVMFuzzerInitialize(int *count, char ***arguments) {
+    (void)count, (void)arguments;
+    const struct wire_type *envelope = &schemas[0].types[0];
+    for (uint32_t index = 0; index < envelope->count; index++) {
+        const struct wire_field *field = &envelope->fields[index];
+        if (!(field->flags & WIRE_CASE)) continue;
+        demand(program.case_count < MOST_CASES);
+        cases[program.case_count++] = (struct payload_case){.number = field->number, .unhandled = UNHANDLED_CASES,
+                                                            .row = field->flags & WIRE_ROUTED ? 0 : -1,
+                                                            .is_ignored = field->number % 2};
+    }
+    for (uint32_t index = 0; index < LISTENERS; index++) {
+        uint32_t first = index * OF_LISTENER;
+        listeners[index] = (struct listener){.fd = -1, .repairs = index, .peers = peers, .entries = entries, .peer_count = 3,
+                                             .columns = COLUMNS, .received = first, .received_bytes = first + 1,
+                                             .padded = first + 2};
+        for (uint32_t reason = 0; reason < REASONS; reason++) listeners[index].rejected[reason] = first + 3 + reason;
+    }
+    struct ring *events = ring_open(1 << 15);
+    part.ring = ring_open(1 << 15);
+    carrier = carrier_open(deadmen_open(counters, events), counters, events);
+    struct change first = {.program = &program};
+    carrier_adopt_first(carrier, &first);
+    carrier_mirror(carrier, ring_open(1 << 15), LOST);
+    return 0;
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *input, size_t size) {
+    if (!size || size > MAX_DATAGRAM + 2) return 0;
+    uint8_t chosen = input[0];
+    struct received received = {.listener = &listeners[chosen % 2], .length = size - 1, .address = chosen / 2 % 4,
+                                .port = chosen & 16 ? 7 : 9};
+    memcpy(carrier->datagram, input + 1, size - 1);
+    handle(carrier, &received, chosen & 32 ? 1 : 0);
+    int64_t balance = counters[ACCEPTED];
+    for (uint32_t index = 0; index < LISTENERS; index++) {
+        balance -= counters[listeners[index].received];
+        for (uint32_t reason = 0; reason < REASONS; reason++) balance += counters[listeners[index].rejected[reason]];
+    }
+    demand(balance == 0);
+    demand(counters[ACCEPTED] == counters[STALE] + counters[LIMITED] + counters[FAILED]);
+    demand(counters[ACCEPTED] == counters[WAITING] + counters[QUEUE_FULL]);
+    return 0;
+}
