@@ -26,6 +26,9 @@ POLL_US = 1000
 KEEPS_UP = 0.97
 """Of the rate that is asked of a generator, what it has to reach."""
 
+BEGINNING_S = 30.0
+"""How long a helper may take to begin on a busy machine."""
+
 SENSOR_BOARD = "127.0.0.30:0"
 STAMPED_CASE = "gps_info"
 
@@ -108,8 +111,19 @@ def sink(*ports: int, wakes: bool = False, priority: int | None = -5) -> Helper:
     words = [word for port in ports for word in ("--listen", f"127.0.0.1:{port}")]
     words += [] if wakes else ["--poll-us", str(POLL_US)]
     helper = Helper(PROGRAMS / "sink", *words, priority=priority)
+    _wait_until_bound(ports)
     time.sleep(0.2)
     return helper
+
+
+def _wait_until_bound(ports: Sequence[int]) -> None:
+    """A sink that runs while nothing else wants to may take seconds to begin. Exits after BEGINNING_S."""
+    wanted = {f"0100007F:{port:04X}" for port in ports}
+    until = time.monotonic() + BEGINNING_S
+    while not wanted <= {line.split()[1] for line in Path("/proc/net/udp").read_text().splitlines()[1:]}:
+        if time.monotonic() > until:
+            sys.exit(f"a sink has not bound ports {', '.join(map(str, ports))} within {BEGINNING_S:g} s")
+        time.sleep(0.01)
 
 
 def _probe(*words: object) -> Helper:
