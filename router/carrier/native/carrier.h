@@ -136,7 +136,8 @@ struct mirror_record {
 
 struct carrier;
 
-/* Open a carrier that counts in `counters`; NULL for lack of memory. Losses and rejections go to `events`. */
+/* Open a carrier that counts in `counters`, and writes losses and rejections to `events`: nobody else writes to either.
+ * NULL for lack of memory. */
 struct carrier *carrier_open(struct deadmen *deadmen, counter *counters, struct ring *events);
 
 /* Start the threads. Return 0, or an errno. */

@@ -50,7 +50,7 @@ static const struct wire_type types[] = {{of_envelope, 3, 0}, {NULL, 0, 1}};
 static const struct wire_schema schema = {types, 2};
 
 static counter counters[COUNTERS], braked[DEADMAN_COUNTERS];
-static struct ring *events, *messages, *mirrored;
+static struct ring *receive_events, *brake_events, *messages, *mirrored;
 static struct deadmen *deadmen;
 static struct carrier *carrier;
 static struct limit limit = {1000000, 500000, -1000000};
@@ -280,7 +280,8 @@ static void *read_others(void *unused) {
     static uint64_t records[4096];
     while (!atomic_load(&has_ended)) {
         ring_take(mirrored, records, sizeof records, 1);
-        ring_take(events, records, sizeof records, 0);
+        ring_take(receive_events, records, sizeof records, 0);
+        ring_take(brake_events, records, sizeof records, 0);
         for (int board = 0; board < BOARDS; board++)
             while (recv(boards[board], records, sizeof records, MSG_DONTWAIT) >= 0) {}
     }
@@ -349,16 +350,17 @@ static void check_accounts(void) {
 
 int main(int count, char **arguments) {
     check(count == 2, "one argument");
-    events = ring_open(1 << 16);
+    receive_events = ring_open(1 << 16);
+    brake_events = ring_open(1 << 16);
     messages = ring_open(1 << 12);
     mirrored = ring_open(1 << 12);
-    deadmen = deadmen_open(braked, events);
+    deadmen = deadmen_open(braked, brake_events);
     for (int index = 0; index < LISTENERS; index++) listening[index] = bound(1);
     for (int index = 0; index < BOARDS; index++) open_sender(index, address_of(boards[index] = bound(1)));
     int gone = bound(1);
     open_sender(BOARDS, address_of(gone));
     close(gone);
-    carrier = carrier_open(deadmen, counters, events);
+    carrier = carrier_open(deadmen, counters, receive_events);
     struct made *first = make(1);
     struct change start = {.program = &first->program};
     atomic_store(&acting, first->feed.deadman);
@@ -383,7 +385,8 @@ int main(int count, char **arguments) {
         sender_close(senders[index]);
     }
     deadmen_close(deadmen);
-    ring_close(events);
+    ring_close(receive_events);
+    ring_close(brake_events);
     ring_close(messages);
     ring_close(mirrored);
     return 0;
