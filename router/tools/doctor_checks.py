@@ -381,6 +381,24 @@ def carrier(variables: Mapping[str, str]) -> Iterator[CheckResult]:
             yield warning("carrier", "its library cannot be used: Python does its work, and more slowly", str(error))
     else:
         yield fine("carrier", "its library is up to date")
+        yield from _priority()
+
+
+def _priority() -> Iterator[CheckResult]:
+    """Check that the carrier's threads may run at the least real-time priority."""
+    policy = os.sched_getscheduler(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        yield warning(
+            "carrier",
+            "it may not run at a real-time priority: other programs can delay commands and brakes by some 0.5 ms",
+            f"'{_user(os.geteuid())} - rtprio 1' in /etc/security/limits.d/60-rover-router.conf, and log in again; the "
+            "service of `make install-service` need not be told",
+        )
+    else:
+        os.sched_setscheduler(0, policy, os.sched_param(0))
+        yield fine("carrier", "it may run at a real-time priority")
 
 
 def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[CheckResult]:

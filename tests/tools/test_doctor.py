@@ -88,10 +88,28 @@ def test_a_sound_place_has_no_problem(table: Path) -> None:
 
 def test_what_carries_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor_checks, "load", lambda: None)
-    assert gist(carrier({}), "up to date") == [(Grade.FINE, True)]
-    assert gist(carrier({"ROUTER_CARRIER": "native"}), "up to date") == [(Grade.FINE, True)]
+    assert gist(carrier({}), "up to date")[0] == (Grade.FINE, True)
+    assert gist(carrier({"ROUTER_CARRIER": "native"}), "up to date")[0] == (Grade.FINE, True)
     assert gist(carrier({"ROUTER_CARRIER": "python"}), "Python, as ROUTER_CARRIER says") == [(Grade.FINE, True)]
     assert gist(carrier({"ROUTER_CARRIER": "c"}), "ROUTER_CARRIER is 'c'") == [(Grade.PROBLEM, True)]
+
+
+def test_without_the_right_to_a_real_time_priority_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(doctor_checks, "load", lambda: None)
+    monkeypatch.setattr(os, "sched_setscheduler", refused)
+    found = list(carrier({}))
+    assert [each.grade for each in found] == [Grade.FINE, Grade.WARNING]
+    assert "rtprio 1" in found[1].remedy
+
+
+def test_asking_for_a_real_time_priority_leaves_the_one_that_was_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor_checks, "load", lambda: None)
+    before = os.sched_getscheduler(0)
+    assert len(list(carrier({}))) == len(("library", "priority"))
+    assert os.sched_getscheduler(0) == before
 
 
 def test_a_library_that_cannot_be_used_keeps_only_those_from_starting_who_asked_for_it(

@@ -48,8 +48,9 @@ void carrier_adopt_first(struct carrier *carrier, const struct change *first);
 int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void *argument);
 
 /* Have Linux run the calling thread as soon as it wakes up, in place of one that computes: it will not compute for long.
- * Otherwise a thread of Python may finish its slice of some milliseconds first. */
-void ask_for_short_slices(void);
+ * At a real-time priority, where the process may have one, no other program delays it. Otherwise the shortest slices have
+ * it wait less, which is some 0.5 ms while Python or a neighbour computes. */
+void ask_to_run_first(void);
 
 /* Whether an event may be written, which is then done. */
 bool may_report(struct reporter *reporter, int64_t now);

@@ -317,7 +317,7 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
 
 void *receive_thread(void *of) {
     struct carrier *carrier = of;
-    ask_for_short_slices();
+    ask_to_run_first();
     while (!is_stopping(carrier)) {
         if (carrier->program->listener_count == 1) receive_from_one(carrier);
         else receive_from_many(carrier, carrier->epoll);

@@ -23,8 +23,11 @@ struct scheduling {
 
 static const uint64_t SLICE = 100000; /* ns, the shortest that Linux takes */
 
-void ask_for_short_slices(void) {
-    if (sched_getscheduler(0) != SCHED_OTHER) return; /* whoever started the router has chosen another policy */
+void ask_to_run_first(void) {
+    int inherited = sched_getscheduler(0); /* the batch policy from a thread of Python that opens ROS */
+    if (inherited != SCHED_OTHER && inherited != SCHED_BATCH) return; /* it was chosen by whoever started the router */
+    struct sched_param least = {.sched_priority = sched_get_priority_min(SCHED_FIFO)};
+    if (!sched_setscheduler(0, SCHED_FIFO, &least)) return;
     struct scheduling wanted = {.size = sizeof wanted, .policy = SCHED_OTHER, .runtime = SLICE};
     wanted.nice = getpriority(PRIO_PROCESS, 0);
     syscall(SYS_sched_setattr, 0, &wanted, 0); /* before Linux 6.12 it changes nothing */
