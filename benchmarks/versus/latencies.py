@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from benchmarks.versus.helpers import GPS
 from benchmarks.versus.runs import Traffic, run, warm_up
 from benchmarks.versus.subscriber import subscribed
 from benchmarks.versus.trial import Metrics, Trial
 
 QUANTILES = ("p50", "p99", "p999")
-RATE = 1000
-THICK_QUANTILES = ("p50", "p99")
 
 
-def latency(trial: Trial, seconds: float) -> Metrics:
+def latency(trial: Trial, rate: float, seconds: float) -> Metrics:
     """In microseconds: `udp_*` to the first destination, without a subscriber; `ros_*` to a subscriber's hands.
 
     `udp_subscribed_*` is the first again, while that subscriber listens.
     """
     metrics: Metrics = {}
-    traffic = Traffic(RATE, min(seconds, trial.pace.longest), stamped=True)
+    traffic = Traffic(rate, min(seconds, trial.pace.longest), stamped=True)
     with trial.started() as subject:
         warm_up(subject, trial.pace)
         alone = run(subject, traffic, trial.pace)
@@ -31,17 +27,4 @@ def latency(trial: Trial, seconds: float) -> Metrics:
     found = {"udp": alone.latency_us, "udp_subscribed": heard.latency_us, "ros": heard.ros_latency_us}
     for name, latencies in found.items():
         metrics |= {f"{name}_{quantile}_us": latencies[quantile] for quantile in QUANTILES if latencies}
-    return metrics
-
-
-def latency_at(trial: Trial, rates: Sequence[float]) -> Metrics:
-    """`udp_*_us@RATE`: microseconds to the first destination, without a subscriber."""
-    metrics: Metrics = {}
-    with trial.started() as subject:
-        warm_up(subject, trial.pace)
-        for rate in trial.pace.rates(rates):
-            result = run(subject, Traffic(rate, trial.pace.seconds, stamped=True), trial.pace)
-            result.add_to(metrics, f"@{rate:g}")
-            if found := result.latency_us:
-                metrics |= {f"udp_{quantile}_us@{rate:g}": found[quantile] for quantile in THICK_QUANTILES}
     return metrics

@@ -13,13 +13,13 @@ from benchmarks.versus.figures import Aim
 from benchmarks.versus.flood import flood
 from benchmarks.versus.footprint import start_and_memory
 from benchmarks.versus.helpers import ALL_TOPICS, IMU
-from benchmarks.versus.latencies import THICK_QUANTILES, latency, latency_at
+from benchmarks.versus.latencies import latency
 from benchmarks.versus.limits import highest_rate, overload
 from benchmarks.versus.trial import Measure
 
 RATES = (1000, 5000, 20_000, 40_000)
 SIZE_RATES = (5000, 20_000)
-THICK_RATES = (5000, 20_000)
+FORWARD_RATES = (200, 1000, 5000, 20_000)
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,10 @@ def sized_router(name: str, routes: int, spread: bool = False) -> Router:
     return Router(name, folder / "table.yaml", payloads=folder / "payloads.txt" if spread else PAYLOADS)
 
 
+LATENCY = at_most(
+    "peer", {f"{edge}_{quantile}_us": 1.0 for edge in ("udp", "udp_subscribed") for quantile in ("p50", "p99")}
+)
+LATENCY += tuple(Aim(f"ros_{quantile}_us", "peer") for quantile in ("p50", "p99"))
 FOOTPRINT = (Aim("start_s", at_most=1.0), Aim("rss_mb", at_most=120))
 
 SCENARIOS = (
@@ -74,14 +78,14 @@ SCENARIOS = (
         "CPU per datagram: one destination and one topic each, nobody subscribes",
         (OWN, PEER),
         partial(inbound_cost, rates=RATES, topics=()),
-        cpu_at_most("peer", (1.1, 0.9, 0.7, 0.6)),
+        cpu_at_most("peer", (0.75,) * 4),
     ),
     Scenario(
         "forward_only",
         "CPU per datagram: one destination, no topic",
-        (Router("router", TABLES / "forward.yaml"), PEER, Native("bare", "bare_forward", ("--batch",))),
-        partial(inbound_cost, rates=RATES, topics=()),
-        cpu_at_most("peer", (0.7,) * 4) + cpu_at_most("bare", (2.0,) * 4),
+        (Router("router", TABLES / "forward.yaml"), Native("bare", "bare_forward")),
+        partial(inbound_cost, rates=FORWARD_RATES, topics=()),
+        cpu_at_most("bare", (1.3,) * 4, FORWARD_RATES),
     ),
     Scenario(
         "max_rate",
@@ -101,27 +105,15 @@ SCENARIOS = (
         "latency",
         "One-way latency at 1000 gps_info per second, to the first destination and to a subscriber",
         (OWN, PEER),
-        partial(latency, seconds=10),
-        at_most(
-            "peer",
-            {
-                f"{edge}_{quantile}_us": limit
-                for edge in ("udp", "udp_subscribed", "ros")
-                for quantile, limit in (("p50", 1.2), ("p99", 1.2), ("p999", 1.5))
-            },
-        ),
+        partial(latency, rate=1000, seconds=10),
+        LATENCY,
     ),
     Scenario(
         "latency_thick",
-        "One-way latency where datagrams come thick: gps_info to the first destination, nobody subscribes",
-        (OWN, Router("never", TABLES / "own_never.yaml"), PEER),
-        partial(latency_at, rates=THICK_RATES),
-        tuple(
-            Aim(f"udp_{quantile}_us@{rate:g}", against)
-            for rate in THICK_RATES
-            for quantile in THICK_QUANTILES
-            for against in ("peer", "never")
-        ),
+        "The same at 20,000 per second",
+        (OWN, PEER),
+        partial(latency, rate=20_000, seconds=4),
+        LATENCY,
     ),
     Scenario(
         "outbound",
