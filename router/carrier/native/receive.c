@@ -307,9 +307,10 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
     }
     do {
         struct epoll_event ready[LISTENERS_PER_WAIT];
-        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, TURN_MS);
+        int count = epoll_wait(waiting, ready, LISTENERS_PER_WAIT, TURN_MS), received = 0;
         for (int index = 0; index < count; index++)
-            receive_one(carrier, &program->listeners[ready[index].data.u32], MSG_DONTWAIT);
+            received += receive_one(carrier, &program->listeners[ready[index].data.u32], MSG_DONTWAIT);
+        if (count > 0 && !received) usleep(1000); /* input has ended, which epoll says again and again */
     } while (goes_on(carrier));
     for (uint32_t index = 0; index < program->listener_count; index++)
         epoll_ctl(waiting, EPOLL_CTL_DEL, program->listeners[index].fd, NULL);
