@@ -78,7 +78,7 @@ static int until_turn(struct carrier *carrier, int64_t turn) {
 void *timer_thread(void *of) {
     struct carrier *carrier = of;
     int64_t turn = 0;
-    ask_to_run_first();
+    run_first();
     while (!atomic_load(&carrier->is_closing)) {
         struct pollfd waiting[] = {{carrier->deadmen->timer, POLLIN, 0}, {carrier->wake, POLLIN, 0}};
         poll(waiting, 2, until_turn(carrier, turn));

@@ -4,6 +4,7 @@
 #include <pthread.h>
 
 #include "carrier.h"
+#include "priority.h"
 
 /* Where a thread reports events, and how many it may still write: a flood is counted only. */
 struct reporter {
@@ -19,6 +20,7 @@ struct carrier {
     struct reporter reporter;
     struct deadmen *deadmen;
     struct freshness freshness;
+    struct share share;
     int epoll;
     /* Shared: */
     edition edition; /* of the counters */
@@ -46,11 +48,6 @@ void carrier_adopt_first(struct carrier *carrier, const struct change *first);
 
 /* Start a thread that gets no signals: those are Python's. Return 0, or an errno. */
 int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void *argument);
-
-/* Have Linux run the calling thread as soon as it wakes up, in place of one that computes: it will not compute for long.
- * At a real-time priority, where the process may have one, no other program delays it. Otherwise the shortest slices have
- * it wait less, which is some 0.5 ms while Python or a neighbour computes. */
-void ask_to_run_first(void);
 
 /* Whether an event may be written, which is then done. */
 bool may_report(struct reporter *reporter, int64_t now);

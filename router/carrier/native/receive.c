@@ -226,6 +226,7 @@ static bool receive_one(struct carrier *carrier, const struct listener *listener
     edition_begin(&carrier->edition);
     handle(carrier, &received, arrival(&message));
     edition_end(&carrier->edition);
+    share_processor(&carrier->share, received.now);
     return true;
 }
 
@@ -318,7 +319,7 @@ static void receive_from_many(struct carrier *carrier, int waiting) {
 
 void *receive_thread(void *of) {
     struct carrier *carrier = of;
-    ask_to_run_first();
+    carrier->share.may_be_first = carrier->share.is_first = run_first();
     while (!is_stopping(carrier)) {
         if (carrier->program->listener_count == 1) receive_from_one(carrier);
         else receive_from_many(carrier, carrier->epoll);

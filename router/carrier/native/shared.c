@@ -2,36 +2,12 @@
 #include "carrier_internal.h"
 
 #include <errno.h>
-#include <sched.h>
 #include <signal.h>
-#include <sys/resource.h>
-#include <sys/syscall.h>
 #include <unistd.h>
 
 #include "clock.h"
 
 /* ---- threads ---- */
-
-/* `struct sched_attr` of sched_setattr(2), which C libraries declare since 2024 only. */
-struct scheduling {
-    uint32_t size, policy;
-    uint64_t flags;
-    int32_t nice;
-    uint32_t priority;
-    uint64_t runtime, deadline, period;
-};
-
-static const uint64_t SLICE = 100000; /* ns, the shortest that Linux takes */
-
-void ask_to_run_first(void) {
-    int inherited = sched_getscheduler(0); /* the batch policy from a thread of Python that opens ROS */
-    if (inherited != SCHED_OTHER && inherited != SCHED_BATCH) return; /* it was chosen by whoever started the router */
-    struct sched_param least = {.sched_priority = sched_get_priority_min(SCHED_FIFO)};
-    if (!sched_setscheduler(0, SCHED_FIFO, &least)) return;
-    struct scheduling wanted = {.size = sizeof wanted, .policy = SCHED_OTHER, .runtime = SLICE};
-    wanted.nice = getpriority(PRIO_PROCESS, 0);
-    syscall(SYS_sched_setattr, 0, &wanted, 0); /* before Linux 6.12 it changes nothing */
-}
 
 int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void *argument) {
     sigset_t all, usual;

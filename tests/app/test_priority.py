@@ -11,6 +11,9 @@ import pytest
 
 from tests.acceptance.site import RouterProcess, site
 
+if os.environ.get("ROUTER_CARRIER") == "python":
+    pytest.skip("Python has no such threads", allow_module_level=True)
+
 THREADS = {"receive", "brakes", "ros commands"}
 UNPRIVILEGED = ("setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice")
 

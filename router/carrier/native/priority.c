@@ -1,0 +1,51 @@
+#include "priority.h"
+
+#include <sched.h>
+#include <sys/resource.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "clock.h"
+
+/* `struct sched_attr` of sched_setattr(2), which C libraries declare since 2024 only. */
+struct scheduling {
+    uint32_t size, policy;
+    uint64_t flags;
+    int32_t nice;
+    uint32_t priority;
+    uint64_t runtime, deadline, period;
+};
+
+static const uint64_t SLICE = 100000; /* ns, the shortest that Linux takes */
+static const int64_t TURN = 100000000; /* ns */
+
+static bool take_priority(void) {
+    struct sched_param least = {.sched_priority = sched_get_priority_min(SCHED_FIFO)};
+    return !sched_setscheduler(0, SCHED_FIFO, &least);
+}
+
+static void take_short_slices(void) {
+    struct scheduling wanted = {.size = sizeof wanted, .policy = SCHED_OTHER, .runtime = SLICE};
+    wanted.nice = getpriority(PRIO_PROCESS, 0);
+    if (!syscall(SYS_sched_setattr, 0, &wanted, 0)) return;
+    sched_setscheduler(0, SCHED_OTHER, &(struct sched_param){0});
+}
+
+bool run_first(void) {
+    int inherited = sched_getscheduler(0); /* the batch policy from a thread of Python that opens ROS */
+    if (inherited != SCHED_OTHER && inherited != SCHED_BATCH) return false; /* whoever started the router has chosen it */
+    if (take_priority()) return true;
+    take_short_slices(); /* before Linux 6.12 they change nothing */
+    return false;
+}
+
+void share_processor(struct share *share, int64_t now) {
+    if (!share->may_be_first || now - share->began < TURN) return;
+    int64_t used = clock_read(CLOCK_THREAD_CPUTIME_ID);
+    bool was_busy = used - share->used > (now - share->began) / 4 * 3;
+    if (was_busy && share->is_first) take_short_slices();
+    else if (!was_busy && !share->is_first) take_priority();
+    share->is_first = !was_busy;
+    share->began = now;
+    share->used = used;
+}

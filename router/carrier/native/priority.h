@@ -1,0 +1,22 @@
+/* Threads that run as soon as they wake up, in place of one that computes: they will not compute for long. */
+#ifndef PRIORITY_H
+#define PRIORITY_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* How much of the processor a thread uses. At first, both flags are what `run_first` returned, and the rest is 0. */
+struct share {
+    bool may_be_first, is_first;
+    int64_t began, used; /* when its turn began, and its time on the processor until then; ns */
+};
+
+/* Give the calling thread the least real-time priority, so that no other program delays it, and return true. Where it may
+ * not have it, ask for the shortest slices: it waits less then, which is some 0.5 ms while Python or a neighbour computes. */
+bool run_first(void);
+
+/* Take the priority from the calling thread for a turn of 100 ms after one of which it used three quarters: a flood would
+ * leave others next to nothing of its processor core. `now` is monotonic. */
+void share_processor(struct share *share, int64_t now);
+
+#endif

@@ -1,0 +1,75 @@
+"""A thread that uses up its processor loses its real-time priority for a turn."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import threading
+from collections.abc import Callable
+from time import thread_time_ns
+
+import pytest
+
+TURN = 100_000_000
+"""ns"""
+
+
+class Share(ctypes.Structure):
+    """`struct share` in priority.h."""
+
+    _fields_ = (
+        ("may_be_first", ctypes.c_bool),
+        ("is_first", ctypes.c_bool),
+        ("began", ctypes.c_int64),
+        ("used", ctypes.c_int64),
+    )
+
+
+def in_a_thread(run: Callable[[], None]) -> None:
+    """Run it in a thread of its own, whose policy ends with it."""
+    failed: list[BaseException] = []
+
+    def guarded() -> None:
+        try:
+            run()
+        except BaseException as error:  # noqa: BLE001 - raised below
+            failed.append(error)
+
+    thread = threading.Thread(target=guarded)
+    thread.start()
+    thread.join()
+    for error in failed:
+        raise error
+
+
+def use_the_processor() -> None:
+    until = thread_time_ns() + TURN
+    while thread_time_ns() < until:
+        pass
+
+
+def test_one_that_uses_most_of_a_turn_is_not_first_in_the_next(library: ctypes.CDLL) -> None:
+    def run() -> None:
+        library.run_first.restype = ctypes.c_bool
+        if not library.run_first():
+            pytest.skip("needs the right to a real-time priority")
+        share = Share(may_be_first=True, is_first=True, used=thread_time_ns())
+        policies = [os.sched_getscheduler(0)]
+        use_the_processor()
+        for now in (TURN - 1, TURN, 2 * TURN - 1, 3 * TURN):
+            library.share_processor(ctypes.byref(share), ctypes.c_int64(now))
+            policies.append(os.sched_getscheduler(0))
+        first, usual = os.SCHED_FIFO, os.SCHED_OTHER
+        assert policies == [first, first, usual, usual, first]
+
+    in_a_thread(run)
+
+
+def test_one_that_may_not_be_first_is_left_alone(library: ctypes.CDLL) -> None:
+    def run() -> None:
+        share = Share()
+        for now in (TURN, 3 * TURN):
+            library.share_processor(ctypes.byref(share), ctypes.c_int64(now))
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+    in_a_thread(run)
