@@ -3,11 +3,14 @@
 #define CLOCK_H
 
 #include <stdint.h>
+#include <time.h>
 
 extern int64_t seam_monotonic, seam_wall;
 
-static inline int64_t monotonic_ns(void) { return seam_monotonic; }
+static inline int64_t clock_read(clockid_t clock) { return clock == CLOCK_REALTIME ? seam_wall : seam_monotonic; }
 
-static inline int64_t wall_ns(void) { return seam_wall; }
+static inline int64_t monotonic_ns(void) { return clock_read(CLOCK_MONOTONIC); }
+
+static inline int64_t wall_ns(void) { return clock_read(CLOCK_REALTIME); }
 
 #endif
