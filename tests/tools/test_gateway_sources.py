@@ -253,7 +253,9 @@ def test_zenoh_without_a_gateway_waits_for_one(rover: tuple[zenoh.Session, str],
     with closing(ZenohSource(settings, said.append)) as source:
         source.ask()
         assert list(source.arrivals(5)) == []
-        session.put("rovers/loki_1/data/imu", b"live")
+        gateway = session.declare_publisher("rovers/loki_1/data/imu")
+        until(source, lambda: gateway.matching_status.matching)  # type: ignore[attr-defined]
+        gateway.put(b"live")
         assert received(source, 1) == [b"live"]
 
 
