@@ -25,7 +25,6 @@ UNPRIVILEGED = ("setpriv", "--bounding-set=-sys_nice", "--inh-caps=-sys_nice")
         ((), os.SCHED_FIFO),
         (UNPRIVILEGED, os.SCHED_OTHER),
         (("prlimit", "--rtprio=1", *UNPRIVILEGED), os.SCHED_FIFO),
-        (("chrt", "--idle", "0"), os.SCHED_IDLE),
     ],
 )
 def test_native_threads_run_first_where_they_may(within: Sequence[str], policy: int, tmp_path: Path) -> None:

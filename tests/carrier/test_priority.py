@@ -1,4 +1,4 @@
-"""A thread that uses up its processor loses its real-time priority for a turn."""
+"""Threads that run first: not where somebody has chosen otherwise, and not in the turn after one that they used up."""
 
 from __future__ import annotations
 
@@ -46,6 +46,16 @@ def use_the_processor() -> None:
     until = thread_time_ns() + TURN
     while thread_time_ns() < until:
         pass
+
+
+def test_the_policy_that_somebody_chose_for_the_router_stays(library: ctypes.CDLL) -> None:
+    def run() -> None:
+        library.run_first.restype = ctypes.c_bool
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        assert not library.run_first()
+        assert os.sched_getscheduler(0) == os.SCHED_IDLE
+
+    in_a_thread(run)
 
 
 def test_one_that_uses_most_of_a_turn_is_not_first_in_the_next(library: ctypes.CDLL) -> None:
