@@ -88,13 +88,24 @@ class RouterProcess:
             )
 
     def __enter__(self) -> RouterProcess:
-        wait_until(lambda: self.process.poll() is not None or bool(self.events("router started")), "the start")
-        assert self.process.poll() is None, self.text()
+        with self._or_killed():
+            wait_until(lambda: self.process.poll() is not None or bool(self.events("router started")), "the start")
+            assert self.process.poll() is None, self.text()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.process.poll() is None:
-            assert self.stop(signal.SIGTERM) == 0, self.text()
+        with self._or_killed():
+            if self.process.poll() is None:
+                assert self.stop(signal.SIGTERM) == 0, self.text()
+
+    @contextmanager
+    def _or_killed(self) -> Iterator[None]:
+        """A router that is left running would subscribe to the topics of other tests."""
+        try:
+            yield
+        except BaseException:
+            self.process.kill()
+            raise
 
     def stop(self, number: signal.Signals) -> int:
         """Sends the signal, waits, and gives the exit code."""
