@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import os
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from time import thread_time_ns
 
 import pytest
@@ -27,19 +27,8 @@ class Share(ctypes.Structure):
 
 def in_a_thread(run: Callable[[], None]) -> None:
     """Run it in a thread of its own, whose policy ends with it."""
-    failed: list[BaseException] = []
-
-    def guarded() -> None:
-        try:
-            run()
-        except BaseException as error:  # noqa: BLE001 - raised below
-            failed.append(error)
-
-    thread = threading.Thread(target=guarded)
-    thread.start()
-    thread.join()
-    for error in failed:
-        raise error
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(run).result()
 
 
 def use_the_processor() -> None:
