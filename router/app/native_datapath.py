@@ -1,7 +1,7 @@
-"""The datapath of the carrier: native threads receive, forward and brake; Python serves what only Python can.
+"""The datapath of the carrier: native threads receive, forward, publish and brake; Python serves what only Python can.
 
-Datagrams whose targets the carrier does not serve come by rings to two threads: `topics` publishes, which may block in
-the middleware, and `destinations` sends to endpoints that need Python. Each has its own engine with its own state, and
+What the receive thread does not send itself comes by rings to others: a native one publishes (`publishing`), `topics`
+and `destinations` serve what needs Python (`parts`). Each of those two has its own engine with its own state, and
 changes to another program when it has served all that the earlier one received. Commands from ROS have a native thread
 (`ros_commands`), other messages from ROS the one in `ros`.
 """
@@ -17,6 +17,8 @@ from socket import inet_ntoa
 from struct import Struct
 from typing import TYPE_CHECKING, cast
 
+from router.app.parts import OF_PYTHON, Part, Parts, divided
+from router.app.publishing import Publishing
 from router.app.ros_commands import RosCommands, RosTopics
 from router.app.sockets import SocketChange
 from router.app.wiring import (
@@ -35,11 +37,12 @@ from router.carrier.commands import native_commands
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.events import EventThread
 from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
+from router.carrier.publishing import PublishRoutes
 from router.carrier.ring import Ring
 from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker, left_behind
-from router.compiler.program import DeadmanPlan, Handler, Part, Program, TargetPlan
+from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine import MAX_DATAGRAM, OutboundEngine, PartEngine
 from router.engine.binding import State
 from router.engine.deadman import feeder
@@ -67,7 +70,6 @@ _PATIENCE_S = 1.0
 _MIRROR = Struct("@IIqIIII")
 """`struct mirror_record`."""
 
-_PARTS = {Part.TOPICS: "topics", Part.DESTINATIONS: "destinations"}
 _ROS, _ENDPOINTS, _GATEWAYS = "ros", "endpoints", "gateways"
 
 
@@ -89,20 +91,23 @@ class NativeDatapath:
         self._context = context
         self._names = Names()
         self._generations = count(1)
+        self._published_before = 0  # bytes in the ring of what the earlier program received
         context.counts.most = MOST_COUNTERS
         self._wiring: NativeWiring | None = None
         self._is_running = False
         report, failed = context.reporter.report, context.reporter.failed
-        received, commanded, braked = (Ring(library, _EVENTS) for _ in range(3))
-        receive_counts, command_counts, deadman_counts = (_fixed_counts() for _ in range(3))
+        received, commanded, braked, published = (Ring(library, _EVENTS) for _ in range(4))
+        receive_counts, command_counts, deadman_counts, publish_counts = (_fixed_counts() for _ in range(4))
         self._deadmen = Deadmen(library, deadman_counts, braked, self._names)
         self._carrier = Carrier(library, self._deadmen.address, receive_counts, received)
         self._commands = RosCommands(library, self._deadmen.address, command_counts, commanded)
+        self._publishing = Publishing(library, Ring(library, _QUEUE), publish_counts, published, self._names)
         self._ros: RouterNode | None = None
-        self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in _PARTS.items()}
+        self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in OF_PYTHON.items()}
         context.counts.add(_as_list(deadman_counts))
         for worker in self._workers.values():  # first: what they have served was received, so no less than 0 waits
             context.counts.add(worker.counts, worker.copy_counts, worker.forget_copy)
+        context.counts.add(_as_list(publish_counts), self._publishing.counters)
         context.counts.add(_as_list(receive_counts), self._carrier.counters)
         context.counts.add(_as_list(command_counts), self._commands.counters)
         self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
@@ -112,6 +117,7 @@ class NativeDatapath:
                 (received, _as_list(receive_counts)),
                 (commanded, _as_list(command_counts)),
                 (braked, _as_list(deadman_counts)),
+                (published, _as_list(publish_counts)),
             ],
             self._names,
             report,
@@ -135,7 +141,7 @@ class NativeDatapath:
         return NativeSender(self._library, endpoint)
 
     def states(self, earlier: Wiring | None) -> States:
-        return States([*_PARTS.values(), _ROS, _ENDPOINTS, _GATEWAYS], earlier.states if earlier else None)
+        return States([*OF_PYTHON.values(), _ROS, _ENDPOINTS, _GATEWAYS], earlier.states if earlier else None)
 
     def start_deadmen(self, program: Program, sockets: SocketChange, states: States) -> None:
         for plan in program.deadmen:
@@ -167,27 +173,25 @@ class NativeDatapath:
         errors = ros.publish_errors if ros else ()
         shared = engine_context(program, context, topics, errors, send, command, pacers)
         outbound = OutboundEngine(program, replace(shared, counts=context.counts.ros, state=states[_ROS]))
-        parts = {
-            part: PartEngine(program, replace(shared, counts=self._workers[part].counts, state=states[user]), part)
-            for part, user in _PARTS.items()
+        parts = divided(program, publishes=self._publishing.open(has_topics=bool(program.lowered)))
+        engines = {
+            part: PartEngine(
+                program, replace(shared, counts=self._workers[part].counts, state=states[user]), parts[part]
+            )
+            for part, user in OF_PYTHON.items()
         }
-        functions = {part: engine.functions() for part, engine in parts.items()}
-
-        def parts_of(handler: Handler) -> Iterator[PartTargets]:
-            for part, worker in self._workers.items():
-                if handler.route in functions[part]:
-                    targets = _targets(program, handler, part)
-                    is_always_wanted = part is Part.DESTINATIONS or handler.collect_timeout is not None
-                    yield PartTargets(worker.ring.address, targets, is_always_wanted)
-
+        functions = {part: engine.functions() for part, engine in engines.items()}
+        limit = partial(_limit, states[_ENDPOINTS])
+        publications = topics.publications if topics else {}
+        routes = PublishRoutes(program, publications, self._names.number, limit)
         outlets = Outlets(
             listeners=sockets.listeners,
             senders={endpoint: sender.address for endpoint, sender in senders.items()},
-            wanted={topic: each.wanted for topic, each in topics.publications.items()} if topics else {},
+            wanted={topic: each.wanted for topic, each in publications.items()},
             feeds=lambda route, names: [(deadman.address, disarms) for deadman, disarms in feeds(route, names)],
-            limit=partial(_limit, states[_ENDPOINTS]),
-            carried=lambda handler: _targets(program, handler, None),
-            parts=lambda handler: list(parts_of(handler)),
+            limit=limit,
+            carried=lambda handler: parts[Part.SENT].get(handler.route, ()),
+            parts=lambda handler: list(self._parts_of(handler, parts, routes)),
             names=self._names,
         )
         try:
@@ -195,16 +199,18 @@ class NativeDatapath:
         except CannotCarry as error:
             what = f"the carrier, which runs, cannot take these messages: {error}"
             raise StartError(f"{what}; restart the router, and Python serves them") from error
-        native.arrays += [senders, deadmen]
+        native.arrays += [senders, deadmen, routes]
         numbers = {handler.route: number for number, handler in enumerate(native.handlers)}
+        now = self._wiring.program if self._wiring else program
+        leaves_native = bool(_topics(now, by_carrier=True) & _topics(program, by_carrier=False))
         stages = {
             part: Stage(
                 native.generation,
                 {numbers[route]: function for route, function in functions[part].items()},
                 native.sources,
-                partial(self._end_timers, part, states),
+                partial(self._switch, part, states, waits=part is Part.TOPICS and leaves_native),
             )
-            for part in Part
+            for part in OF_PYTHON
         }
         commands = native_commands(program, outlets)
         commands.arrays += [senders, deadmen]
@@ -223,7 +229,7 @@ class NativeDatapath:
             states=states,
             gateway_deadmen=behind_gateways,
             pacers=pacers,
-            engines=(outbound, *parts.values()),
+            engines=(outbound, *engines.values()),
             native=native,
             topics=RosTopics(
                 commands, {topic: each.raw for topic, each in topics.subscriptions.items()} if topics else {}
@@ -231,6 +237,17 @@ class NativeDatapath:
             deadmen=deadmen,
             stages=stages,
         )
+
+    def _parts_of(self, handler: Handler, parts: Parts, routes: PublishRoutes) -> Iterator[PartTargets]:
+        """The parts of a route that get their messages by a ring."""
+        if targets := parts[Part.PUBLISHED].get(handler.route):
+            yield PartTargets(
+                self._publishing.ring.address, targets, is_always_wanted=False, publishes=routes.route(handler, targets)
+            )
+        for part, worker in self._workers.items():
+            if targets := parts[part].get(handler.route):
+                is_always_wanted = part is Part.DESTINATIONS or handler.collect_timeout is not None
+                yield PartTargets(worker.ring.address, targets, is_always_wanted)
 
     def _native(self, sender: Sender) -> NativeSender:
         assert isinstance(sender, NativeSender)  # noqa: S101 - made by `open_sender`
@@ -241,12 +258,15 @@ class NativeDatapath:
         key = "deadman", plan, tuple(senders.values())
         return states[_ENDPOINTS].keep(key, lambda: self._deadmen.add(plan, program.counters, senders))
 
-    def _end_timers(self, part: Part, states: States) -> None:
+    def _switch(self, part: Part, states: States, *, waits: bool) -> None:
         """End the timers that only the earlier program had, once its messages are served.
 
-        What waits for an endpoint may have come by any of its timers, which end before the pacer.
+        What waits for an endpoint may have come by any of its timers, which end before the pacer. `waits`: a topic was
+        published on by the native thread, whose messages come first.
         """
-        left = list(states[_PARTS[part]].left())
+        if waits:
+            self._publishing.wait_until_passed(self._publishing.ring.written, _PATIENCE_S)
+        left = list(states[OF_PYTHON[part]].left())
         if part is Part.DESTINATIONS:
             left += states[_ENDPOINTS].left()
         self._context.timers.release(left)
@@ -288,18 +308,24 @@ class NativeDatapath:
         for next_one, before in replaced:
             next_one.succeeds(before)
         generation = wiring.native.generation
-        holds = _moves_to_carrier(earlier.program, wiring.program)
+        holds = _endpoints(earlier.program, by_carrier=False) & _endpoints(wiring.program, by_carrier=True)
+        holds_topics = _topics(earlier.program, by_carrier=False) & _topics(wiring.program, by_carrier=True)
+        self._publishing.hold(is_held=bool(holds_topics))
         self._carrier.change(
             wiring.native,
             [(next_one.address, before.address) for next_one, before in replaced],
             [before.address for before in ended],
-            holds=holds,
+            holds=bool(holds),
         )
+        self._published_before = self._publishing.ring.written
         for worker in self._workers.values():
             worker.advance(generation)
         if holds:  # what waits for Python is sent before what the carrier receives from now on
             self._workers[Part.DESTINATIONS].wait_for(generation, _PATIENCE_S)
             self._carrier.resume()
+        if holds_topics:
+            self._workers[Part.TOPICS].wait_for(generation, _PATIENCE_S)
+            self._publishing.hold(is_held=False)
 
     def start(self) -> None:
         assert self._wiring is not None  # noqa: S101 - `adopt` was called
@@ -314,7 +340,8 @@ class NativeDatapath:
         if not self._is_running:
             return True
         late = left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
-        return not late and self._commands.has_passed
+        has_published = self._publishing.wait_until_passed(self._published_before, _PATIENCE_S)
+        return not late and has_published and self._commands.has_passed
 
     def observe(self, *, is_observed: bool) -> None:
         lost = self._context.counts.counters.index("mirror_dropped")
@@ -332,14 +359,15 @@ class NativeDatapath:
         stuck = [worker.name for worker in self._workers.values() if not worker.stop(_PATIENCE_S)]
         if stuck:
             logger.error("a thread is stuck, and the router ends without it", threads=stuck)
-        self._stop_commands()
+        self._stop_threads_of_ros()
 
-    def _stop_commands(self) -> None:
-        if not self._commands.stop() and self._ros is not None:
+    def _stop_threads_of_ros(self) -> None:
+        have_ended = self._publishing.stop(), self._commands.stop()
+        if not all(have_ended) and self._ros is not None:
             self._ros.leave_open()
 
     def close(self) -> None:
-        self._stop_commands()  # if the start has failed
+        self._stop_threads_of_ros()  # if the start has failed
         for deadman in self._wiring.deadmen.values() if self._wiring else ():
             deadman.end()
         self._events.close()
@@ -397,17 +425,6 @@ def _host(address: int) -> str:
     return inet_ntoa(address.to_bytes(4, "big"))
 
 
-def _targets(program: Program, handler: Handler, part: Part | None) -> list[TargetPlan]:
-    """The targets of a route that a part serves; None for those that the carrier serves."""
-
-    def served_by(target: TargetPlan) -> Part | None:
-        if target.is_topic:
-            return Part.TOPICS
-        return None if program.executors[handler.route, None, target.label].is_carrier else Part.DESTINATIONS
-
-    return [target for target in handler.targets if served_by(target) is part]
-
-
 def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
     """The limit of a target with `max_rate`, which lives as long as programs have the target."""
     rate = target.max_rate
@@ -417,14 +434,13 @@ def _limit(state: State, handler: Handler, target: TargetPlan) -> c.Limit:
     return state.keep(key, lambda: c.Limit(period, period - period // 2, -period))
 
 
-def _moves_to_carrier(earlier: Program, later: Program) -> bool:
-    """Whether an endpoint that Python served is served by the carrier now."""
+def _endpoints(program: Program, *, by_carrier: bool) -> set[str | None]:
+    """The endpoints to which datagrams are forwarded by the carrier, or by Python."""
+    of_udp = {key: executor for key, executor in program.executors.items() if key[1] is None}
+    return {endpoint for (_, _, endpoint), executor in of_udp.items() if executor.is_carrier is by_carrier}
 
-    def served(program: Program, *, by_carrier: bool) -> set[str]:
-        return {
-            endpoint
-            for (_, topic, endpoint), executor in program.executors.items()
-            if topic is None and executor.is_carrier is by_carrier
-        }
 
-    return bool(served(earlier, by_carrier=False) & served(later, by_carrier=True))
+def _topics(program: Program, *, by_carrier: bool) -> set[str | None]:
+    """The topics on which the carrier publishes, or Python."""
+    published = {key: executor for key, executor in program.executors.items() if key[2] is None}
+    return {topic for (_, topic, _), executor in published.items() if executor.is_carrier is by_carrier}

@@ -31,6 +31,10 @@ _OPTIMIZED = (
 _LINKED = ("-Wl,-Bsymbolic", "-Wl,-z,defs", "-Wl,-z,relro", "-Wl,-z,now", "-Wl,-z,noexecstack")
 """All functions are exported, for ctypes; among themselves they need no symbol table."""
 
+_RCL = ("rcl", "rcutils", "rmw", "rosidl_runtime_c", "rosidl_typesupport_interface", "rosidl_dynamic_typesupport",
+        "rcl_yaml_param_parser", "type_description_interfaces", "service_msgs", "builtin_interfaces")  # fmt: skip
+"""Packages whose headers those of rcl include."""
+
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wstrict-prototypes", "-Werror")
 """For developers: other compilers than theirs may warn of more."""
 
@@ -42,6 +46,13 @@ class BuildError(Exception):
 def sources() -> list[Path]:
     """The files to compile."""
     return sorted(NATIVE.glob("*.c"))
+
+
+def rcl_headers() -> list[str]:
+    """Options by which the compiler finds the headers of rcl: of the wheels in this environment, or of ROS from apt."""
+    prefixes = [sys.prefix, *os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
+    folders = [Path(prefix, "include", package) for prefix in prefixes if prefix for package in _RCL]
+    return [f"-isystem{folder}" for folder in folders if folder.is_dir()]
 
 
 def checksum() -> str:
@@ -68,7 +79,7 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
     """
     with TemporaryDirectory(dir=output.parent, prefix=".carrier") as folder:
         made = Path(folder) / output.name
-        compile_c([*map(str, sources()), "-fPIC", "-shared", *flags, "-o", str(made)], compiler)
+        compile_c([*map(str, sources()), "-fPIC", "-shared", *rcl_headers(), *flags, "-o", str(made)], compiler)
         made.replace(output)
     return output
 
@@ -76,7 +87,8 @@ def build(output: Path = LIBRARY, flags: Sequence[str] = _OPTIMIZED + _LINKED, c
 def compile_c(arguments: Sequence[str], compiler: str | None = None) -> None:
     """Run the C compiler on sources of the carrier, and of those who call it. Raises BuildError."""
     language = ("-std=c11", "-D_GNU_SOURCE", "-pthread", f'-DCARRIER_CHECKSUM="{checksum()}"')
-    command = [compiler or os.environ.get("CC") or "cc", *language, *arguments]
+    libraries = () if {"-fsyntax-only", "-c"} & {*arguments} else ("-lm",)
+    command = [compiler or os.environ.get("CC") or "cc", *language, *arguments, *libraries]
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     except OSError as error:
@@ -95,7 +107,7 @@ def main() -> int:
         return 0 if is_current(args.output) else 1
     try:
         if args.lint:
-            compile_c([*map(str, sources()), *WARNINGS, "-fsyntax-only"])
+            compile_c([*map(str, sources()), *rcl_headers(), *WARNINGS, "-fsyntax-only"])
         else:
             build(args.output)
     except BuildError as error:

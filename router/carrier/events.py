@@ -26,6 +26,7 @@ _LOSSES = (
     "queue_full",
     "send_buffer_full",
     "send_error",
+    "publish_error",
 )
 """`enum loss`."""
 
@@ -111,7 +112,8 @@ class EventThread:
             self._count(counter, Report("reject", place, "", _REASONS[reason], None, detail), counters, last)
         elif kind == _LOST:
             _, _, route, target, loss, number, counter, _ = _LOSS.unpack_from(record)
-            lost = Report("drop", self._name(route), self._name(target), _LOSSES[loss], _error(number))
+            detail = bytes(record[_LOSS.size :]).partition(b"\0")[0].decode(errors="replace")
+            lost = Report("drop", self._name(route), self._name(target), _LOSSES[loss], _error(number), detail)
             self._count(counter, lost, counters, last)
         else:
             _, _, route, target, number, counter = _DEADMAN.unpack_from(record)

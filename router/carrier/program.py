@@ -39,11 +39,15 @@ class Names:
 
 @dataclass(frozen=True, slots=True)
 class PartTargets:
-    """The targets of a route that one thread of Python serves, and the ring by which it gets the messages."""
+    """The targets of a route that one thread serves, and the ring by which it gets the messages.
+
+    `publishes` is what the native thread does with them, None for a thread of Python.
+    """
 
     ring: int
     targets: Sequence[TargetPlan]
     is_always_wanted: bool
+    publishes: c.PublishRoute | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +210,7 @@ class _Writer:
         targets = [self._waiting(handler, target) for target in part.targets]
         return c.Part(
             ring=part.ring,
+            publishes=ctypes.pointer(part.publishes) if part.publishes is not None else None,
             wanted=self.array(ctypes.c_void_p, flags),
             targets=self.array(c.Waiting, targets),
             wanted_count=len(flags),

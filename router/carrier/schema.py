@@ -8,14 +8,11 @@ from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
-from google.protobuf.message import DecodeError
-from google.protobuf.message_factory import GetMessageClass
 
 from router.carrier.structures import Schema, WireField, WireType
-from router.compiler.payload import varint
-from router.engine.slow_path import LEN
 from router.types.descriptors import container, message_of
 from router.types.protobuf import Envelope
+from router.types.wire import delimited, parses, validates_text
 
 _MOST_TYPES = 65536
 
@@ -91,7 +88,7 @@ def wire_schema(envelope: Envelope, routed: Container[int]) -> WireSchema:
     arrays = [_lowered(each, indexes, {} if index else flags) for each, index in indexes.items()]
     types = (WireType * len(arrays))(
         *(
-            WireType(fields, len(fields), _parses(each, _len(0, b"")))
+            WireType(fields, len(fields), parses(each, delimited(0, b"")))
             for fields, each in zip(arrays, indexes, strict=True)
         )
     )
@@ -149,7 +146,7 @@ def _lowered(
 
 def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], flags: WireFlag) -> WireField:
     kind = _kind(field)
-    if kind is WireKind.GROUP and not _parses(container(field), _len(field.number, b"\xff")):
+    if kind is WireKind.GROUP and not parses(container(field), delimited(field.number, b"\xff")):
         raise CannotCarry(f"protobuf before 7.36 takes {field.full_name}, a group, for a message")
     if kind in {WireKind.MESSAGE, WireKind.GROUP}:
         return WireField(field.number, kind, flags, indexes[message_of(field)])
@@ -158,20 +155,6 @@ def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], fl
 
 
 def _kind(field: FieldDescriptor) -> WireKind:
-    if field.type == FieldDescriptor.TYPE_STRING and _parses(container(field), _len(field.number, b"\xff")):
+    if field.type == FieldDescriptor.TYPE_STRING and not validates_text(field):
         return WireKind.BYTES  # what is no UTF-8 is accepted; that depends on syntax and features
     return _KINDS[field.type]
-
-
-def _len(number: int, value: bytes) -> bytes:
-    """A LEN field."""
-    return varint(number << 3 | LEN) + varint(len(value)) + value
-
-
-def _parses(descriptor: Descriptor, data: bytes) -> bool:
-    """Whether protobuf parses a message. Versions and features differ in details; so they are asked."""
-    try:
-        GetMessageClass(descriptor).FromString(data)
-    except DecodeError:
-        return False
-    return True

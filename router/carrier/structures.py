@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, c_int32, c_int64, c_uint8, c_uint16, c_uint32, c_void_p
+from ctypes import POINTER, c_int32, c_int64, c_uint8, c_uint16, c_uint32, c_uint64, c_void_p
 
 REASONS = 8
 """Reasons to reject a datagram: those of REJECT_REASONS, in the same order."""
@@ -78,11 +78,96 @@ class Waiting(ctypes.Structure):
     _fields_ = (("id", c_uint32), ("waiting", c_uint32), ("queue_full", c_uint32), ("filtered", c_uint32))
 
 
+class Value(ctypes.Structure):
+    """`struct value` in fields.h, with its union as bits."""
+
+    _fields_ = (("bits", c_uint64), ("size", c_uint32), ("reserved", c_uint32))
+
+
+class NodeField(ctypes.Structure):
+    """`struct node_field` in fields.h."""
+
+    _fields_ = (
+        ("number", c_uint32),
+        ("type", c_uint8),
+        ("is_repeated", c_uint8),
+        ("slot", c_uint16),
+        ("presence", c_uint16),
+        ("node", c_uint16),
+        ("choice", c_uint16),
+        ("cleared", c_uint16),
+        ("cleared_count", c_uint16),
+        ("reserved", c_uint16),
+    )
+
+
+class Node(ctypes.Structure):
+    """`struct node` in fields.h."""
+
+    _fields_ = (
+        ("fields", POINTER(NodeField)),
+        ("count", c_uint32),
+        ("first_slot", c_uint16),
+        ("slot_count", c_uint16),
+    )
+
+
+class Operation(ctypes.Structure):
+    """`struct operation` in compose.h, with its union as bits."""
+
+    _fields_ = (("kind", c_uint8), ("flag", c_uint8), ("slot", c_uint16), ("size", c_uint32), ("bits", c_uint64))
+
+
+class PublishTopic(ctypes.Structure):
+    """`struct publish_topic` in publishing.h."""
+
+    _fields_ = (("publisher", c_void_p), ("wanted", c_void_p), ("id", c_uint32), ("reserved", c_uint32))
+
+
+class PublishTarget(ctypes.Structure):
+    """`struct publish_target` in publishing.h."""
+
+    _fields_ = (
+        ("topic", POINTER(PublishTopic)),
+        ("condition", POINTER(Operation)),
+        ("operations", POINTER(Operation)),
+        ("limit", POINTER(Limit)),
+        ("condition_count", c_uint32),
+        ("operation_count", c_uint32),
+        ("published", c_uint32),
+        ("waiting", c_uint32),
+        ("filtered", c_uint32),
+        ("stale", c_uint32),
+        ("rate_limited", c_uint32),
+        ("mapping_error", c_uint32),
+        ("non_finite", c_uint32),
+        ("publish_error", c_uint32),
+    )
+
+
+class PublishRoute(ctypes.Structure):
+    """`struct publish_route` in publishing.h."""
+
+    _fields_ = (
+        ("ttl", c_int64),
+        ("nodes", POINTER(Node)),
+        ("defaults", POINTER(Value)),
+        ("sources", POINTER(Value)),
+        ("literals", c_void_p),
+        ("targets", POINTER(PublishTarget)),
+        ("slot_count", c_uint32),
+        ("target_count", c_uint32),
+        ("id", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
 class Part(ctypes.Structure):
     """`struct part` in carrier.h."""
 
     _fields_ = (
         ("ring", c_void_p),
+        ("publishes", POINTER(PublishRoute)),
         ("wanted", POINTER(c_void_p)),
         ("targets", POINTER(Waiting)),
         ("wanted_count", c_uint32),
@@ -267,6 +352,8 @@ class MessageRecord(ctypes.Structure):
         ("start", c_uint32),
         ("payload_length", c_uint32),
         ("handler", c_uint32),
+        ("whole", c_uint32),
+        ("reserved", c_uint32),
     )
 
 
@@ -300,12 +387,19 @@ __all__ = [
     "Listener",
     "MessageRecord",
     "MirrorRecord",
+    "Node",
+    "NodeField",
+    "Operation",
     "Part",
     "Peer",
     "Program",
+    "PublishRoute",
+    "PublishTarget",
+    "PublishTopic",
     "ReadOp",
     "Route",
     "Schema",
+    "Value",
     "Waiting",
     "WireField",
     "WireType",

@@ -18,7 +18,7 @@ from router.log import logger
 
 _TRIES, _TRY_S = 100, 0.0002
 
-_RECORD = Struct("@IIQqqqIIIIII")
+_RECORD = Struct("@IIQqqqIIIIIIII")
 """`struct message_record`."""
 
 
@@ -152,6 +152,8 @@ class Worker:
                 start,
                 payload_length,
                 number,
+                _,
+                _,
             ) = _RECORD.unpack_from(records, position)
             if stage is None or generation != stage.generation:
                 self._switch(generation)

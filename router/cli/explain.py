@@ -15,6 +15,7 @@ from router.compiler.commands import lower_commands
 from router.compiler.executors import Executors, executors
 from router.compiler.link import compile_handlers
 from router.compiler.lookup import Definitions
+from router.compiler.lowering import lower_topics
 from router.compiler.metrics import Counters
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     for name in args.names:
         if name not in known:
             raise UsageError(f"{args.table} has no route or gateway '{name}'; {did_you_mean(name, known)}")
-    executed_by = {**executors(checked.routes), **lower_commands(checked.routes).executors}
+    executed_by = _executors(checked)
     topics = known_topics(checked.table) if args.live is None else seen_topics(checked.table, args.live)
     for name in args.names or known:
         for route in routes.get(name, ()):
@@ -66,6 +67,13 @@ def run(args: argparse.Namespace) -> int:
         if name in ignored:
             print(*ignored_gateway(ignored[name]), sep="\n", end="\n\n")
     return OK
+
+
+def _executors(checked: Checked) -> Executors:
+    assert checked.envelope is not None  # noqa: S101 - as above
+    routes = [route for route in checked.routes if not route.route.ignore]
+    published = lower_topics(routes, checked.envelope).executors
+    return {**executors(routes), **lower_commands(routes).executors, **published}
 
 
 def _diff(old: Path, new: Path) -> int:
@@ -84,7 +92,7 @@ def _print_route(route: CheckedRoute, checked: Checked, executed_by: Executors, 
     assert checked.table is not None  # noqa: S101 - a table without errors is one
     print(*explained_route(route, checked, executed_by), sep="\n")
     if not no_code and not route.route.ignore:
-        for handler in compile_handlers(route, checked.table, Counters(), executed_by):
+        for handler in compile_handlers(route, checked.table, Counters()):
             _print_code(handler.source)
     print()
 

@@ -18,10 +18,9 @@ from google.protobuf.message_factory import GetMessageClass
 
 from router.compiler.cdr.reading import LENGTH, Leap, Loop, Moment, Object, Step, Stretch, Take, Unpack
 from router.compiler.checked import CheckedRoute, CheckedSubscription, CheckedTarget
-from router.compiler.executors import CARRIER, Executor
+from router.compiler.executors import CARRIER, Executor, Executors
 from router.compiler.expressions import Typed
 from router.compiler.namespace import NAMESPACE
-from router.compiler.payload import varint
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.source import call
 from router.errors import MappingError, SourceSpan
@@ -29,6 +28,7 @@ from router.table.model import Keep
 from router.types.descriptors import message_of
 from router.types.model import Bytes, Float, List, String, Type
 from router.types.protobuf import PayloadCase
+from router.types.wire import varint
 
 MOST_SLOTS, MOST_REPEATS, MOST_OPEN = 1024, 8, 32
 """As in `native/convert.h`."""
@@ -123,7 +123,7 @@ class LoweredCommands:
     """
 
     commands: Commands
-    executors: Mapping[tuple[str, str | None, str], Executor]
+    executors: Executors
 
 
 class NeedsPythonError(Exception):
@@ -141,7 +141,7 @@ def lower_commands(routes: Sequence[CheckedRoute]) -> LoweredCommands:
         for feed in checked.subscriptions:
             topics.setdefault(feed.topic.topic.value, []).append((checked, feed))
     commands: dict[str, tuple[Command, ...]] = {}
-    executors: dict[tuple[str, str | None, str], Executor] = {}
+    executors: dict[tuple[str, str | None, str | None], Executor] = {}
     for topic, feeds in topics.items():
         if not any(_is_command(checked, feed) for checked, feed in feeds):
             continue

@@ -27,8 +27,8 @@ class Executor:
         return self.reason is None
 
 
-Executors = Mapping[tuple[str, str | None, str], Executor]
-"""By route, topic and endpoint. The topic is that from which a route from ROS takes messages, None for UDP."""
+Executors = Mapping[tuple[str, str | None, str | None], Executor]
+"""By route, topic and endpoint: what is forwarded has no topic, and a topic that is published no endpoint."""
 
 CARRIER = Executor()
 

@@ -11,9 +11,10 @@ from dataclasses import replace
 from router.compiler.checked import CheckedDeadman, CheckedRoute
 from router.compiler.commands import lower_commands
 from router.compiler.deadmen import deadman_plan
-from router.compiler.executors import Executors, executors
+from router.compiler.executors import executors
 from router.compiler.handlers import HandlerSource
 from router.compiler.lookup import layout
+from router.compiler.lowering import lower_topics
 from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
     CLIENTS,
@@ -34,8 +35,8 @@ from router.compiler.program import (
     DeadmanPlan,
     GatewayPlan,
     Handler,
-    Part,
     Program,
+    TargetPlan,
     TopicPlan,
     source_label,
 )
@@ -63,11 +64,11 @@ def link(
     _open_counters(counters, table, envelope)
     _open_own_counters(counters, table)
     served = [checked for checked in routes if not checked.route.ignore]
-    executed_by, lowered = executors(served), lower_commands(served)
+    commands, topics = lower_commands(served), lower_topics(served, envelope)
     inbound: dict[int, tuple[Handler, ...]] = {}
     outbound: dict[str, tuple[Handler, ...]] = {}
     for checked in served:
-        for handler in compile_handlers(checked, table, counters, executed_by):
+        for handler in compile_handlers(checked, table, counters):
             if handler.topic is None:
                 number = handler.case.number
                 inbound[number] = (*inbound.get(number, ()), handler)
@@ -92,8 +93,9 @@ def link(
         deadmen=deadmen,
         ignored=frozenset(checked.case.number for checked in routes if checked.route.ignore),
         protos=schema,
-        executors={**executed_by, **lowered.executors},
-        commands=lowered.commands,
+        executors={**executors(served), **commands.executors, **topics.executors},
+        commands=commands.commands,
+        lowered=topics.routes,
         gateways=tuple(gateways),
     )
 
@@ -153,13 +155,10 @@ def _open_own_counters(counters: Counters, table: RouteTable) -> None:
         _open_each(counters, "record_dropped", last=RECORD_DROP_REASONS)
 
 
-def compile_handlers(
-    checked: CheckedRoute, table: RouteTable, counters: Counters, executed_by: Executors
-) -> Iterator[Handler]:
+def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counters) -> Iterator[Handler]:
     """Generate and compile the functions of one route, and open its series in the counters.
 
-    A route from UDP has one function, a route from ROS one for each of its topics. `executed_by` are all targets of the
-    table.
+    A route from UDP has one function, a route from ROS one for each of its topics.
     """
     route, case = checked.route, checked.case
     _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route.name)
@@ -170,16 +169,14 @@ def compile_handlers(
         if ANY in sources:
             sources = [*table.endpoints, STRANGER]
         _open_each(counters, "messages_received", route.name, last=map(source_label, sources))
-        yield _inbound_handler(checked, counters, executed_by, frozenset(sources))
+        yield _inbound_handler(checked, counters, frozenset(sources))
     for feed in checked.subscriptions:
         generator = HandlerSource(route, case, counters)
         generator.outbound(feed)
         yield _handler(generator, checked, feed.topic.span.file, frozenset(), feed.topic.topic.value)
 
 
-def _inbound_handler(
-    checked: CheckedRoute, counters: Counters, executed_by: Executors, sources: frozenset[str | None]
-) -> Handler:
+def _inbound_handler(checked: CheckedRoute, counters: Counters, sources: frozenset[str | None]) -> Handler:
     """The handler of a route from UDP, and those of its parts once they are asked for."""
     route = checked.route
     spans = [target.span for target in checked.targets if target.topic]
@@ -187,14 +184,10 @@ def _inbound_handler(
     generator = HandlerSource(route, checked.case, counters)
     generator.inbound(checked.targets, checked.collect)
 
-    def compile_part(part: Part) -> Handler | None:
-        if part is Part.TOPICS:
-            served, collect = [target for target in checked.targets if target.topic], checked.collect
-        else:
-            forwarded, collect = [target for target in checked.targets if not target.topic], None
-            served = [to for to in forwarded if not executed_by[route.name, None, to.label].is_carrier]
-        if not served:
-            return None
+    def compile_part(targets: Sequence[TargetPlan]) -> Handler:
+        places = {(target.label, target.is_topic) for target in targets}
+        served = [target for target in checked.targets if (target.label, target.topic is not None) in places]
+        collect = checked.collect if any(target.topic for target in served) else None
         generator = HandlerSource(route, checked.case, counters)
         generator.inbound(checked.targets, collect, served)
         return _handler(generator, replace(checked, collect=collect), file, sources, None)

@@ -16,6 +16,7 @@ from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.source import Source, attribute, call, load, placed
 from router.types.model import Field, Float
 from router.types.protobuf import PayloadCase
+from router.types.wire import varint
 
 _ONE_BYTE = 128
 """Lengths below this are varints of one byte."""
@@ -55,15 +56,6 @@ def _envelope(number: int) -> Callable[[bytes], bytes]:
         return (heads[size] if size < _ONE_BYTE else tag + varint(size)) + payload
 
     return envelope
-
-
-def varint(value: int) -> bytes:
-    """Encode an integer as protobuf encodes tags and lengths."""
-    encoded = bytearray()
-    while value >= _ONE_BYTE:
-        encoded.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*encoded, value])
 
 
 @dataclass(slots=True)

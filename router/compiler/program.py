@@ -5,14 +5,14 @@ A program is plain data and code objects; `engine` binds it to sockets, publishe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from itertools import chain
 from types import CodeType
 
 from router.compiler.commands import Commands
 from router.compiler.executors import Executors
+from router.compiler.lowering import LoweredRoute
 from router.compiler.metrics import Counters
 from router.table.model import Endpoint, Gateway, Inbound, Keep, Listener, Priority, RouteTable
 from router.types.model import MessageType
@@ -115,14 +115,6 @@ class GatewayPlan:
     inbound: Mapping[str, InboundPlan]
 
 
-class Part(Enum):
-    """Targets of a route from UDP that Python serves when the carrier receives. Each part has a queue of its own."""
-
-    TOPICS = auto()
-    DESTINATIONS = auto()
-    """Those that the carrier does not serve (see compiler.executors)."""
-
-
 @dataclass(frozen=True, slots=True)
 class Handler:
     """One route as generated Python, for a route from ROS one for each of its topics.
@@ -147,11 +139,12 @@ class Handler:
     topic: str | None = None
     ttl: int | None = None
     collect_timeout: int | None = None
-    compile_part: Callable[[Part], Handler | None] = field(default=lambda _: None, repr=False, compare=False)
+    compile_part: Callable[[Sequence[TargetPlan]], Handler] | None = field(default=None, repr=False, compare=False)
 
-    def part(self, part: Part) -> Handler | None:
-        """Return the handler of these targets only; None if there are none, or for a route from ROS."""
-        return self.compile_part(part)
+    def part(self, targets: Sequence[TargetPlan]) -> Handler:
+        """Return the handler of these targets only, for a route from UDP."""
+        assert self.compile_part is not None  # noqa: S101 - a route from UDP
+        return self.compile_part(targets)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +152,8 @@ class Program:
     """A compiled table. `senders` are the endpoints that something is sent to, `executors` say who does that.
 
     `inbound` has the handlers by envelope field number: several where a case has several routes, which differ
-    in their sources. `outbound` has them by topic, and `commands` the topics that the carrier can take. `ignored` are
-    the numbers of cases that the table ignores.
+    in their sources. `outbound` has them by topic, and `commands` the topics that the carrier can take. `lowered` has
+    the routes with topics that it can publish on, by name. `ignored` are the numbers of cases that the table ignores.
     """
 
     table: RouteTable
@@ -176,6 +169,7 @@ class Program:
     protos: ProtoSchema
     executors: Executors
     commands: Commands
+    lowered: Mapping[str, LoweredRoute]
     gateways: tuple[GatewayPlan, ...] = ()
 
     @property

@@ -13,7 +13,7 @@ from google.protobuf.message import Message
 from router.compiler import STRANGER, source_label
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS, HISTOGRAM_CELLS, REJECT_REASONS
 from router.compiler.network import recognisers
-from router.compiler.program import Handler, Part, Program
+from router.compiler.program import Handler, Program, TargetPlan
 from router.engine.binding import EngineContext, Handle, bind, unbind
 from router.engine.delivery import Outcome, Report
 from router.engine.freshness import Freshness
@@ -191,15 +191,16 @@ class InboundEngine:
 
 
 class PartEngine:
-    """One part of a program's routes from UDP, for datagrams that another thread has accepted and put into a queue.
+    """Some targets of a program's routes from UDP, for datagrams that another thread has accepted and put into a queue.
 
-    That thread has counted them as received. What becomes of them is counted in `context.counts`.
+    `served` are these targets, by route. That thread has counted the datagrams as received; what becomes of them is
+    counted in `context.counts`.
     """
 
-    def __init__(self, program: Program, context: EngineContext, part: Part) -> None:
+    def __init__(self, program: Program, context: EngineContext, served: Mapping[str, Sequence[TargetPlan]]) -> None:
         self._program = program
         self._context = context
-        self._part = part
+        self._served = served
         self._handles: list[FunctionType] = []
 
     def close(self) -> None:
@@ -208,12 +209,11 @@ class PartEngine:
             unbind(handle)
 
     def functions(self) -> Mapping[str, tuple[ServePart, Sequence[int]]]:
-        """Compile and return the functions of all routes that have the part, each with the indexes of its targets'
-        `messages_waiting`, which are left to the caller. They never raise for what was received.
+        """Compile and return the functions of these routes, each with the indexes of its targets' `messages_waiting`,
+        which are left to the caller. They never raise for what was received.
         """
-        handlers = [handler for handlers in self._program.inbound.values() for handler in handlers]
-        parts = ((handler.route, handler.part(self._part)) for handler in handlers)
-        return {route: self._function(part) for route, part in parts if part is not None}
+        handlers = {handler.route: handler for handlers in self._program.inbound.values() for handler in handlers}
+        return {route: self._function(handlers[route].part(targets)) for route, targets in self._served.items()}
 
     def _function(self, part: Handler) -> tuple[ServePart, Sequence[int]]:
         counters, counts, route = self._program.counters, self._context.counts, part.route

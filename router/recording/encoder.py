@@ -21,12 +21,12 @@ from google.protobuf.message import Message
 from mcap.opcode import Opcode
 from mcap.records import Chunk as ChunkRecord
 
-from router.compiler.payload import varint
 from router.engine import MAX_DATAGRAM
 from router.engine.slow_path import LEN
 from router.recording.channels import Channels, Datagram
 from router.recording.mirror import Classifier, Mirrored, Peer
 from router.types.protobuf import PayloadCase
+from router.types.wire import varint
 
 LONGEST_CHUNK = 4 << 20
 """Bytes, not compressed."""

@@ -15,11 +15,11 @@ from google.protobuf.message import Message
 
 from router.clock import wall_ns
 from router.compiler.network import recognisers
-from router.compiler.payload import varint
 from router.engine import MAX_DATAGRAM
 from router.engine.slow_path import LEN, restored
 from router.table.model import Framing, RouteTable
 from router.types.protobuf import Envelope, PayloadCase
+from router.types.wire import varint
 
 Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]

@@ -6,6 +6,7 @@ import ctypes
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from threading import get_ident
 from time import sleep
 from typing import TypeVar
 
@@ -14,12 +15,14 @@ from rclpy.event_handler import EventHandler
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 
+from router.clock import monotonic_ns
 from router.compiler.program import TopicPlan
 from router.errors import SourceSpan, StartError
 from router.log import logger
 from router.ros.events import PeerEvents, WantedFlag
-from router.ros.node import RCL, RCL_ERRORS
+from router.ros.node import RCL_ERRORS
 from router.ros.qos import publisher_qos, qos_profile, subscription_qos
+from router.ros.rcl import RCL, ErrorString, SerializedMessage, function
 from router.ros.receiving import MessageThread, RawSubscription
 from router.ros.types import checked_class
 
@@ -34,29 +37,12 @@ _IN_TRANSIT_S = 0.005
 """Time in which the middleware passes a message to the second of two subscriptions."""
 
 
-class _SerializedMessage(ctypes.Structure):
-    """rcutils_uint8_array_t. The allocator stays zero: publishing only reads the bytes."""
-
-    _fields_ = (
-        ("buffer", ctypes.c_char_p),
-        ("buffer_length", ctypes.c_size_t),
-        ("buffer_capacity", ctypes.c_size_t),
-        ("allocator", ctypes.c_void_p * 5),
-    )
-
-
-class _ErrorString(ctypes.Structure):
-    """rcutils_error_string_t."""
-
-    _fields_ = (("text", ctypes.c_char * 1024),)
-
-
 # rclpy publishes with the interpreter lock held, and Fast DDS may block for seconds, waiting for a reader that has gone
 # or a shared-memory port. ctypes releases the lock.
-_publish_serialized = ctypes.CFUNCTYPE(
-    ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_SerializedMessage), ctypes.c_void_p
-)(("rcl_publish_serialized_message", RCL))
-_error_string = ctypes.CFUNCTYPE(_ErrorString)(("rcutils_get_error_string", RCL))
+_publish_serialized = function(
+    "rcl_publish_serialized_message", ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(SerializedMessage), ctypes.c_void_p
+)
+_error_string = function("rcutils_get_error_string", ErrorString)
 
 
 def _rcl_error() -> Exception:
@@ -90,9 +76,11 @@ class Publication:
             handle = self._publisher.handle
             opening.enter_context(handle)
             self._open = opening.pop_all()
-        self._calls: list[None] = []  # one entry for each call of `publish` that has not returned
+        self._calls: dict[int, int] = {}  # by thread in `publish`: since when, in ns of the monotonic clock
         self._is_closed = False
-        self.publish = self._publish_to(handle.pointer)
+        self.address: int = handle.pointer
+        """That of its `rcl_publisher_t`, until it is closed."""
+        self.publish = self._publish_to(self.address)
         self.topic: str = handle.get_topic_name()
         self.qos = publisher_qos(handle.pointer)
         self.events: Sequence[EventHandler] = self._publisher.event_handlers
@@ -105,19 +93,25 @@ class Publication:
                 return
             sleep(_POLL_S)
 
+    def stalled(self) -> float:
+        """For how many seconds a call of `publish` has been in the middleware; 0 if there is none."""
+        since = list(self._calls.values())
+        return (monotonic_ns() - min(since)) / 1e9 if since else 0.0
+
     def _publish_to(self, publisher: int) -> Callable[[bytes], None]:
-        begin, end = self._calls.append, self._calls.pop
+        calls = self._calls
 
         def publish(cdr: bytes) -> None:
-            begin(None)
+            thread = get_ident()
+            calls[thread] = monotonic_ns()
             try:
                 if self._is_closed:
                     raise rclpy_implementation.RCLError("the publisher was closed by a reload")
                 size = len(cdr)
-                if _publish_serialized(publisher, _SerializedMessage(cdr, size, size), None):
+                if _publish_serialized(publisher, SerializedMessage(cdr, size, size), None):
                     raise _rcl_error()
             finally:
-                end()
+                del calls[thread]
 
         return publish
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,7 +9,6 @@ from pathlib import Path
 
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import get_rmw_implementation_identifier
@@ -20,9 +18,6 @@ from router.log import logger
 
 RCL_ERRORS = (RuntimeError, NameValidationException, ParameterException)
 """What rclpy raises for invalid arguments, names and settings; its own errors derive from RuntimeError."""
-
-RCL = ctypes.CDLL(rclpy_implementation.__file__)
-"""rcl, as loaded by rclpy. Calls through ctypes release the interpreter lock; those of rclpy hold it."""
 
 UDP_ON_LOCALHOST = Path(__file__).with_name("fastdds_udp_localhost.xml")
 """A profile of Fast DDS: UDP as its only transport, discovery on this computer only."""

@@ -16,7 +16,7 @@ from rclpy.qos import (
 )
 
 from router.compiler.program import QosPlan
-from router.ros.node import RCL
+from router.ros.rcl import RCL
 
 
 def qos_profile(plan: QosPlan) -> QoSProfile:

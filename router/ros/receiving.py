@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile
 
 from router.clock import wall_ns
-from router.ros.node import RCL
+from router.ros.rcl import RCL, address
 from router.threads import join_or_leave, paused
 
 Receive = Callable[[bytes, int], None]
@@ -37,10 +37,7 @@ _set_callback.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 # libc's `int eventfd_write(int fd, uint64_t value)` can be that callback, with the descriptor as user data.
 _ADD_TO_EVENTFD = ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
-TAKE, RESET = (
-    ctypes.cast(function, ctypes.c_void_p).value or 0
-    for function in (RCL.rcl_take_serialized_message, RCL.rcutils_reset_error)
-)
+TAKE, RESET = map(address, ("rcl_take_serialized_message", "rcutils_reset_error"))
 """Addresses of what a native thread calls to take messages, and to forget why it could not."""
 
 

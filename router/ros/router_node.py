@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 
@@ -52,7 +52,7 @@ class RouterNode:
         self._subscriptions: dict[str, Subscription] = {}
         self._messages: MessageThread | None = None
         self._is_stuck = False
-        self._is_taken_from = False  # by a thread that is left
+        self._is_left = False  # a thread uses subscriptions or publishers
         self._failed: Callable[[Exception], None] | None = None
         self._peers = PeerEvents(incompatible, subscriber_joined)
         self.subscribed: Collection[str] = self._peers.subscribed
@@ -85,8 +85,8 @@ class RouterNode:
             self._messages = None
 
     def leave_open(self) -> None:
-        """Have `close` leave subscriptions and node open: a thread is stuck where it takes messages."""
-        self._is_taken_from = self._is_stuck = True
+        """Have `close` leave everything open: a thread is stuck where it takes messages, or publishes them."""
+        self._is_left = self._is_stuck = True
 
     def close(self) -> None:
         """To be called when no thread publishes."""
@@ -123,6 +123,12 @@ class RouterNode:
         """Close what `prepare` has opened."""
         for opened in change.opened:
             opened.close()
+
+    def stalled(self) -> Iterator[tuple[str, float]]:
+        """The topics in whose publishers threads of Python are now, each with seconds."""
+        for topic, publication in list(self._publications.items()):
+            if seconds := publication.stalled():
+                yield topic, seconds
 
     def paused(self) -> AbstractContextManager[None]:
         """No message is received inside; none is lost. Raises StuckError."""
@@ -191,9 +197,10 @@ class RouterNode:
             self._close_one(subscription)
 
     def _close_one(self, endpoint: Publication | Subscription) -> None:
+        if self._is_left:
+            return
         if isinstance(endpoint, Subscription):
-            if not self._is_taken_from:
-                endpoint.close()
+            endpoint.close()
         elif not endpoint.close():
             self._is_stuck = True
 

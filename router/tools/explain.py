@@ -12,7 +12,7 @@ from time import sleep
 from router.compiler import Checked
 from router.compiler.cdr import message_size
 from router.compiler.checked import CheckedRoute, CheckedTarget
-from router.compiler.executors import Executors
+from router.compiler.executors import Executor, Executors
 from router.compiler.mapping import Row
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.compiler.program import GatewayPlan, InboundPlan
@@ -45,7 +45,7 @@ _WIDEST_CELL = 48
 
 
 def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Executors) -> Iterator[str]:
-    """Destinations that are not in `executed_by` are explained without their executor."""
+    """Targets that are not in `executed_by` are explained without their executor."""
     route, case, table, envelope = checked.route, checked.case, everything.table, everything.envelope
     assert table is not None  # noqa: S101 - a table without errors is one
     assert envelope is not None  # noqa: S101 - and has one
@@ -62,9 +62,10 @@ def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Exe
         yield ""
         if served.topic:
             yield from _topic(served, served.topic)
+            yield from _executor(executed_by.get((route.name, served.label, None)))
         else:
             yield from _destination(served, route, table, "unchanged")
-            yield from _executor(route, None, served, executed_by)
+            yield from _executor(executed_by.get((route.name, None, served.label)))
     for feed in checked.subscriptions:
         yield ""
         yield f"  from topic {feed.topic.topic.value}: {feed.type}  ({feed.topic.span})"
@@ -74,7 +75,7 @@ def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Exe
         for served in feed.targets:
             yield ""
             yield from _destination(served, route, table, f"from topic {feed.topic.topic.value}")
-            yield from _executor(route, feed.topic, served, executed_by)
+            yield from _executor(executed_by.get((route.name, feed.topic.topic.value, served.label)))
 
 
 def _settings(checked: CheckedRoute) -> Iterator[str]:
@@ -124,8 +125,7 @@ def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: st
     yield from _served(served)
 
 
-def _executor(route: Route, topic: Topic | None, served: CheckedTarget, executed_by: Executors) -> Iterator[str]:
-    executor = executed_by.get((route.name, topic.topic.value if topic else None, served.label))
+def _executor(executor: Executor | None) -> Iterator[str]:
     if executor is None:
         return
     place = f"  ({executor.span})" if executor.span else ""

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from benchmarks.fuzz_engine import MUTATIONS
+from router.app.parts import OF_PYTHON, Part, divided
 from router.carrier import structures as c
 from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.deadmen import Deadmen, NativeDeadman
@@ -20,7 +21,7 @@ from router.carrier.library import load
 from router.carrier.program import Names, Outlets, PartTargets, native_program
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
-from router.compiler.program import Handler, Part, Program, TargetPlan
+from router.compiler.program import Handler, Program, TargetPlan
 from router.engine import MAX_DATAGRAM, PartEngine
 from router.engine.binding import State
 from router.engine.pacing import RateLimit
@@ -158,8 +159,9 @@ class Whole:
         self._deadmen = Deadmen(loaded, self._counts, self._events, self._names)
         senders = cast("Mapping[str, NativeSender]", self._destinations)
         self._braking = {plan.route: self._deadmen.add(plan, made.counters, senders) for plan in made.deadmen}
-        self._rings = {part: Ring(loaded, 1 << 17) for part in Part}
-        self._parts = {part: self._engine(part) for part in Part}
+        self._divided = divided(made, publishes=False)
+        self._rings = {part: Ring(loaded, 1 << 17) for part in OF_PYTHON}
+        self._parts = {part: self._engine(part) for part in OF_PYTHON}
         self._functions = {part: engine.functions() for part, engine in self._parts.items()}
         self._limits = State()
         wanted = {topic: (ctypes.c_uint8 * 1)(topic not in unwanted) for topic in self._rig.wanted}
@@ -173,7 +175,7 @@ class Whole:
                 wanted=wanted,
                 feeds=lambda route, names: [(each.address, disarms) for each, disarms in self._feeds(route, names)],
                 limit=self._limit,
-                carried=lambda handler: self._targets(handler, None),
+                carried=lambda handler: self._divided[Part.SENT].get(handler.route, ()),
                 parts=self._parts_of,
                 names=self._names,
             ),
@@ -237,7 +239,7 @@ class Whole:
     def _engine(self, part: Part) -> PartEngine:
         send: dict[str, Callable[[bytes], int]] = {name: each.send for name, each in self._destinations.items()}
         context = replace(self._rig.context, send=send, command=self._command, state=State())
-        return PartEngine(self._program, context, part)
+        return PartEngine(self._program, context, self._divided[part])
 
     def _command(self, endpoint: str, route: str, names: Sequence[str]) -> Callable[[bytes, int | None], int]:
         sender = cast("NativeSender", self._destinations[endpoint])
@@ -252,23 +254,14 @@ class Whole:
         key = handler.route, target
         return self._limits.keep(key, lambda: c.Limit(period, period - period // 2, -period))
 
-    def _targets(self, handler: Handler, part: Part | None) -> list[TargetPlan]:
-        def served_by(target: TargetPlan) -> Part | None:
-            if target.is_topic:
-                return Part.TOPICS
-            is_carrier = self._program.executors[handler.route, None, target.label].is_carrier
-            return None if is_carrier else Part.DESTINATIONS
-
-        return [target for target in handler.targets if served_by(target) is part]
-
     def _parts_of(self, handler: Handler) -> list[PartTargets]:
         return [
             PartTargets(
                 self._rings[part].address,
-                self._targets(handler, part),
+                self._divided[part][handler.route],
                 part is Part.DESTINATIONS or handler.collect_timeout is not None,
             )
-            for part in Part
+            for part in OF_PYTHON
             if handler.route in self._functions[part]
         ]
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.compiler.program import Part, Program
+from router.app.parts import OF_PYTHON, Part, divided
+from router.compiler.program import Program
 from router.engine import PartEngine
 from tests.engine.rig import SENSOR_BOARD, PublishError, Rig, program
 from tests.engine.test_both_directions import MS, enveloped
@@ -42,7 +43,8 @@ class Carried:
 
     def __init__(self, made: Program) -> None:
         self.rig = Rig(made)
-        self.engines = {part: PartEngine(made, self.rig.context, part) for part in Part}
+        parts = divided(made, publishes=False)
+        self.engines = {part: PartEngine(made, self.rig.context, parts[part]) for part in OF_PYTHON}
         self.parts = {part: engine.functions() for part, engine in self.engines.items()}
 
     def serve(self, route: str, payload: bytes | None, datagram: bytes, born: int = 0) -> None:
@@ -66,9 +68,8 @@ def test_only_routes_that_have_the_part_have_a_function(carried: Carried) -> Non
 
 def test_a_part_serves_its_targets_alone(made: Program) -> None:
     [handler] = made.inbound[13]
-    topics, destinations = handler.part(Part.TOPICS), handler.part(Part.DESTINATIONS)
-    assert topics is not None
-    assert destinations is not None
+    parts = divided(made, publishes=False)
+    topics, destinations = (handler.part(parts[part]["imu_info"]) for part in OF_PYTHON)
     assert handler.targets == (handler.targets[0], *destinations.targets, *topics.targets)  # whose state is kept by it
     assert [target.label for target in destinations.targets] == ["recorder"]
     assert [target.identifier for target in topics.targets] == ["accel_x", "accel_x_2"]

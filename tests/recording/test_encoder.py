@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.compiler.payload import varint
 from router.engine import MAX_DATAGRAM
 from router.recording.channels import MOST_CHANNELS, Channels
 from router.recording.encoder import Encoder
 from router.recording.mirror import MirroredDatagram
+from router.types.wire import varint
 from tests.recording.recorder_rig import (
     MILLISECOND,
     SENSOR_BOARD,

@@ -31,15 +31,18 @@ struct destination {
     uint32_t reserved;
 };
 
-/* A target that Python serves. */
+/* A target that gets its messages by a ring. */
 struct waiting {
     uint32_t id;                            /* of the target, in events */
     uint32_t waiting, queue_full, filtered; /* counters */
 };
 
-/* The targets of a route that one thread of Python serves. */
+struct publish_route;
+
+/* The targets of a route that one thread serves. */
 struct part {
     struct ring *ring;
+    const struct publish_route *publishes; /* what the native thread does (publishing.h); NULL for one of Python */
     const uint8_t *const *wanted; /* flags, not 0 while somebody subscribes to a topic */
     const struct waiting *targets;
     uint32_t wanted_count, target_count;
@@ -124,6 +127,8 @@ struct message_record {
     uint32_t length;      /* of the datagram */
     uint32_t start, payload_length; /* of the payload, where it is the only field */
     uint32_t handler;
+    uint32_t whole; /* of the envelope, as in struct envelope */
+    uint32_t reserved;
 };
 
 /* A received datagram in the mirror; up to MAX_DATAGRAM + 1 bytes of it follow. */

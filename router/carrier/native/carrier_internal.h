@@ -49,12 +49,21 @@ void carrier_adopt_first(struct carrier *carrier, const struct change *first);
 /* Start a thread that gets no signals: those are Python's. Return 0, or an errno. */
 int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void *argument);
 
+/* Open a condition that is waited for by the monotonic clock: until `patience`, the longest wait for a thread that may be
+ * stuck in the middleware. */
+void condition_open(pthread_cond_t *condition);
+struct timespec patience(void);
+
 /* Whether an event may be written, which is then done. */
 bool may_report(struct reporter *reporter, int64_t now);
 
 /* Report that a target did not get a message. `counted` is the counter of such losses. */
 void report_loss(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
                  uint32_t counted);
+
+/* Likewise, with a text that says more. */
+void report_loss_because(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason,
+                         uint32_t counted, const char *text);
 
 /* Report that `destination_send` has returned an errno. */
 void report_send_error(struct reporter *reporter, int64_t now, uint32_t route, const struct destination *to, int error);

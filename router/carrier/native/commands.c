@@ -5,18 +5,15 @@
 #include <stdlib.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
-#include <time.h>
 #include <unistd.h>
 
 #include "carrier_internal.h"
 #include "clock.h"
-#include "rcl_types.h"
 
 enum {
     TURN = 32, /* messages of one topic before others have their turn */
     TOPICS_PER_WAIT = 16,
 };
-static const int64_t LONGEST_WAIT = 1000000000;
 
 struct commands {
     pthread_t thread;
@@ -218,11 +215,6 @@ static void *commands_thread(void *of) {
 
 /* ---- for others ---- */
 
-static struct timespec after(int64_t nanoseconds) {
-    int64_t until = monotonic_ns() + nanoseconds;
-    return (struct timespec){until / 1000000000, until % 1000000000};
-}
-
 static void commands_close(struct commands *commands) {
     if (commands->epoll >= 0) close(commands->epoll);
     if (commands->wake >= 0) close(commands->wake);
@@ -230,14 +222,6 @@ static void commands_close(struct commands *commands) {
     pthread_mutex_destroy(&commands->lock);
     free(commands->message.buffer);
     free(commands);
-}
-
-static void wait_by_monotonic_clock(pthread_cond_t *condition) {
-    pthread_condattr_t attributes;
-    pthread_condattr_init(&attributes);
-    pthread_condattr_setclock(&attributes, CLOCK_MONOTONIC);
-    pthread_cond_init(condition, &attributes);
-    pthread_condattr_destroy(&attributes);
 }
 
 struct commands *commands_open(struct deadmen *deadmen, counter *counters, struct ring *events, take_function *take,
@@ -251,7 +235,7 @@ struct commands *commands_open(struct deadmen *deadmen, counter *counters, struc
     commands->reset = reset;
     commands->message.allocator = ALLOCATOR;
     pthread_mutex_init(&commands->lock, NULL);
-    wait_by_monotonic_clock(&commands->changed);
+    condition_open(&commands->changed);
     commands->epoll = epoll_create1(EPOLL_CLOEXEC);
     commands->wake = eventfd(0, EFD_CLOEXEC);
     if (commands->epoll < 0 || commands->wake < 0 || commands_watch(commands, commands->wake) ||
@@ -270,7 +254,7 @@ int commands_watch(struct commands *commands, int eventfd) {
 void commands_unwatch(struct commands *commands, int eventfd) { epoll_ctl(commands->epoll, EPOLL_CTL_DEL, eventfd, NULL); }
 
 bool commands_serve(struct commands *commands, const struct command_set *set) {
-    struct timespec until = after(LONGEST_WAIT);
+    struct timespec until = patience();
     pthread_mutex_lock(&commands->lock);
     commands->offered = set;
     eventfd_write(commands->wake, 1);
@@ -282,7 +266,7 @@ bool commands_serve(struct commands *commands, const struct command_set *set) {
 }
 
 bool commands_stop(struct commands *commands) {
-    struct timespec until = after(LONGEST_WAIT);
+    struct timespec until = patience();
     pthread_mutex_lock(&commands->lock);
     commands->is_stopping = true;
     eventfd_write(commands->wake, 1);

@@ -11,6 +11,7 @@
 
 #include "carrier.h"
 #include "convert.h"
+#include "rcl_types.h"
 
 struct command_target {
     struct destination destination;
@@ -47,10 +48,6 @@ struct command_set {
     uint32_t count, reserved;
 };
 
-/* rcl_take_serialized_message: fills a rcutils_uint8_array_t and a rmw_message_info_t. Returns 0 if there was one. */
-typedef int take_function(const void *subscription, void *message, void *info, void *allocation);
-/* rcutils_reset_error: forgets the text of an error. */
-typedef void reset_function(void);
 
 struct commands;
 

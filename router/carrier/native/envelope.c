@@ -1,83 +1,14 @@
-/* The wire format of protobuf, as far as it decides whether the protobuf library (upb) parses a message.
- *
- * A message is a sequence of fields. A field starts with a tag, `number << 3 | wire type`, then comes its value:
- *
- *     0  VARINT     7 bits per byte, the lowest first; the high bit says that another byte follows
- *     1  I64        8 bytes
- *     2  LEN        a varint with the size, then so many bytes: a string, bytes, a message, or packed scalars
- *     3  GROUP      fields, up to
- *     4  GROUP_END  with the same number
- *     5  I32        4 bytes
+/* The wire format of protobuf (wire.h), as far as it decides whether the protobuf library (upb) parses a message.
  *
  * A field whose number or wire type is not the declared one is unknown: it is skipped, and has to be well formed. */
 #include "envelope.h"
 
 #include "utf8.h"
+#include "wire.h"
 
 #include <string.h>
 
-enum { VARINT, I64, LEN, GROUP, GROUP_END, I32 };
-enum {
-    LONGEST_VARINT = 10,
-    LONGEST_TAG = 5,  /* bytes; the tag itself has 32 bits */
-    LONGEST_SIZE = 5,
-    MOST_LEVELS = 100 /* of messages and groups within a message, known or unknown */
-};
-
-/* What is left to read. */
-struct bytes {
-    const uint8_t *at, *end;
-};
-
-static inline size_t left(const struct bytes *bytes) { return (size_t)(bytes->end - bytes->at); }
-
-/* Read a varint of at most `longest` bytes. It may be longer than it needs to be; bits beyond 64 are dropped. */
-static inline bool read_varint(struct bytes *bytes, unsigned longest, uint64_t *value) {
-    uint64_t read = 0;
-    for (unsigned index = 0; index < longest && bytes->at < bytes->end; index++) {
-        uint8_t byte = *bytes->at++;
-        read |= (uint64_t)(byte & 0x7F) << (7 * index);
-        if (byte < 0x80) {
-            *value = read;
-            return true;
-        }
-    }
-    return false;
-}
-
-static inline bool read_tag(struct bytes *bytes, uint32_t *tag) {
-    uint64_t value;
-    if (!read_varint(bytes, LONGEST_TAG, &value) || value > UINT32_MAX) return false;
-    *tag = (uint32_t)value;
-    return true;
-}
-
-static inline bool skip(struct bytes *bytes, uint64_t size) {
-    if (size > left(bytes)) return false;
-    bytes->at += size;
-    return true;
-}
-
-/* Read the size of a LEN field, and skip the bytes. */
-static inline bool read_len(struct bytes *bytes, struct bytes *value) {
-    uint64_t size;
-    if (!read_varint(bytes, LONGEST_SIZE, &size)) return false;
-    value->at = bytes->at;
-    if (!skip(bytes, size)) return false;
-    value->end = bytes->at;
-    return true;
-}
-
-/* Skip the value of a field that is neither LEN nor a group. */
-static inline bool skip_scalar(struct bytes *bytes, uint32_t wire_type) {
-    uint64_t number;
-    switch (wire_type) {
-    case VARINT: return read_varint(bytes, LONGEST_VARINT, &number);
-    case I64: return skip(bytes, 8);
-    case I32: return skip(bytes, 4);
-    default: return false;
-    }
-}
+enum { MOST_LEVELS = 100 /* of messages and groups within a message, known or unknown */ };
 
 static const struct wire_field *find_field(const struct wire_type *type, uint32_t number) {
     const struct wire_field *fields = type->fields;
@@ -186,30 +117,6 @@ static bool is_well_formed(const struct wire_schema *schema, const struct wire_t
             return true;
         }
     }
-}
-
-/* Read the value of a field of a well-formed message: `value` is all of it, of a group with its end. */
-static bool read_value(struct bytes *bytes, uint32_t wire_type, struct bytes *value) {
-    if (wire_type == LEN) return read_len(bytes, value);
-    value->at = bytes->at;
-    unsigned open = wire_type == GROUP;
-    if (open == 0 && !skip_scalar(bytes, wire_type)) return false;
-    while (open > 0) {
-        uint32_t tag;
-        struct bytes inner;
-        if (!read_tag(bytes, &tag)) return false;
-        switch (tag & 7) {
-        case GROUP: open++; break;
-        case GROUP_END: open--; break;
-        case LEN:
-            if (!read_len(bytes, &inner)) return false;
-            break;
-        default:
-            if (!skip_scalar(bytes, tag & 7)) return false;
-        }
-    }
-    value->end = bytes->at;
-    return true;
 }
 
 /* Whether an envelope's field has the wire type that is declared. */

@@ -24,7 +24,7 @@ struct rejected_event {
 };
 
 struct lost_event {
-    uint32_t size, kind; /* EVENT_LOST */
+    uint32_t size, kind; /* EVENT_LOST; a text that says more may follow, up to a NUL */
     uint32_t route, target;
     uint32_t reason;     /* enum loss */
     int32_t error;       /* errno, of LOSS_SEND_BUFFER_FULL and LOSS_SEND_ERROR */
@@ -40,7 +40,8 @@ enum loss {
     LOSS_RATE_LIMITED,
     LOSS_QUEUE_FULL,
     LOSS_SEND_BUFFER_FULL,
-    LOSS_SEND_ERROR
+    LOSS_SEND_ERROR,
+    LOSS_PUBLISH_ERROR
 };
 
 #endif

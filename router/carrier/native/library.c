@@ -3,6 +3,7 @@
 
 #include "carrier.h"
 #include "commands.h"
+#include "publishing.h"
 
 struct structure_size {
     const char *name;
@@ -24,7 +25,8 @@ const struct structure_size *carrier_structure_sizes(void) {
         SIZE(destination),    SIZE(waiting),   SIZE(part),        SIZE(route), SIZE(entry),
         SIZE(payload_case),   SIZE(peer),      SIZE(listener),    SIZE(program), SIZE(change),
         SIZE(message_record), SIZE(mirror_record), SIZE(read_op), SIZE(write_op), SIZE(command_target), SIZE(command_route),
-        SIZE(command_topic), SIZE(command_set), SIZE(deadman_destination), {NULL, 0},
+        SIZE(command_topic), SIZE(command_set), SIZE(deadman_destination),
+        SIZE(value), SIZE(node_field), SIZE(node), SIZE(operation), SIZE(publish_topic), SIZE(publish_target), SIZE(publish_route), {NULL, 0},
     };
     return sizes;
 }

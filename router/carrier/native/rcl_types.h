@@ -1,8 +1,9 @@
-/* What rcl_take_serialized_message fills, as far as it is used here. rcl has these types in C as well, but its headers are
- * not there where the library is built; tests/carrier/test_commands.py compares them. */
+/* What is used of rcl. It has these types in C as well, but its headers need not be there where the library is made:
+ * rcl_check.c compares them if they are, and router/ros/rcl.py tries them when the router starts. */
 #ifndef RCL_TYPES_H
 #define RCL_TYPES_H
 
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -30,6 +31,24 @@ struct message_info {
     int64_t source_timestamp, received_timestamp;
     uint8_t rest[240];
 };
+
+/* rcutils_error_string_t */
+struct error_text {
+    char text[1024];
+};
+
+/* rcl_take_serialized_message: fills a serialized message and its info. Returns 0 if there was one. */
+typedef int take_function(const void *subscription, void *message, void *info, void *allocation);
+
+/* rcl_publish_serialized_message. Returns 0 if it has published. */
+typedef int publish_function(const void *publisher, const void *message, void *allocation);
+
+/* rcutils_get_error_string and rcutils_reset_error: what went wrong in the calling thread. */
+typedef struct error_text error_function(void);
+typedef void reset_function(void);
+
+/* Whether the library was made beside headers of rcl that have something else. */
+bool rcl_types_differ(void);
 
 static inline void *allocate(size_t size, void *state) {
     (void)state;

@@ -114,7 +114,8 @@ static void hand_over(struct carrier *carrier, const struct part *part, const st
                                       .length = (uint32_t)received->length,
                                       .start = received->envelope.start,
                                       .payload_length = received->envelope.length,
-                                      .handler = part->handler};
+                                      .handler = part->handler,
+                                      .whole = received->envelope.size};
     memcpy(record + 1, carrier->datagram, whole);
     for (uint32_t index = 0; index < part->target_count; index++)
         counter_add(carrier->counters, part->targets[index].waiting, 1);

@@ -3,6 +3,7 @@
 
 #include <errno.h>
 #include <signal.h>
+#include <string.h>
 #include <unistd.h>
 
 #include "clock.h"
@@ -17,6 +18,21 @@ int start_thread(pthread_t *thread, const char *name, void *(*run)(void *), void
     pthread_sigmask(SIG_SETMASK, &usual, NULL);
     if (!error) pthread_setname_np(*thread, name);
     return error;
+}
+
+static const int64_t PATIENCE = 1000000000;
+
+struct timespec patience(void) {
+    int64_t until = monotonic_ns() + PATIENCE;
+    return (struct timespec){until / 1000000000, until % 1000000000};
+}
+
+void condition_open(pthread_cond_t *condition) {
+    pthread_condattr_t attributes;
+    pthread_condattr_init(&attributes);
+    pthread_condattr_setclock(&attributes, CLOCK_MONOTONIC);
+    pthread_cond_init(condition, &attributes);
+    pthread_condattr_destroy(&attributes);
 }
 
 /* ---- counting and reporting ---- */
@@ -54,6 +70,19 @@ void report_loss(struct reporter *reporter, int64_t now, uint32_t route, uint32_
                  uint32_t counted) {
     struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error, counted, 0};
     if (may_report(reporter, now)) ring_put(reporter->events, &event, sizeof event);
+}
+
+void report_loss_because(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason,
+                         uint32_t counted, const char *text) {
+    enum { LONGEST = 255 };
+    struct {
+        struct lost_event event;
+        char text[LONGEST + 1];
+    } record = {.event = {0, EVENT_LOST, route, target, reason, 0, counted, 0}};
+    size_t length = strnlen(text, LONGEST);
+    memcpy(record.text, text, length);
+    record.event.size = (uint32_t)(sizeof record.event + (length + 8) / 8 * 8);
+    if (may_report(reporter, now)) ring_put(reporter->events, &record, record.event.size);
 }
 
 /* ---- destinations ---- */

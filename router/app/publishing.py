@@ -1,0 +1,70 @@
+"""Topics on which a native thread publishes, from one program to the next."""
+
+from __future__ import annotations
+
+import ctypes
+
+from router.carrier.program import Names
+from router.carrier.publishing import PublishThread
+from router.carrier.ring import Ring
+from router.errors import StartError
+from router.log import logger
+
+
+class Publishing:
+    """The thread, which starts with the first program that has topics. Where rcl is not as expected, Python publishes.
+
+    `counts` is the array that the thread counts in, `ring` has the messages for it.
+    """
+
+    def __init__(
+        self, library: ctypes.CDLL, ring: Ring, counts: ctypes.Array[ctypes.c_int64], events: Ring, names: Names
+    ) -> None:
+        self.ring = ring
+        self._library = library
+        self._counts, self._events, self._names = counts, events, names
+        self._thread: PublishThread | None = None
+        self._is_refused = False
+
+    def open(self, *, has_topics: bool) -> bool:
+        """Start the thread if there are topics. Return whether there is one. Raises StartError."""
+        if self._thread is None and has_topics and not self._is_refused:
+            from router.ros.rcl import publish_functions  # rclpy is there: the topics are open
+
+            functions = None if self._library.rcl_types_differ() else publish_functions()
+            if functions is None:
+                self._is_refused = True
+                logger.warning("rcl is not as the carrier expects it, and Python publishes, more slowly")
+                return False
+            try:
+                self._thread = PublishThread(self._library, self.ring, self._counts, self._events, functions)
+            except MemoryError as error:
+                raise StartError(str(error)) from error
+        return self._thread is not None
+
+    def counters(self, count: int) -> list[int]:
+        """Return the first counters, as they are between two messages."""
+        return self._thread.counters(count) if self._thread else list(self._counts[:count])
+
+    def wait_until_passed(self, position: int, timeout: float) -> bool:
+        return self._thread is None or self._thread.wait_until_passed(position, timeout)
+
+    def hold(self, *, is_held: bool) -> None:
+        """Have the thread keep what it takes until it is no longer held."""
+        if self._thread is not None:
+            self._thread.hold(is_held=is_held)
+
+    def stalled(self) -> tuple[str, float] | None:
+        """The topic in whose publisher the thread is now, and for how many seconds."""
+        stalled = self._thread.stalled() if self._thread else None
+        return (self._names.name(stalled[0]), stalled[1]) if stalled else None
+
+    def stop(self) -> bool:
+        """Publish what waits, and end. Return False if the thread is stuck: publishers must stay open then.
+
+        Idempotent.
+        """
+        has_ended = self._thread is None or self._thread.stop()
+        if not has_ended:
+            logger.error("a thread is stuck, and the router ends without it", threads=["publish"])
+        return has_ended
