@@ -1,9 +1,11 @@
 #include "ring.h"
 
-#include <poll.h>
+#include <linux/futex.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/eventfd.h>
+#include <sys/syscall.h>
+#include <time.h>
 #include <unistd.h>
 
 enum { WORD = sizeof(uint64_t) };
@@ -45,6 +47,13 @@ static uint32_t size_at(struct ring *ring, uint64_t position) {
     return head.size;
 }
 
+/* Wake the reader, if it sleeps or is going to, once for all that is written until then. */
+static void wake_reader(struct ring *ring) {
+    if (atomic_load_explicit(&ring->is_watched, memory_order_relaxed)) eventfd_write(ring->wake, 1);
+    if (atomic_load(&ring->is_waited_for) && atomic_exchange(&ring->is_waited_for, 0))
+        syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAKE_PRIVATE, 1, NULL, NULL, 0);
+}
+
 bool ring_put(struct ring *ring, const void *record, uint32_t size) {
     uint64_t written = atomic_load_explicit(&ring->written, memory_order_relaxed);
     uint64_t taken = atomic_load_explicit(&ring->taken, memory_order_acquire);
@@ -56,7 +65,7 @@ bool ring_put(struct ring *ring, const void *record, uint32_t size) {
         atomic_store_explicit(word_at(ring, written + done), *words++, memory_order_relaxed);
     /* Sequentially consistent, as is `is_waited_for`: either the reader sees the record, or we see that it waits. */
     atomic_store(&ring->written, written + size);
-    if (atomic_load(&ring->is_waited_for)) ring_wake(ring);
+    wake_reader(ring);
     return true;
 }
 
@@ -100,28 +109,35 @@ static size_t take_ready(struct ring *ring, void *records, size_t limit) {
     }
 }
 
+/* Sleep while `is_waited_for`, for up to `timeout_ms` (-1: for ever). */
+static void sleep_until_woken(struct ring *ring, int timeout_ms) {
+    struct timespec timeout = {timeout_ms / 1000, timeout_ms % 1000 * 1000000L};
+    syscall(SYS_futex, &ring->is_waited_for, FUTEX_WAIT_PRIVATE, 1, timeout_ms < 0 ? NULL : &timeout, NULL, 0);
+}
+
 size_t ring_take(struct ring *ring, void *records, size_t limit, int timeout_ms) {
     size_t copied = take_ready(ring, records, limit);
     if (copied || !timeout_ms) return copied;
     atomic_store(&ring->is_waited_for, 1);
     copied = take_ready(ring, records, limit);
-    if (!copied) {
-        struct pollfd wake = {ring->wake, POLLIN, 0};
-        eventfd_t times;
-        if (poll(&wake, 1, timeout_ms) > 0) eventfd_read(ring->wake, &times);
+    if (!copied && !atomic_exchange(&ring->is_woken, false)) {
+        sleep_until_woken(ring, timeout_ms);
         copied = take_ready(ring, records, limit);
     }
     atomic_store(&ring->is_waited_for, 0);
     return copied;
 }
 
-void ring_wake(struct ring *ring) { eventfd_write(ring->wake, 1); }
+void ring_wake(struct ring *ring) {
+    atomic_store(&ring->is_woken, true);
+    wake_reader(ring);
+}
 
 uint64_t ring_written(struct ring *ring) { return atomic_load(&ring->written); }
 
 uint64_t ring_taken(struct ring *ring) { return atomic_load(&ring->taken); }
 
 int ring_watch(struct ring *ring) {
-    atomic_store(&ring->is_waited_for, 1);
+    atomic_store(&ring->is_watched, true);
     return ring->wake;
 }

@@ -14,8 +14,9 @@
 struct ring {
     _Atomic uint64_t written; /* bytes, since the ring was opened */
     _Atomic uint64_t taken;   /* bytes that were taken or dropped */
-    _Atomic uint32_t is_waited_for;
-    int wake; /* eventfd */
+    _Atomic uint32_t is_waited_for; /* by a reader that sleeps until it is not, as a futex */
+    _Atomic bool is_woken, is_watched;
+    int wake; /* eventfd, for one that watches */
     size_t capacity;
     _Atomic uint64_t *words;
 };
