@@ -2,14 +2,15 @@
 
 What the receive thread does not send itself comes by rings to others: a native one publishes (`publishing`), `topics`
 and `destinations` serve what needs Python (`parts`). Each of those two has its own engine with its own state, and
-changes to another program when it has served all that the earlier one received. Commands from ROS have a native thread
-(`ros_commands`), other messages from ROS the one in `ros`.
+changes to another program when it has served all that the earlier one received. Messages from ROS have two native
+threads, one of them for commands (`ros_commands`); those that need Python have the one in `ros`.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import count
@@ -96,11 +97,15 @@ class NativeDatapath:
         self._wiring: NativeWiring | None = None
         self._is_running = False
         report, failed = context.reporter.report, context.reporter.failed
-        received, commanded, braked, published = (Ring(library, _EVENTS) for _ in range(4))
-        receive_counts, command_counts, deadman_counts, publish_counts = (_fixed_counts() for _ in range(4))
+        received, braked, published = (Ring(library, _EVENTS) for _ in range(3))
+        receive_counts, deadman_counts, publish_counts = (_fixed_counts() for _ in range(3))
+        from_ros = [(_fixed_counts(), Ring(library, _EVENTS)) for _ in (True, False)]
         self._deadmen = Deadmen(library, deadman_counts, braked, self._names)
         self._carrier = Carrier(library, self._deadmen.address, receive_counts, received)
-        self._commands = RosCommands(library, self._deadmen.address, command_counts, commanded)
+        self._commands = [
+            RosCommands(library, self._deadmen.address, counts, events, is_urgent=is_urgent)
+            for is_urgent, (counts, events) in zip((True, False), from_ros, strict=True)
+        ]
         self._publishing = Publishing(library, Ring(library, _QUEUE), publish_counts, published, self._names)
         self._ros: RouterNode | None = None
         self._workers = {part: Worker(name, Ring(library, _QUEUE), failed) for part, name in OF_PYTHON.items()}
@@ -109,13 +114,14 @@ class NativeDatapath:
             context.counts.add(worker.counts, worker.copy_counts, worker.forget_copy)
         context.counts.add(_as_list(publish_counts), self._publishing.counters)
         context.counts.add(_as_list(receive_counts), self._carrier.counters)
-        context.counts.add(_as_list(command_counts), self._commands.counters)
+        for commands, (counts, _) in zip(self._commands, from_ros, strict=True):
+            context.counts.add(_as_list(counts), commands.counters)
         self._mirrored = MirrorRing(Ring(library, _MIRRORED), self._names)
         mirror.drain_by(self._mirrored.take)
         self._events = EventThread(
             [
                 (received, _as_list(receive_counts)),
-                (commanded, _as_list(command_counts)),
+                *((events, _as_list(counts)) for counts, events in from_ros),
                 (braked, _as_list(deadman_counts)),
                 (published, _as_list(publish_counts)),
             ],
@@ -132,7 +138,8 @@ class NativeDatapath:
 
     def _pulse(self) -> None:
         self._carrier.pulse()
-        self._commands.report_failures()
+        for commands in self._commands:
+            commands.report_failures()
 
     def open_listener(self, settings: model.Listener) -> Listener:
         return Listener(settings, is_stamped=True)
@@ -214,7 +221,8 @@ class NativeDatapath:
         }
         commands = native_commands(program, outlets)
         commands.arrays += [senders, deadmen]
-        self._commands.open(commands)
+        for thread in self._commands:
+            thread.open(commands)
         self._ros = ros
         for part, stage in stages.items():
             self._workers[part].prepare(stage)
@@ -281,12 +289,12 @@ class NativeDatapath:
     def between(self, wiring: Wiring, swap: Callable[[], None]) -> None:
         assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
         assert self._wiring is not None  # noqa: S101 - another program runs
-        self._commands.leave(wiring.topics, keeps=wiring.deadmen == self._wiring.deadmen)
-        try:
+        with ExitStack() as undo:
+            for commands in self._commands:
+                commands.leave(wiring.topics, keeps=wiring.deadmen == self._wiring.deadmen)
+                undo.callback(commands.stay)
             swap()
-        except BaseException:
-            self._commands.stay()
-            raise
+            undo.pop_all()
 
     def adopt(self, wiring: Wiring, earlier: Wiring | None, left: Sequence[Listener], now: Sequence[Listener]) -> None:
         assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
@@ -296,7 +304,8 @@ class NativeDatapath:
             for listener in left:
                 listener.end_input()
             self._change(wiring, earlier)
-        self._commands.serve(wiring.topics)
+        for commands in self._commands:
+            commands.serve(wiring.topics)
         self._wiring = wiring
 
     def _change(self, wiring: NativeWiring, earlier: NativeWiring) -> None:
@@ -341,7 +350,7 @@ class NativeDatapath:
             return True
         late = left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
         has_published = self._publishing.wait_until_passed(self._published_before, _PATIENCE_S)
-        return not late and has_published and self._commands.has_passed
+        return not late and has_published and all(commands.has_passed for commands in self._commands)
 
     def observe(self, *, is_observed: bool) -> None:
         lost = self._context.counts.counters.index("mirror_dropped")
@@ -362,7 +371,7 @@ class NativeDatapath:
         self._stop_threads_of_ros()
 
     def _stop_threads_of_ros(self) -> None:
-        have_ended = self._publishing.stop(), self._commands.stop()
+        have_ended = [self._publishing.stop(), *(commands.stop() for commands in self._commands)]
         if not all(have_ended) and self._ros is not None:
             self._ros.leave_open()
 

@@ -1,4 +1,4 @@
-"""Commands from ROS that a native thread serves, from one program to the next.
+"""Messages from ROS that a native thread serves, from one program to the next.
 
 Topics that another thread is to serve, or from another subscription, are left before the swap. All others are served by
 the earlier program until the swap is done, unless deadmen change: those of two programs do not get feeds in turns.
@@ -19,20 +19,34 @@ from router.threads import StuckError
 
 @dataclass(frozen=True, slots=True)
 class RosTopics:
-    """What a program makes of commands from ROS, and its subscriptions by topic: all of them, whoever serves them."""
+    """What a program has a native thread make of messages from ROS, and all of its subscriptions by topic."""
 
     commands: NativeCommands
     subscriptions: Mapping[str, Subscription]
 
+    def only(self, *, urgent: bool) -> RosTopics:
+        """With those for the thread of urgent messages, or those for the other one."""
+        return RosTopics(self.commands.only(urgent=urgent), self.subscriptions)
+
 
 class RosCommands:
-    """The thread, which starts with the first program that has commands for it.
+    """The thread, which starts with the first program that has messages for it.
 
-    `deadmen` is the address of the carrier's, `counts` the array that the thread counts in.
+    `deadmen` is the address of the carrier's, `counts` the array that the thread counts in. Urgent messages have a
+    thread of their own.
     """
 
-    def __init__(self, library: ctypes.CDLL, deadmen: int, counts: ctypes.Array[ctypes.c_int64], events: Ring) -> None:
+    def __init__(
+        self,
+        library: ctypes.CDLL,
+        deadmen: int,
+        counts: ctypes.Array[ctypes.c_int64],
+        events: Ring,
+        *,
+        is_urgent: bool,
+    ) -> None:
         self._library = library
+        self.is_urgent = is_urgent
         self._deadmen = deadmen
         self._counts = counts
         self._events = events
@@ -48,12 +62,14 @@ class RosCommands:
 
     def open(self, commands: NativeCommands) -> None:
         """Start the thread if these need it. Raises StartError."""
-        if self._thread is not None or not commands.topics:
+        if self._thread is not None or not commands.only(urgent=self.is_urgent).topics:
             return
         from router.ros.receiving import RESET, TAKE  # rclpy is there: the topics are open
 
         try:
-            self._thread = CommandThread(self._library, self._deadmen, self._counts, self._events, TAKE, RESET)
+            self._thread = CommandThread(
+                self._library, self._deadmen, self._counts, self._events, TAKE, RESET, is_urgent=self.is_urgent
+            )
         except MemoryError as error:
             raise StartError(str(error)) from error
 
@@ -65,10 +81,12 @@ class RosCommands:
         if self._thread is None:
             return
         now, then = self._served, next_one.subscriptions
-        kept = [topic for topic in now.commands.topics if keeps and topic in next_one.commands.topics]
+        own = next_one.only(urgent=self.is_urgent).commands.topics
+        kept = [topic for topic in now.commands.topics if keeps and topic in own]
         kept = [topic for topic in kept if then[topic] is now.subscriptions[topic]]
         forget_what_is_served(now.subscriptions, {topic: then[topic] for topic in now.commands.topics if topic in then})
-        commands = NativeCommands({topic: now.commands.topics[topic] for topic in kept}, now.commands.arrays)
+        topics = {topic: now.commands.topics[topic] for topic in kept}
+        commands = NativeCommands(topics, now.commands.urgent, now.commands.arrays)
         self._thread.serve(commands, {topic: then[topic] for topic in kept})
 
     def stay(self) -> None:
@@ -79,11 +97,12 @@ class RosCommands:
         """Serve other topics, or by another program. What fails is logged; what was served before is served then."""
         if self._thread is None:
             return
+        next_one = next_one.only(urgent=self.is_urgent)
         try:
             commands, subscriptions = next_one.commands, next_one.subscriptions
             self._thread.serve(commands, {topic: subscriptions[topic] for topic in commands.topics})
         except (StuckError, OSError, RuntimeError) as error:  # those of rcl are RuntimeErrors
-            logger.error("commands from ROS are not served as the table says until it is reloaded", why=str(error))
+            logger.error("messages from ROS are not served as the table says until it is reloaded", why=str(error))
             self.has_passed = False
         else:
             self._served = next_one
@@ -93,7 +112,7 @@ class RosCommands:
         """Log how often the middleware has refused to hand out a message since the last call."""
         refused = self._thread.failures if self._thread else 0
         if refused > self._refused:
-            logger.error("the middleware has not handed out commands that it has", times=refused - self._refused)
+            logger.error("the middleware has not handed out messages that it has", times=refused - self._refused)
         self._refused = refused
 
     def stop(self) -> bool:
@@ -103,5 +122,5 @@ class RosCommands:
         """
         has_ended = self._thread is None or self._thread.stop()
         if not has_ended:
-            logger.error("the thread for commands from ROS is stuck, and the router ends without it")
+            logger.error("a thread for messages from ROS is stuck, and the router ends without it")
         return has_ended

@@ -1,4 +1,4 @@
-"""Commands from ROS that a native thread takes, converts and sends: neither Python nor a publisher can hold it up."""
+"""Messages from ROS that native threads take, convert and send: neither Python nor a publisher can hold them up."""
 
 from __future__ import annotations
 
@@ -38,10 +38,19 @@ class Subscription(Protocol):
 
 @dataclass(slots=True)
 class NativeCommands:
-    """The routes of each topic, an array of `struct command_route`, with all that they refer to."""
+    """The routes of each topic, an array of `struct command_route`, with all that they refer to.
+
+    `urgent` are the topics of which one route is.
+    """
 
     topics: dict[str, ctypes.Array[c.CommandRoute]] = field(default_factory=dict)
+    urgent: set[str] = field(default_factory=set)
     arrays: list[object] = field(default_factory=list)
+
+    def only(self, *, urgent: bool) -> NativeCommands:
+        """Those for the thread of urgent messages, or those for the other one."""
+        topics = {topic: routes for topic, routes in self.topics.items() if (topic in self.urgent) is urgent}
+        return NativeCommands(topics, self.urgent, self.arrays)
 
 
 def native_commands(program: Program, outlets: Outlets) -> NativeCommands:
@@ -52,6 +61,8 @@ def native_commands(program: Program, outlets: Outlets) -> NativeCommands:
         writer = _Writer(program, outlets, made.arrays, topic)
         routes = [writer.route(handlers[command.route], command) for command in commands]
         made.topics[topic] = (c.CommandRoute * len(routes))(*routes)
+        if any(command.is_urgent for command in commands):
+            made.urgent.add(topic)
     return made
 
 
@@ -134,7 +145,7 @@ class CommandThread:
     """Takes the messages of subscriptions, and sends what they command. It starts at once, and stops once.
 
     `deadmen` is the address of the carrier's, `counters` the array that the thread counts in. `take` and `reset` are
-    addresses of functions: those of `ros.receiving`.
+    addresses of functions: those of `ros.receiving`. A thread for urgent messages runs before others.
     """
 
     def __init__(
@@ -145,13 +156,15 @@ class CommandThread:
         events: Ring,
         take: int,
         reset: int,
+        *,
+        is_urgent: bool = True,
     ) -> None:
         """Raises MemoryError, also for a lack of descriptors or threads."""
         self._library = library
         self._counters, self._events = counters, events
         self._served: _Served | None = None
         self._in_use = Lock()  # for those who read counters while the thread may be stopped
-        self._address: int = library.commands_open(deadmen, counters, events.address, take, reset)
+        self._address: int = library.commands_open(deadmen, counters, events.address, take, reset, is_urgent)
         if not self._address:
             raise MemoryError("the thread for commands from ROS cannot be started")
 

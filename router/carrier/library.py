@@ -37,7 +37,7 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
     "command_send_at": (c_int, (c_void_p, c_void_p, c_void_p, c_size_t, c_int64, c_void_p, c_uint32, c_int64)),
     "commands_counters": (c_bool, (c_void_p, c_void_p, c_uint32)),
     "commands_failures": (c_uint64, (c_void_p,)),
-    "commands_open": (c_void_p, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p)),
+    "commands_open": (c_void_p, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_bool)),
     "commands_serve": (c_bool, (c_void_p, c_void_p)),
     "commands_stop": (c_bool, (c_void_p,)),
     "commands_unwatch": (None, (c_void_p, c_int)),

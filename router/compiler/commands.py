@@ -1,4 +1,4 @@
-"""Commands from ROS that need no Python: from a checked topic to the operations that the carrier executes.
+"""Messages from ROS that need no Python: from a checked topic to the operations that the carrier executes.
 
 A topic is lowered if all that it feeds can be: one thread takes its messages. What can be lowered are fields of the
 message, constants, `float32()`, `float64()` and `int()` of fields; all else stays in the generated handlers.
@@ -24,7 +24,7 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.source import call
 from router.errors import MappingError, SourceSpan
-from router.table.model import Keep
+from router.table.model import Keep, Route
 from router.types.descriptors import message_of
 from router.types.model import Bytes, Float, List, String, Type
 from router.types.protobuf import PayloadCase
@@ -103,9 +103,13 @@ class CommandTarget:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One route from one topic. `stamp` are the slots of seconds and nanoseconds of the message's stamp, or None."""
+    """One route from one topic. `stamp` are the slots of seconds and nanoseconds of the message's stamp, or None.
+
+    It is urgent if it has a `ttl`, or feeds or disarms a deadman.
+    """
 
     route: str
+    is_urgent: bool
     reads: tuple[ReadOp, ...]
     targets: tuple[CommandTarget, ...]
     stamp: tuple[int, int] | None
@@ -117,10 +121,7 @@ Commands = Mapping[str, tuple[Command, ...]]
 
 @dataclass(frozen=True, slots=True)
 class LoweredCommands:
-    """The topics whose messages have a `ttl` or feed or disarm a deadman.
-
-    `commands` are those that the carrier takes. `executors` are by route, topic and endpoint, of all of them.
-    """
+    """What routes from ROS take. `commands` are the topics that the carrier takes, `executors` those of all."""
 
     commands: Commands
     executors: Executors
@@ -143,23 +144,22 @@ def lower_commands(routes: Sequence[CheckedRoute]) -> LoweredCommands:
     commands: dict[str, tuple[Command, ...]] = {}
     executors: dict[tuple[str, str | None, str | None], Executor] = {}
     for topic, feeds in topics.items():
-        if not any(_is_command(checked, feed) for checked, feed in feeds):
-            continue
         executor = CARRIER
         try:
-            commands[topic] = tuple(lower(checked.route.name, checked.case, feed) for checked, feed in feeds)
+            commands[topic] = tuple(lower(checked.route, checked.case, feed) for checked, feed in feeds)
         except NeedsPythonError as error:
-            executor = Executor(f"{error}; its freshness is Python's", error.span)
+            is_urgent = any(_is_urgent(checked.route, feed) for checked, feed in feeds)
+            executor = Executor(f"{error}; its freshness is Python's" if is_urgent else str(error), error.span)
         for checked, feed in feeds:
             executors |= {(checked.route.name, topic, target.label): executor for target in feed.targets}
     return LoweredCommands(commands, executors)
 
 
-def _is_command(checked: CheckedRoute, feed: CheckedSubscription) -> bool:
-    return checked.route.ttl is not None or any(target.deadmen for target in feed.targets)
+def _is_urgent(route: Route, feed: CheckedSubscription) -> bool:
+    return route.ttl is not None or any(target.deadmen for target in feed.targets)
 
 
-def lower(route: str, case: PayloadCase, feed: CheckedSubscription) -> Command:
+def lower(route: Route, case: PayloadCase, feed: CheckedSubscription) -> Command:
     """Lower what a route makes of the messages of one topic. Raises NeedsPythonError."""
     if feed.for_each is not None:
         raise NeedsPythonError("`for_each` needs it", feed.for_each.span)
@@ -170,7 +170,8 @@ def lower(route: str, case: PayloadCase, feed: CheckedSubscription) -> Command:
     reading = _Reading(feed.topic.span)
     reading.add(feed.reads.steps())
     targets = tuple(_target(case, target, reading.found) for target in feed.targets)
-    return Command(route, tuple(reading.ops), targets, _stamp(feed.stamp, reading))
+    is_urgent = _is_urgent(route, feed)
+    return Command(route.name, is_urgent, tuple(reading.ops), targets, _stamp(feed.stamp, reading))
 
 
 def _want_immediate(target: CheckedTarget) -> None:

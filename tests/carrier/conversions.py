@@ -43,7 +43,8 @@ def lowered(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType
     )
     target = CheckedTarget(declared, plan=mapping.plan, rows=tuple(mapping.rows))
     topic = cast("Any", SimpleNamespace(span=SPAN))
-    return lower("route", case, CheckedSubscription(topic, source, reads, None, None, None, (target,)))
+    route = cast("Any", SimpleNamespace(name="route", ttl=None))
+    return lower(route, case, CheckedSubscription(topic, source, reads, None, None, None, (target,)))
 
 
 def in_python(convert: Callable[[Any], bytes]) -> Convert:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import struct
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,7 +12,6 @@ from time import monotonic, sleep
 
 import pytest
 
-from router.carrier.build import NATIVE, compile_c
 from router.carrier.commands import NativeCommands
 from router.clock import monotonic_ns, wall_ns
 from router.compiler.metrics import HISTOGRAM_CELLS
@@ -370,7 +368,7 @@ def test_what_may_be_sent_later_or_not_at_all_needs_python(
     assert list(made.commands) == ["arm"]
 
 
-def test_topics_without_freshness_are_left_to_python(tmp_path: Path) -> None:
+def test_messages_without_freshness_are_not_urgent(tmp_path: Path) -> None:
     routes = """\
   rover_localization:
     source: ros
@@ -378,41 +376,10 @@ def test_topics_without_freshness_are_left_to_python(tmp_path: Path) -> None:
     fields: auto
     destinations: [basestation]
 """
-    made = program(tmp_path, routes)
-    assert made.commands == {}
-    assert made.executors == {}
-
-
-# ---- types of rcl
-
-INCLUDE = Path(sys.prefix, "include")
-CHECK = """
-#include <stddef.h>
-#include "rcl/types.h"
-#include "rcutils/types/uint8_array.h"
-#include "rmw/types.h"
-#include "rcl_types.h"
-#define SAME(ours, our_field, theirs, their_field) \\
-    _Static_assert(offsetof(ours, our_field) == offsetof(theirs, their_field), #their_field)
-SAME(struct serialized_message, buffer, rcutils_uint8_array_t, buffer);
-SAME(struct serialized_message, length, rcutils_uint8_array_t, buffer_length);
-SAME(struct serialized_message, capacity, rcutils_uint8_array_t, buffer_capacity);
-SAME(struct serialized_message, allocator, rcutils_uint8_array_t, allocator);
-SAME(struct allocator, allocate, rcutils_allocator_t, allocate);
-SAME(struct allocator, deallocate, rcutils_allocator_t, deallocate);
-SAME(struct allocator, reallocate, rcutils_allocator_t, reallocate);
-SAME(struct allocator, zero_allocate, rcutils_allocator_t, zero_allocate);
-SAME(struct allocator, state, rcutils_allocator_t, state);
-SAME(struct message_info, source_timestamp, rmw_message_info_t, source_timestamp);
-SAME(struct message_info, received_timestamp, rmw_message_info_t, received_timestamp);
-_Static_assert(sizeof(struct serialized_message) == sizeof(rcutils_uint8_array_t), "size");
-_Static_assert(sizeof(struct message_info) >= sizeof(rmw_message_info_t), "room");
-_Static_assert(TAKE_FAILED == RCL_RET_SUBSCRIPTION_TAKE_FAILED, "code");
-"""
-
-
-@pytest.mark.skipif(not (INCLUDE / "rcl").exists(), reason="needs the headers of rcl")
-def test_the_types_of_rcl_are_as_we_declare_them(tmp_path: Path) -> None:
-    (tmp_path / "check.c").write_text(CHECK)
-    folders = [f"-I{folder}" for folder in (NATIVE, *(each for each in INCLUDE.iterdir() if each.is_dir()))]
-    compile_c(["-fsyntax-only", *folders, str(tmp_path / "check.c")])
+    made = program(tmp_path, ROUTES + routes)
+    urgent = {topic: [command.is_urgent for command in commands] for topic, commands in made.commands.items()}
+    assert urgent == {"drive": [True], "arm": [True, False], "where": [False]}
+    assert made.executors["rover_localization", "where", "basestation"].is_carrier
+    slowly = program(tmp_path, routes.replace("auto", "{x: x + 1}"))
+    executor = slowly.executors["rover_localization", "where", "basestation"]
+    assert executor.reason == "`x: x + 1` needs it"

@@ -59,7 +59,8 @@ def test_structures_have_their_fields_where_c_has_them(tmp_path: Path) -> None:
         for field in structure._fields_
     ]
     main = tmp_path / "offsets.c"
-    main.write_text(f'#include <stdio.h>\n#include "commands.h"\n#include "publishing.h"\nint main(void) {{ {" ".join(lines)} }}\n')
+    headers = "".join(f"#include {name}\n" for name in ("<stdio.h>", '"commands.h"', '"publishing.h"'))
+    main.write_text(f"{headers}int main(void) {{ {' '.join(lines)} }}\n")
     build.compile_c([str(main), f"-I{build.NATIVE}", "-o", str(tmp_path / "offsets")])
     printed = subprocess.check_output([tmp_path / "offsets"], text=True)
     assert printed.splitlines() == [
@@ -127,3 +128,49 @@ def test_structures_of_another_size_are_refused(built: Path, monkeypatch: pytest
     monkeypatch.setattr(library, "STRUCTURES", {**STRUCTURES, "entry": structures.Feed, "more": structures.Feed})
     with pytest.raises(LibraryError, match="C and Python differ about struct entry, more"):
         load(built)
+
+
+RCL = {
+    "rcl/types.h": "enum { RCL_RET_SUBSCRIPTION_TAKE_FAILED = 401 };",
+    "rcutils/error_handling.h": "typedef struct { char str[1024]; } rcutils_error_string_t;",
+    "rcutils/types/uint8_array.h": """
+#include <stddef.h>
+#include <stdint.h>
+typedef struct { void *allocate, *deallocate, *reallocate, *zero_allocate, *state; } rcutils_allocator_t;
+typedef struct {
+    uint8_t *buffer; size_t buffer_length; size_t buffer_capacity; rcutils_allocator_t allocator;
+} rcutils_uint8_array_t;
+""",
+    "rmw/types.h": "typedef struct { int64_t source_timestamp, received_timestamp; } rmw_message_info_t;",
+}
+"""Headers like those of rcl, as far as they are used."""
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        ("401", "402"),
+        ("size_t buffer_length; size_t buffer_capacity;", "size_t buffer_capacity; size_t buffer_length;"),
+        ("*allocate, *deallocate", "*deallocate, *allocate"),
+        ("source_timestamp, received_timestamp", "received_timestamp, source_timestamp"),
+        ("[1024]", "[2048]"),
+    ],
+)
+def test_other_headers_of_rcl_are_noticed(ours: str, theirs: str, tmp_path: Path) -> None:
+    assert not _differ(RCL, tmp_path / "same")
+    changed = {name: text.replace(ours, theirs) for name, text in RCL.items()}
+    assert changed != RCL
+    assert _differ(changed, tmp_path / "changed")
+
+
+def _differ(headers: dict[str, str], folder: Path) -> bool:
+    for name, text in headers.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    made = folder / "check.so"
+    build.compile_c(["-shared", "-fPIC", f"-isystem{folder}", str(build.NATIVE / "rcl_check.c"), "-o", str(made)])
+    return bool(ctypes.CDLL(str(made)).rcl_types_differ() & 0xFF)
+
+
+def test_the_installed_headers_of_rcl_are_those_that_we_declare() -> None:
+    assert not load().rcl_types_differ()

@@ -33,6 +33,7 @@ struct commands {
     reset_function *reset;
     struct freshness freshness;
     int epoll, wake;
+    bool is_urgent;
     struct serialized_message message;
     struct slot slots[MOST_SLOTS];
     uint8_t datagram[MOST_CONVERTED];
@@ -203,7 +204,7 @@ static void serve_arrivals(struct commands *commands) {
 
 static void *commands_thread(void *of) {
     struct commands *commands = of;
-    run_first();
+    if (commands->is_urgent) run_first();
     pthread_mutex_lock(&commands->lock);
     while (!commands->is_stopping && !commands->is_left) serve_arrivals(commands);
     serve_rest(commands, commands->current, NULL);
@@ -225,7 +226,7 @@ static void commands_close(struct commands *commands) {
 }
 
 struct commands *commands_open(struct deadmen *deadmen, counter *counters, struct ring *events, take_function *take,
-                               reset_function *reset) {
+                               reset_function *reset, bool is_urgent) {
     struct commands *commands = calloc(1, sizeof *commands);
     if (!commands) return NULL;
     commands->deadmen = deadmen;
@@ -233,13 +234,14 @@ struct commands *commands_open(struct deadmen *deadmen, counter *counters, struc
     commands->reporter.events = events;
     commands->take = take;
     commands->reset = reset;
+    commands->is_urgent = is_urgent;
     commands->message.allocator = ALLOCATOR;
     pthread_mutex_init(&commands->lock, NULL);
     condition_open(&commands->changed);
     commands->epoll = epoll_create1(EPOLL_CLOEXEC);
     commands->wake = eventfd(0, EFD_CLOEXEC);
     if (commands->epoll < 0 || commands->wake < 0 || commands_watch(commands, commands->wake) ||
-        start_thread(&commands->thread, "ros commands", commands_thread, commands)) {
+        start_thread(&commands->thread, is_urgent ? "ros commands" : "ros messages", commands_thread, commands)) {
         commands_close(commands);
         return NULL;
     }

@@ -1,4 +1,4 @@
-/* A thread that takes commands from ROS and sends them to boards.
+/* A thread that takes messages from ROS, most of them commands, and sends them to boards and others.
  *
  * It takes serialized messages, makes datagrams of them (convert.h), and checks, feeds and sends as for commands from
  * UDP. Neither the interpreter nor a publisher can hold it up, and it holds its lock while it serves a message, never
@@ -51,10 +51,10 @@ struct command_set {
 
 struct commands;
 
-/* Open a thread that serves nothing yet. It counts in `counters`, and losses go to `events`. NULL for lack of memory,
- * descriptors or threads. */
+/* Open a thread that serves nothing yet. It counts in `counters`, and losses go to `events`. Messages that are urgent have
+ * a thread of their own, which runs first. NULL for lack of memory, descriptors or threads. */
 struct commands *commands_open(struct deadmen *deadmen, counter *counters, struct ring *events, take_function *take,
-                               reset_function *reset);
+                               reset_function *reset, bool is_urgent);
 
 /* Have the thread wait for an eventfd as well, before it is in a set. Return 0, or an errno. */
 int commands_watch(struct commands *commands, int eventfd);

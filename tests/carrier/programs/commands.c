@@ -61,7 +61,7 @@ int main(void) {
     struct command_route route = {.ttl = 1000000000, .reads = READS, .targets = &target, .read_count = 1,
                                   .target_count = 1, .seconds = NO_SLOT, .nanoseconds = NO_SLOT, .received = RECEIVED,
                                   .last_message = LAST, .duration = DURATION};
-    struct commands *commands = commands_open(deadmen, counters, events, take, middleware_reset);
+    struct commands *commands = commands_open(deadmen, counters, events, take, middleware_reset, true);
     struct source sources[2];
     struct command_topic topics[2];
     for (int index = 0; index < 2; index++) {
