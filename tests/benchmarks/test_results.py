@@ -55,10 +55,10 @@ def test_the_file_names_neither_this_machine_nor_its_folders() -> None:
 
 def test_a_figure_is_shown_with_ratio_aim_verdict_and_what_disturbed_it() -> None:
     [row] = report.cells(entry(5, noise=0.2))
-    assert row == ("cpu_us@1000", "5", "peer 10", "0.50", "0.5 to 0.5", "<= 1.1", "met", "router noisy")
+    assert row == ("cpu_us@1000", "5", "peer 10", "0.50", "0.5 to 0.5", "<= 0.75", "met", "router noisy")
 
 
 def test_the_page_has_a_table_for_each_scenario() -> None:
     page = report.page(results.empty() | {"scenarios": {FIRST.name: entry(5)}})
     assert f"## `{FIRST.name}`" in page
-    assert "| cpu_us@1000 | 5 | peer 10 | 0.50 | 0.5 to 0.5 | <= 1.1 | met |" in page
+    assert "| cpu_us@1000 | 5 | peer 10 | 0.50 | 0.5 to 0.5 | <= 0.75 | met |" in page
