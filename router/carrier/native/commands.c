@@ -205,6 +205,7 @@ static void serve_arrivals(struct commands *commands) {
 static void *commands_thread(void *of) {
     struct commands *commands = of;
     if (commands->is_urgent) run_first();
+    else run_soon();
     pthread_mutex_lock(&commands->lock);
     while (!commands->is_stopping && !commands->is_left) serve_arrivals(commands);
     serve_rest(commands, commands->current, NULL);

@@ -31,11 +31,20 @@ static void take_short_slices(void) {
     sched_setscheduler(0, SCHED_OTHER, &(struct sched_param){0});
 }
 
+/* Whether nobody has chosen a policy for the router. A thread of Python that opens ROS passes on the batch policy. */
+static bool is_ours_to_choose(void) {
+    int inherited = sched_getscheduler(0);
+    return inherited == SCHED_OTHER || inherited == SCHED_BATCH;
+}
+
+void run_soon(void) {
+    if (is_ours_to_choose()) take_short_slices(); /* before Linux 6.12 they change nothing */
+}
+
 bool run_first(void) {
-    int inherited = sched_getscheduler(0); /* the batch policy from a thread of Python that opens ROS */
-    if (inherited != SCHED_OTHER && inherited != SCHED_BATCH) return false; /* whoever started the router has chosen it */
+    if (!is_ours_to_choose()) return false;
     if (take_priority()) return true;
-    take_short_slices(); /* before Linux 6.12 they change nothing */
+    run_soon();
     return false;
 }
 

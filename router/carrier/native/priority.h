@@ -15,6 +15,9 @@ struct share {
  * not have it, ask for the shortest slices: it waits less then, which is some 0.5 ms while Python or a neighbour computes. */
 bool run_first(void);
 
+/* Ask for the shortest slices only: for a thread that may block or compute, but should not wait for others for long. */
+void run_soon(void);
+
 /* Take the priority from the calling thread for a turn of 100 ms after one of which it used three quarters: a flood would
  * leave others next to nothing of its processor core. `now` is monotonic. */
 void share_processor(struct share *share, int64_t now);

@@ -169,6 +169,7 @@ static bool serve_all(struct publishing *publishing, size_t size) {
 
 static void *publishing_thread(void *of) {
     struct publishing *publishing = of;
+    run_soon();
     pthread_mutex_lock(&publishing->lock);
     for (;;) {
         bool is_stopping = atomic_load(&publishing->is_stopping); /* what is there by now is served */
