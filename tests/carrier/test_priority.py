@@ -72,3 +72,18 @@ def test_one_that_may_not_be_first_is_left_alone(library: ctypes.CDLL) -> None:
         assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
     in_a_thread(run)
+
+
+def test_a_thread_that_may_block_is_not_left_with_the_batch_policy(library: ctypes.CDLL) -> None:
+    """It comes from a thread of Python that opens ROS, and would have to wait for others."""
+
+    def policy_after(inherited: int) -> int:
+        os.sched_setscheduler(0, inherited, os.sched_param(0))
+        library.run_soon()
+        return os.sched_getscheduler(0)
+
+    def run() -> None:
+        assert policy_after(os.SCHED_BATCH) == os.SCHED_OTHER
+        assert policy_after(os.SCHED_IDLE) == os.SCHED_IDLE
+
+    in_a_thread(run)
