@@ -46,7 +46,7 @@ FROM_ROS = """\
   rock_measure_result:
     source: ros
     topics: [{topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}]
-    fields: auto
+    fields: {auto: true, width_cm: "width_cm + 0"}   # which needs Python
     destinations: [basestation]
 """
 
