@@ -136,6 +136,9 @@ class NativeDatapath:
     def turns(self) -> int:
         return self._carrier.turns
 
+    def stalled(self) -> tuple[str, float] | None:
+        return self._publishing.stalled()
+
     def _pulse(self) -> None:
         self._carrier.pulse()
         for commands in self._commands:

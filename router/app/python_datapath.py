@@ -60,6 +60,9 @@ class PythonDatapath:
     def turns(self) -> int:
         return self._receiving.turns
 
+    def stalled(self) -> None:
+        return None
+
     def open_listener(self, settings: model.Listener) -> Listener:
         return Listener(settings)
 

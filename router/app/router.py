@@ -202,6 +202,7 @@ class Router:
             "mirror_dropped": lambda: [((), self.mirror.lost + self.total("mirror_dropped"))],
             **self._services.asked(),
             "kernel_drops": lambda: [((name,), dropped) for name, dropped in self._runtime.drops.totals()],
+            "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self._runtime.stalled().items()],
             "gateway_client_lag_seconds": of_clients(lambda client: client.lag(monotonic_ns()) / 1e9),
             "gateway_client_sent": of_clients(lambda client: client.sent),
             "gateway_client_dropped": of_clients(lambda client: client.dropped),

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from router.ros.endpoints import RosChange
     from router.ros.router_node import RouterNode
 
+_STALLED_S = 0.01
+"""A call that publishes usually takes less."""
+
 
 @dataclass(frozen=True, slots=True)
 class Change:
@@ -58,6 +61,15 @@ class Runtime:
     def node_name(self) -> str:
         """The fully qualified name of the ROS node, or "" without one."""
         return self._ros.name if self._ros else ""
+
+    def stalled(self) -> dict[str, float]:
+        """For how many seconds a call that publishes on a topic has been in the middleware, by topic; 0 if in none."""
+        stalled = dict.fromkeys((plan.label for plan in self.wiring.program.publishers) if self.wiring else (), 0.0)
+        ros, native = self._ros, self.datapath.stalled()
+        for topic, seconds in (*(ros.stalled() if ros else ()), *([native] if native else ())):
+            if seconds >= _STALLED_S:
+                stalled[topic] = max(seconds, stalled.get(topic, 0.0))
+        return stalled
 
     def start(self, change: Change, closing: ExitStack) -> None:
         """Run the prepared program. `closing` stops receiving."""

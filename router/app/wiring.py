@@ -187,6 +187,9 @@ class Datapath(Protocol):
     def turns(self) -> int:
         """A number that grows unless the thread that receives is stuck, even if nothing comes."""
 
+    def stalled(self) -> tuple[str, float] | None:
+        """The topic in whose publisher a native thread is now, and for how many seconds."""
+
     def open_listener(self, settings: model.Listener) -> Listener:
         """Bind a socket. Raises StartError."""
 

@@ -40,6 +40,12 @@ METRICS = (
     Metric("messages_collected", "counter", ("route", "target"), "Messages that joined an open frame."),
     Metric("messages_waiting", "level", ("route", "target"), "Messages that wait between two threads of the router."),
     Metric(
+        "publish_stalled_seconds",
+        "number",
+        ("topic",),
+        "For how long a call that publishes there has been in the ROS middleware; 0 below 10 ms.",
+    ),
+    Metric(
         "route_duration_seconds",
         "histogram",
         ("route",),

@@ -26,7 +26,11 @@ PERIOD = 1.0
 SNAPSHOTS = 6
 """What went wrong is reported for so many periods, less one: a status that comes and goes would be overlooked."""
 
+MOST_STALLED = 1.0
+"""Seconds that calls which publish on a topic may last."""
+
 LAST_SEEN = "endpoint_last_seen_timestamp_seconds"
+STALLED = "publish_stalled_seconds"
 METRICS = frozenset(
     {
         "config_last_reload_successful",
@@ -46,6 +50,7 @@ METRICS = frozenset(
         "messages_sent",
         "messages_waiting",
         "mirror_dropped",
+        STALLED,
         "record_dropped",
     }
 )
@@ -133,7 +138,16 @@ class Watch:
         silent = {name: now - self._seen(name, latest, earlier, now, wall) for name in program.table.endpoints}
         self._snapshots.append((now, latest))
         since, before = self._snapshots[0]
-        return [*Report(program, latest, before, max(now - since, 1) / 1e9, silent, self._host).statuses()]
+        report = Report(program, latest, before, max(now - since, 1) / 1e9, silent, self._stalled(), self._host)
+        return [*report.statuses()]
+
+    def _stalled(self) -> dict[str, float]:
+        """For how many seconds each topic's publisher is stuck, or was within the last periods, call by call."""
+        snapshots = [each.counts(STALLED) for _, each in self._snapshots]
+        return {
+            topic: max(seconds, sum(min(each.get((topic,), 0.0), PERIOD) for each in snapshots))
+            for (topic,), seconds in snapshots[-1].items()
+        }
 
     def _seen(self, endpoint: str, latest: Snapshot, earlier: int, now: int, wall: int) -> int:
         """When it was last heard of, or first looked for. Stamps are of the wall clock, which jumps."""
@@ -148,7 +162,8 @@ class Watch:
 class Report:
     """The statuses that follow from two snapshots, `seconds` apart.
 
-    `silent`: for how long each endpoint is silent, ns. `host` names this computer.
+    `silent`: for how long each endpoint is silent, ns. `stalled`: for how long the publisher of each topic is stuck, s.
+    `host` names this computer.
     """
 
     program: Program
@@ -156,6 +171,7 @@ class Report:
     before: Snapshot
     seconds: float
     silent: Mapping[str, int]
+    stalled: Mapping[str, float]
     host: str
 
     def statuses(self) -> Iterator[Status]:
@@ -181,6 +197,11 @@ class Report:
                 for _, n in self._grown("record_dropped", reason)
             ),
             *(_warning(f"recordings and taps were not shown {n}") for _, n in self._grown("mirror_dropped")),
+            *(
+                Problem(Level.ERROR, f"publishing on {topic} is stuck in the ROS middleware, for {seconds:.1f} s")
+                for topic, seconds in self.stalled.items()
+                if seconds > MOST_STALLED
+            ),
         ]
         if not self.now.total("config_last_reload_successful"):
             problems.append(_warning("the last reload failed, and the table from before it goes on"))

@@ -40,6 +40,7 @@ PATHS = {
     "kernel_drops": "listeners {listener} kernel_drops",
     "datagrams_rejected": "listeners {listener} rejected {reason}",
     "unhandled": "unhandled {payload_case}",
+    "publish_stalled_seconds": "stalled {topic}",
     "config_last_reload_successful": "reload ok",
     "config_last_reload_timestamp_seconds": "reload at",
 }
@@ -53,6 +54,7 @@ IF_ANY = {
     "qos_incompatible",
     "datagrams_rejected",
     "unhandled",
+    "publish_stalled_seconds",
 }
 """Left out where they are 0."""
 
@@ -101,7 +103,7 @@ def numbers(now: Snapshot) -> Json:
 
     `routes` has gateways as well. A route's `buckets` are cumulative, in the order of bounds.
     """
-    found: Json = {"routes": {}, "endpoints": {}, "listeners": {}, "unhandled": {}, "reload": {}}
+    found: Json = {"routes": {}, "endpoints": {}, "listeners": {}, "unhandled": {}, "stalled": {}, "reload": {}}
     for metric, path in _PATHS.items():
         for labels, value in now.counts(metric).items():
             if value or metric not in IF_ANY:

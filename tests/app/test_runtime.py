@@ -233,6 +233,23 @@ def test_metrics_are_served_while_it_runs(site: Site) -> None:
     assert router.program.protos_sha256 in build
 
 
+def test_metrics_tell_on_which_topics_a_publisher_is_stuck(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    others = "      - {topic: other, type: comms/msg/SensorBoardPHInfo, fields: auto}\n"
+    with Router(site.program(ROUTE + TOPIC + others)) as router:
+        runtime = router._runtime
+
+        def stalled() -> dict[str, float]:
+            families = {family.name: family for family in router.collect()}
+            samples = families["router_publish_stalled_seconds"].samples
+            return {sample.labels["topic"]: sample.value for sample in samples}
+
+        assert stalled() == {"ph": 0, "other": 0}
+        monkeypatch.setattr(runtime.datapath, "stalled", lambda: ("ph", 2.5))
+        monkeypatch.setattr(runtime._ros, "stalled", lambda: iter([("ph", 1.5), ("other", 0.009)]))
+        assert stalled() == {"ph": 2.5, "other": 0}
+
+
 def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -> None:
     failing = """\
     topics:

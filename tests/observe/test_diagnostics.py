@@ -17,7 +17,7 @@ from router.compiler import check_table
 from router.compiler.program import Program
 from router.observe import diagnostics
 from router.observe.diagnostics import SNAPSHOTS, Diagnostics, Level, Status, Watch, diagnostic_array
-from router.observe.metrics import CountersCollector
+from router.observe.metrics import Asked, CountersCollector
 from router.observe.running import Running
 from router.ros.types import installed_class
 from tests.tables import ROUTES
@@ -50,13 +50,17 @@ class Counting:
     program: Program
     counts: list[int]
     kernel_drops: int = 0
+    stalled: dict[str, float] = field(default_factory=lambda: {"imu_data": 0.0})
     now: int = 0
     shift: int = 0
     watch: Watch = field(init=False)
 
     def __post_init__(self) -> None:
-        drops = {"kernel_drops": lambda: [(["rover"], self.kernel_drops)]}
-        self._collector = CountersCollector(self.program.counters, lambda: [self.counts], drops, {})
+        asked: dict[str, Asked] = {
+            "kernel_drops": lambda: [(["rover"], self.kernel_drops)],
+            "publish_stalled_seconds": lambda: [((topic,), each) for topic, each in self.stalled.items()],
+        }
+        self._collector = CountersCollector(self.program.counters, lambda: [self.counts], asked, {})
         self.watch = Watch(cast("Running", self))
         self.add(1, "config_last_reload_successful")
 
@@ -145,6 +149,27 @@ def test_a_topic_for_which_messages_wait_without_end_is_stuck(router: Counting) 
     router.add(1, "messages_published", "imu_info", "imu_data")
     router.hear("sensor_board")
     assert router.after(1)["route/imu_info"].level == Level.OK
+
+
+def test_a_publisher_that_is_stuck_is_an_error_until_it_goes_on(router: Counting) -> None:
+    router.stalled = {"imu_data": 0.9, "imu/mag": 0.9}
+    assert router.after(1)["router"].level == Level.OK
+    router.stalled = {"imu_data": 61.9, "imu/mag": 0.0}
+    told = router.after(1)["router"]
+    assert (told.level, told.message) == (
+        Level.ERROR,
+        "publishing on imu_data is stuck in the ROS middleware, for 61.9 s",
+    )
+    router.stalled = {"imu_data": 0.0, "imu/mag": 0.0}
+    levels = [router.after(1)["router"].level for _ in range(SNAPSHOTS)]
+    assert (levels[0], levels[-1]) == (Level.ERROR, Level.OK)
+
+
+def test_a_publisher_that_takes_long_for_each_message_is_stuck_as_well(router: Counting) -> None:
+    for seconds in (0.8, 0.1, 0.6):
+        router.stalled = {"imu_data": seconds}
+        message = router.after(1)["router"].message
+    assert message == "publishing on imu_data is stuck in the ROS middleware, for 1.5 s"
 
 
 @pytest.mark.parametrize("shift", [-3600 * SECOND, 3600 * SECOND])

@@ -331,11 +331,13 @@ def blocked() -> Iterator[RouterNode]:
 
 def test_python_goes_on_while_the_middleware_blocks_a_publisher(blocked: RouterNode) -> None:
     ran_at: list[float] = []
+    stalled: list[float] = []
     ended = threading.Event()
 
     def run() -> None:
         while not ended.is_set():
             ran_at.append(monotonic())
+            stalled.extend(seconds for _, seconds in blocked.stalled())
             sleep(0.001)
 
     other = threading.Thread(target=run)
@@ -347,6 +349,8 @@ def test_python_goes_on_while_the_middleware_blocks_a_publisher(blocked: RouterN
     ended.set()
     other.join()
     assert any(lasted / 4 < at - begun < lasted * 3 / 4 for at in ran_at)
+    assert lasted / 4 < max(stalled) <= lasted
+    assert not list(blocked.stalled())
 
 
 def test_a_publisher_closes_when_nobody_is_in_it_and_refuses_after_that(blocked: RouterNode) -> None:
