@@ -129,6 +129,7 @@ class NativeDatapath:
             report,
             context.deadman_changed,
             self._why_rejected,
+            self._where_refused,
             self._pulse,
         )
 
@@ -193,7 +194,8 @@ class NativeDatapath:
         functions = {part: engine.functions() for part, engine in engines.items()}
         limit = partial(_limit, states[_ENDPOINTS])
         publications = topics.publications if topics else {}
-        routes = PublishRoutes(program, publications, self._names.number, limit)
+        generation = next(self._generations)
+        routes = PublishRoutes(program, publications, self._names.number, limit, generation)
         outlets = Outlets(
             listeners=sockets.listeners,
             senders={endpoint: sender.address for endpoint, sender in senders.items()},
@@ -205,7 +207,7 @@ class NativeDatapath:
             names=self._names,
         )
         try:
-            native = native_program(program, next(self._generations), outlets)
+            native = native_program(program, generation, outlets)
         except CannotCarry as error:
             what = f"the carrier, which runs, cannot take these messages: {error}"
             raise StartError(f"{what}; restart the router, and Python serves them") from error
@@ -399,6 +401,13 @@ class NativeDatapath:
         except Rejected as rejected:
             return str(rejected)
         return case
+
+    def _where_refused(self, route: str, topic: str, generation: int, place: int) -> str:
+        """Say which place of the table refused a message; nothing if it is not of the program that runs."""
+        wiring = self._wiring
+        if wiring is None or wiring.native.generation & 0xFFFF != generation:
+            return ""
+        return wiring.program.lowered[route].targets[topic].places[place]
 
 
 def _fixed_counts() -> ctypes.Array[ctypes.c_int64]:

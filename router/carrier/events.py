@@ -34,7 +34,7 @@ _REASONS = tuple(REJECT_REASONS)
 _HEAD = Struct("@II")
 _DEADMAN = Struct("@IIIIiI")
 _REJECT = Struct("@IIIIIIII")
-_LOSS = Struct("@IIIIIiII")
+_LOSS = Struct("@IIIIIiIHH")
 
 _PULSE_MS = 5000
 
@@ -44,7 +44,8 @@ class EventThread:
 
     Each ring comes with the counters of those who write to it. Of many losses of a kind, few are events; by the counter
     that an event names, `report` is told of all of them. `changed` gets a route and whether its deadman has tripped.
-    `detail(listener, data, length)` returns in words why a datagram was rejected.
+    `detail(listener, data, length)` returns in words why a datagram was rejected, `place(route, topic, program, place)`
+    which place of the table refused a message, or "". It gets the lowest 16 bits of the program's generation.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class EventThread:
         report: Callable[[Report], None],
         changed: Callable[[str, bool], None],
         detail: Callable[[str, bytes, int], str],
+        place: Callable[[str, str, int, int], str],
         pulse: Callable[[], None],
     ) -> None:
         self._rings = rings
@@ -61,6 +63,7 @@ class EventThread:
         self._report = report
         self._changed = changed
         self._detail = detail
+        self._place = place
         self._pulse = pulse
         self._stopping = False
         self._last: list[dict[int, tuple[int, Report]]] = [{} for _ in rings]
@@ -111,9 +114,12 @@ class EventThread:
             detail = f"{sender}: {what}" if what else sender
             self._count(counter, Report("reject", place, "", _REASONS[reason], None, detail), counters, last)
         elif kind == _LOST:
-            _, _, route, target, loss, number, counter, _ = _LOSS.unpack_from(record)
+            _, _, of_route, of_target, loss, number, counter, program, place = _LOSS.unpack_from(record)
+            route, target = self._name(of_route), self._name(of_target)
             detail = bytes(record[_LOSS.size :]).partition(b"\0")[0].decode(errors="replace")
-            lost = Report("drop", self._name(route), self._name(target), _LOSSES[loss], _error(number), detail)
+            if place:
+                detail = self._place(route, target, program, place)
+            lost = Report("drop", route, target, _LOSSES[loss], _error(number), detail)
             self._count(counter, lost, counters, last)
         else:
             _, _, route, target, number, counter = _DEADMAN.unpack_from(record)

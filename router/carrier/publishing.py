@@ -38,13 +38,14 @@ class PublishRoutes:
     """Makes the routes of one program, and keeps what they refer to. `publications` are by topic.
 
     `number(name)` returns what stands for a name in events, `limit(handler, target)` the limit of a target with
-    `max_rate`.
+    `max_rate`. `generation` is that of the carrier program.
     """
 
     program: Program
     publications: Mapping[str, Publication]
     number: Callable[[str], int]
     limit: Callable[[Handler, TargetPlan], c.Limit]
+    generation: int = 0
     arrays: list[object] = field(default_factory=list)
     _topics: dict[str, c.PublishTopic] = field(default_factory=dict)
     _sources: ctypes.Array[c.Value] | None = None
@@ -60,6 +61,7 @@ class PublishRoutes:
             labels = *self.program.table.endpoints, source_label(STRANGER)
             self._sources = native_values([label.encode() for label in labels], self.arrays)
         made.ttl, made.id, made.sources = handler.ttl or 0, self.number(handler.route), self._sources
+        made.program = self.generation
         return made
 
     def _complete(self, made: c.PublishTarget, handler: Handler, target: TargetPlan) -> None:

@@ -158,7 +158,7 @@ class PublishRoute(ctypes.Structure):
         ("slot_count", c_uint32),
         ("target_count", c_uint32),
         ("id", c_uint32),
-        ("reserved", c_uint32),
+        ("program", c_uint32),
     )
 
 

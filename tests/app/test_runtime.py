@@ -264,13 +264,40 @@ def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -
         site.send(NAN_PH, NAN_PH, NAN_PH)
     lines = [entry for entry in logged if entry["event"] == "message dropped"]
     assert [(line["reason"], line.get("more")) for line in lines] == [("non_finite", None), ("non_finite", 2)]
-    frames = []
-    traceback = lines[0]["exc_info"].__traceback__
-    while traceback:
-        frames.append((Path(traceback.tb_frame.f_code.co_filename).name, traceback.tb_lineno))
-        traceback = traceback.tb_next
-    assert ("table.yaml", 17) in frames
+    if program.executors["ph_info", "ph", None].is_carrier and isinstance(router._runtime.datapath, NativeDatapath):
+        assert lines[0]["detail"] == f"{program.table.path}:17:18: state"
+    else:
+        frames = []
+        traceback = lines[0]["exc_info"].__traceback__
+        while traceback:
+            frames.append((Path(traceback.tb_frame.f_code.co_filename).name, traceback.tb_lineno))
+            traceback = traceback.tb_next
+        assert ("table.yaml", 17) in frames
     assert router.totals()["datagrams_sent"] == router.totals()["messages_dropped"] == 3
+
+
+def test_the_place_of_a_condition_that_fails_is_told_and_none_of_another_program(site: Site) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    failing = """\
+    topics:
+      - topic: ph
+        type: std_msgs/msg/Float32
+        qos: {durability: transient_local}
+        when: 1 / temperature > 0
+        fields: {data: ph_value}
+"""
+    with capture_logs() as logged, Router(site.program(ROUTE + failing)) as router:
+        datapath = router._runtime.datapath
+        if not isinstance(datapath, NativeDatapath):
+            pytest.skip("of the carrier")
+        site.send(NAN_PH)
+        wait_until(lambda: router.totals()["messages_dropped"] == 1)
+        generation = datapath._wiring.native.generation if datapath._wiring else 0
+        told = [datapath._where_refused("ph_info", "ph", each, 1) for each in (generation, generation + 1)]
+    place = f"{router.program.table.path}:16:15: when"
+    assert told == [place, ""]
+    lines = [entry for entry in logged if entry["event"] == "message dropped"]
+    assert [(line["reason"], line["detail"]) for line in lines] == [("mapping_error", place)]
 
 
 def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) -> None:

@@ -61,9 +61,8 @@ bool may_report(struct reporter *reporter, int64_t now);
 void report_loss(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
                  uint32_t counted);
 
-/* Likewise, with a text that says more. */
-void report_loss_because(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason,
-                         uint32_t counted, const char *text);
+/* Report a loss, whose size and kind are filled in here, with a text that says more. */
+void report_loss_because(struct reporter *reporter, int64_t now, const struct lost_event *lost, const char *text);
 
 /* Report that `destination_send` has returned an errno. */
 void report_send_error(struct reporter *reporter, int64_t now, uint32_t route, const struct destination *to, int error);

@@ -29,8 +29,12 @@ struct lost_event {
     uint32_t reason;     /* enum loss */
     int32_t error;       /* errno, of LOSS_SEND_BUFFER_FULL and LOSS_SEND_ERROR */
     uint32_t counter;    /* of such losses */
-    uint32_t reserved;
+    uint16_t program;    /* the lowest bits of its generation, and the enum place that refused, if one did */
+    uint16_t place;
 };
+
+/* Where a program that publishes refuses a message: `places` of a LoweredTarget in compiler/lowering. */
+enum place { PLACE_UNKNOWN, PLACE_CONDITION, PLACE_OPERATIONS /* and the index of one */ };
 
 /* Why a target did not get a message, by the names of DROP_REASONS in compiler/metrics.py. */
 enum loss {

@@ -49,12 +49,14 @@ static uint32_t counter_of(const struct publish_target *target, enum loss reason
     }
 }
 
-/* Count and report a loss, with a text that says more. */
+/* Count and report a loss, with the place that refused or a text that says more. */
 static void lose(struct publishing *publishing, const struct served *served, const struct publish_target *target,
-                 enum loss reason, const char *text) {
-    uint32_t counted = counter_of(target, reason);
-    counter_add(publishing->counters, counted, 1);
-    report_loss_because(&publishing->reporter, served->record->now, served->route->id, target->topic->id, reason, counted, text);
+                 enum loss reason, uint32_t place, const char *text) {
+    struct lost_event lost = {.route = served->route->id, .target = target->topic->id, .reason = reason,
+                              .counter = counter_of(target, reason), .program = (uint16_t)served->route->program,
+                              .place = (uint16_t)place};
+    counter_add(publishing->counters, lost.counter, 1);
+    report_loss_because(&publishing->reporter, served->record->now, &lost, text);
 }
 
 /* ---- the middleware ---- */
@@ -76,7 +78,7 @@ static bool publish_composed(struct publishing *publishing, const struct served 
     pthread_mutex_lock(&publishing->lock);
     atomic_store_explicit(&publishing->since, 0, memory_order_relaxed);
     if (publishing->is_left) return false;
-    if (error) lose(publishing, served, target, LOSS_PUBLISH_ERROR, why.text);
+    if (error) lose(publishing, served, target, LOSS_PUBLISH_ERROR, PLACE_UNKNOWN, why.text);
     else counter_add(publishing->counters, target->published, 1);
     return true;
 }
@@ -108,11 +110,13 @@ static bool is_composed(struct publishing *publishing, struct served *served, co
     struct composer *composer = &publishing->composer;
     counter *counters = publishing->counters;
     bool is_true = true;
-    uint32_t at;
+    uint32_t at, place = PLACE_UNKNOWN;
     int outcome = is_valid(publishing, served) ? COMPOSED : LOSS_MAPPING_ERROR;
     composer->literals = served->route->literals;
-    if (outcome == COMPOSED && target->condition)
+    if (outcome == COMPOSED && target->condition) {
         outcome = compose_condition(composer, target->condition, target->condition_count, &is_true, &at);
+        if (outcome != COMPOSED) place = PLACE_CONDITION;
+    }
     if (outcome == COMPOSED && !is_true) {
         counter_add(counters, target->filtered, 1);
         return false;
@@ -122,9 +126,12 @@ static bool is_composed(struct publishing *publishing, struct served *served, co
         counter_add(counters, target->rate_limited, 1);
         return false;
     }
-    if (outcome == COMPOSED) outcome = compose(composer, target->operations, target->operation_count, &at);
-    if (outcome == COMPOSED) return true;
-    lose(publishing, served, target, (enum loss)outcome, "");
+    if (outcome == COMPOSED) {
+        outcome = compose(composer, target->operations, target->operation_count, &at);
+        if (outcome == COMPOSED) return true;
+        place = PLACE_OPERATIONS + at;
+    }
+    lose(publishing, served, target, (enum loss)outcome, place, "");
     return false;
 }
 

@@ -44,8 +44,7 @@ struct publish_route {
     const uint8_t *literals;
     const struct publish_target *targets;
     uint32_t slot_count, target_count;
-    uint32_t id; /* in events */
-    uint32_t reserved;
+    uint32_t id, program; /* in events; `program`: its generation */
 };
 
 struct publishing;

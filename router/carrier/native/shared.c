@@ -68,19 +68,19 @@ bool may_report(struct reporter *reporter, int64_t now) {
 
 void report_loss(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason, int error,
                  uint32_t counted) {
-    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error, counted, 0};
+    struct lost_event event = {sizeof event, EVENT_LOST, route, target, reason, error, counted, 0, 0};
     if (may_report(reporter, now)) ring_put(reporter->events, &event, sizeof event);
 }
 
-void report_loss_because(struct reporter *reporter, int64_t now, uint32_t route, uint32_t target, enum loss reason,
-                         uint32_t counted, const char *text) {
+void report_loss_because(struct reporter *reporter, int64_t now, const struct lost_event *lost, const char *text) {
     enum { LONGEST = 255 };
     struct {
         struct lost_event event;
         char text[LONGEST + 1];
-    } record = {.event = {0, EVENT_LOST, route, target, reason, 0, counted, 0}};
+    } record = {.event = *lost};
     size_t length = strnlen(text, LONGEST);
     memcpy(record.text, text, length);
+    record.event.kind = EVENT_LOST;
     record.event.size = (uint32_t)(sizeof record.event + (length + 8) / 8 * 8);
     if (may_report(reporter, now)) ring_put(reporter->events, &record, record.event.size);
 }

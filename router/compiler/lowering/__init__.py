@@ -33,16 +33,21 @@ from router.errors import SourceSpan
 from router.table.model import Keep
 from router.types.protobuf import Envelope
 
-_MOST_OPERATIONS = 0xFFFF
+_MOST_OPERATIONS = 0xFFFF - 2  # an `enum place` has 16 bits
 
 
 @dataclass(frozen=True, slots=True)
 class LoweredTarget:
-    """What makes the message of a topic. `condition` is its `when`, or nothing."""
+    """What makes the message of a topic. `condition` is its `when`, or nothing.
+
+    `places` say where in the table a message may be refused, by `enum place` in `native/events.h`: "", the condition,
+    and what each operation fills.
+    """
 
     label: str
     condition: Code
     operations: Code
+    places: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,14 +147,17 @@ def _name_messages(names: Names, target: CheckedTarget, payload: Node) -> None:
 def _target(target: CheckedTarget, lowering: Lowering) -> LoweredTarget:
     assert target.plan is not None  # noqa: S101 - a topic has one
     condition: Code = ()
+    place = ""
     if target.when is not None:
+        place = f"{target.when.span}: when"
         try:
             condition = lowering.value(target.when.node).code
         except NeedsPython as reason:
             raise Unlowered(f"when: {target.declared.when}", str(reason), target.when.span) from None
     rows = {row.target: row.expression for row in target.rows}
-    operations = MessageWriter(lowering, rows).message(target.plan)
-    return LoweredTarget(target.label, condition, operations)
+    placed = MessageWriter(lowering, rows).message(target.plan)
+    operations, places = zip(*placed, strict=True)
+    return LoweredTarget(target.label, condition, operations, ("", place, *places))
 
 
 def _want_room(laid_out: Layout, nodes: Sequence[Node], targets: Mapping[str, LoweredTarget], span: SourceSpan) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from router.compiler.cdr.writing import Blob, Put, Repeat, Step, Text, steps
 from router.compiler.lowering.expressions import Listed, Lowering, fit, type_of
@@ -14,7 +15,8 @@ from router.compiler.plan import Plan, Record
 from router.errors import SourceSpan
 from router.types.model import List
 
-_LONGEST = 0xFFFF_FFFF
+P = TypeVar("P")
+
 _INTEGERS = {
     "b": (-(1 << 7), (1 << 7) - 1), "B": (0, (1 << 8) - 1),
     "h": (-(1 << 15), (1 << 15) - 1), "H": (0, (1 << 16) - 1),
@@ -32,6 +34,10 @@ class Unlowered(Exception):
         self.span = span
 
 
+Placed = tuple[Operation, SourceSpan | None]
+"""An operation, and where the table says what it does; None for known bytes."""
+
+
 @dataclass(frozen=True, slots=True)
 class MessageWriter:
     """Writes the message of a target. `rows` are the expressions by path of their field."""
@@ -39,11 +45,11 @@ class MessageWriter:
     lowering: Lowering
     rows: Mapping[str, str]
 
-    def message(self, plan: Record) -> Code:
-        """Raises Unlowered."""
-        return tuple(_merged(self._record(plan, ())))
+    def message(self, plan: Record) -> list[tuple[Operation, str]]:
+        """Return the operations, each with the position and the field that it is for. Raises Unlowered."""
+        return list(_merged(self._record(plan, ())))
 
-    def _record(self, plan: Record, path: tuple[str, ...]) -> Iterator[Operation]:
+    def _record(self, plan: Record, path: tuple[str, ...]) -> Iterator[tuple[Operation, str]]:
         for member, made in plan.members:
             inner = (*path, member.name)
             if isinstance(made, Record) and made.type.fields:
@@ -51,30 +57,35 @@ class MessageWriter:
             else:
                 yield from self._field(made, inner)
         if not plan.type.fields:
-            yield from self._steps(steps(plan), 0)
+            yield from self._placed(plan, path)
 
-    def _field(self, made: Plan, path: tuple[str, ...]) -> Iterator[Operation]:
+    def _field(self, made: Plan, path: tuple[str, ...]) -> Iterator[tuple[Operation, str]]:
         try:
-            yield from list(self._steps(steps(made), 0))
+            yield from list(self._placed(made, path))
         except NeedsPython as reason:
             raise Unlowered(self._shown(path), str(reason), made.span) from None
+
+    def _placed(self, made: Plan, path: tuple[str, ...]) -> Iterator[tuple[Operation, str]]:
+        field = ".".join(path)
+        for operation, span in self._steps(steps(made), 0):
+            yield operation, f"{span or made.span}: {field}"
 
     def _shown(self, path: tuple[str, ...]) -> str:
         """The field with its expression, which may be that of the message around it."""
         names = [".".join(path[:length]) for length in range(len(path), 0, -1)]
         return next((f"{name}: {self.rows[name]}" for name in names if name in self.rows), names[0])
 
-    def _steps(self, sequence: Iterable[Step], depth: int) -> Iterator[Operation]:
+    def _steps(self, sequence: Iterable[Step], depth: int) -> Iterator[Placed]:
         for step in sequence:
             match step:
                 case Blob():
-                    yield _known(step.data, step.alignment)
+                    yield _known(step.data, step.alignment), None
                 case Put():
-                    yield from self._put(step)
+                    yield from _at(step.span, self._put(step))
                 case Text(wide=True):
                     raise NeedsPython("the carrier writes no wide strings")
                 case Text():
-                    yield from self.lowering.value(step.node).then(Op.PUT_TEXT).code
+                    yield from _at(step.span, self.lowering.value(step.node).then(Op.PUT_TEXT).code)
                 case Repeat():
                     yield from self._repeat(step, depth)
 
@@ -87,20 +98,20 @@ class MessageWriter:
             return fit(value, integer(low), integer(high)).then(Op.PUT, slot=step.size).code
         return to_real(value).then(Op.PUT_FLOAT if step.format == "f" else Op.PUT_DOUBLE).code
 
-    def _repeat(self, step: Repeat, depth: int) -> Iterator[Operation]:
+    def _repeat(self, step: Repeat, depth: int) -> Iterator[Placed]:
         if depth == MOST_LOOPS:
             raise NeedsPython("it has lists in too many lists")
         listed = self.lowering.listed(step.values)
-        yield from listed.code
-        yield from _count(listed.slot, step.type)
+        yield from _at(step.span, (*listed.code, *_count(listed.slot, step.type)))
         if listed.is_octets and _copies_octets(step):
-            yield Operation(Op.LOAD, listed.slot)
-            yield Operation(Op.PUT_BYTES)
+            yield from _at(step.span, (Operation(Op.LOAD, listed.slot), Operation(Op.PUT_BYTES)))
             return
-        body = (*self._element(step.variable, listed), *_merged(self._steps(step.body, depth + 1)))
-        yield Operation(Op.EACH_BYTE if listed.is_octets else Op.EACH, listed.slot, size=len(body) + 1)
+        element = _at(step.span, self._element(step.variable, listed))
+        body = [*element, *_merged(self._steps(step.body, depth + 1))]
+        each = Op.EACH_BYTE if listed.is_octets else Op.EACH
+        yield Operation(each, listed.slot, size=len(body) + 1), step.span
         yield from body
-        yield Operation(Op.AGAIN)
+        yield Operation(Op.AGAIN), step.span
 
     def _element(self, variable: str, listed: Listed) -> Code:
         """What makes the element on the stack be `variable`."""
@@ -112,6 +123,10 @@ class MessageWriter:
         kind = type_of(listed.field)
         names.values[variable] = slot, Integer(0, 255) if isinstance(kind, Octets) and listed.is_octets else kind
         return Operation(Op.KEEP, slot), Operation(Op.DROP)
+
+
+def _at(span: SourceSpan, code: Code) -> Iterator[Placed]:
+    return ((operation, span) for operation in code)
 
 
 def _known(data: bytes, alignment: int) -> Operation:
@@ -138,18 +153,19 @@ def _copies_octets(step: Repeat) -> bool:
     return False
 
 
-def _merged(operations: Iterable[Operation]) -> Iterator[Operation]:
+def _merged(placed: Iterable[tuple[Operation, P]]) -> Iterator[tuple[Operation, P]]:
     """Known bytes that stand beside each other as one, where the padding between them does not depend on the offset."""
-    last: Operation | None = None
-    for operation in operations:
-        if last is None or not _follows(last, operation):
+    last: tuple[Operation, P] | None = None
+    for operation, place in placed:
+        if last is None or not _follows(last[0], operation):
             if last is not None:
                 yield last
-            last = operation
+            last = operation, place
             continue
-        padding = bytes(-last.size % operation.slot)  # type: ignore[operator]  # an alignment
-        data = last.data + padding + operation.data
-        last = last._replace(data=data, size=len(data))
+        before, first = last
+        padding = bytes(-before.size % operation.slot)  # type: ignore[operator]  # an alignment
+        data = before.data + padding + operation.data
+        last = before._replace(data=data, size=len(data)), first
     if last is not None:
         yield last
 
