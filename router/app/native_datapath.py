@@ -92,7 +92,6 @@ class NativeDatapath:
         self._context = context
         self._names = Names()
         self._generations = count(1)
-        self._published_before = 0  # bytes in the ring of what the earlier program received
         context.counts.most = MOST_COUNTERS
         self._wiring: NativeWiring | None = None
         self._is_running = False
@@ -220,7 +219,7 @@ class NativeDatapath:
                 native.generation,
                 {numbers[route]: function for route, function in functions[part].items()},
                 native.sources,
-                partial(self._switch, part, states, waits=part is Part.TOPICS and leaves_native),
+                partial(self._switch, part, states, after=native.generation if leaves_native else None),
             )
             for part in OF_PYTHON
         }
@@ -271,14 +270,14 @@ class NativeDatapath:
         key = "deadman", plan, tuple(senders.values())
         return states[_ENDPOINTS].keep(key, lambda: self._deadmen.add(plan, program.counters, senders))
 
-    def _switch(self, part: Part, states: States, *, waits: bool) -> None:
+    def _switch(self, part: Part, states: States, after: int | None) -> None:
         """End the timers that only the earlier program had, once its messages are served.
 
-        What waits for an endpoint may have come by any of its timers, which end before the pacer. `waits`: a topic was
-        published on by the native thread, whose messages come first.
+        What waits for an endpoint may have come by any of its timers, which end before the pacer. `after` is the
+        generation that the native thread has to reach before, since its messages on a topic come first.
         """
-        if waits:
-            self._publishing.wait_until_passed(self._publishing.ring.written, _PATIENCE_S)
+        if part is Part.TOPICS and after is not None:
+            self._publishing.wait_for(after, _PATIENCE_S)
         left = list(states[OF_PYTHON[part]].left())
         if part is Part.DESTINATIONS:
             left += states[_ENDPOINTS].left()
@@ -324,14 +323,15 @@ class NativeDatapath:
         generation = wiring.native.generation
         holds = _endpoints(earlier.program, by_carrier=False) & _endpoints(wiring.program, by_carrier=True)
         holds_topics = _topics(earlier.program, by_carrier=False) & _topics(wiring.program, by_carrier=True)
-        self._publishing.hold(is_held=bool(holds_topics))
+        if holds_topics:
+            self._publishing.hold(generation)
         self._carrier.change(
             wiring.native,
             [(next_one.address, before.address) for next_one, before in replaced],
             [before.address for before in ended],
             holds=bool(holds),
         )
-        self._published_before = self._publishing.ring.written
+        self._publishing.advance(generation)
         for worker in self._workers.values():
             worker.advance(generation)
         if holds:  # what waits for Python is sent before what the carrier receives from now on
@@ -339,7 +339,7 @@ class NativeDatapath:
             self._carrier.resume()
         if holds_topics:
             self._workers[Part.TOPICS].wait_for(generation, _PATIENCE_S)
-            self._publishing.hold(is_held=False)
+            self._publishing.hold(0)
 
     def start(self) -> None:
         assert self._wiring is not None  # noqa: S101 - `adopt` was called
@@ -354,7 +354,7 @@ class NativeDatapath:
         if not self._is_running:
             return True
         late = left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
-        has_published = self._publishing.wait_until_passed(self._published_before, _PATIENCE_S)
+        has_published = self._publishing.wait_for(wiring.native.generation, _PATIENCE_S)
         return not late and has_published and all(commands.has_passed for commands in self._commands)
 
     def observe(self, *, is_observed: bool) -> None:

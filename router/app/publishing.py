@@ -46,13 +46,19 @@ class Publishing:
         """Return the first counters, as they are between two messages."""
         return self._thread.counters(count) if self._thread else list(self._counts[:count])
 
-    def wait_until_passed(self, position: int, timeout: float) -> bool:
-        return self._thread is None or self._thread.wait_until_passed(position, timeout)
-
-    def hold(self, *, is_held: bool) -> None:
-        """Have the thread keep what it takes until it is no longer held."""
+    def advance(self, generation: int) -> None:
+        """Go on to that generation once all earlier messages are published: none of them can come any more."""
         if self._thread is not None:
-            self._thread.hold(is_held=is_held)
+            self._thread.advance(generation)
+
+    def wait_for(self, generation: int, timeout: float) -> bool:
+        """Wait until nothing of earlier generations is in use. Return False after `timeout` s."""
+        return self._thread is None or self._thread.wait_for(generation, timeout)
+
+    def hold(self, generation: int) -> None:
+        """Publish nothing of that generation or a later one, until this is called with 0."""
+        if self._thread is not None:
+            self._thread.hold(generation)
 
     def stalled(self) -> tuple[str, float] | None:
         """The topic in whose publisher the thread is now, and for how many seconds."""

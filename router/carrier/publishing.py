@@ -188,20 +188,26 @@ class PublishThread:
             self._library.publishing_counters(self._address, copy, count)
         return list(copy)
 
-    def wait_until_passed(self, position: int, timeout: float) -> bool:
-        """Wait until nothing is in use that came into the ring before so many bytes. Return False after `timeout` s."""
+    def advance(self, generation: int) -> None:
+        """Go on to that generation once all earlier messages are served: none of them can come any more."""
+        with self._in_use:
+            if self._address:
+                self._library.publishing_advance(self._address, generation)
+
+    def wait_for(self, generation: int, timeout: float) -> bool:
+        """Wait until nothing of earlier generations is in use. Return False after `timeout` s."""
         for _ in range(int(timeout / _POLL_S)):
             with self._in_use:
-                if not self._address or self._library.publishing_has_passed(self._address, position):
+                if not self._address or self._library.publishing_has_reached(self._address, generation):
                     return True
             sleep(_POLL_S)
         return False
 
-    def hold(self, *, is_held: bool) -> None:
-        """Have the thread keep what it takes until it is no longer held."""
+    def hold(self, generation: int) -> None:
+        """Serve nothing of that generation or a later one, until this is called with 0."""
         with self._in_use:
             if self._address:
-                self._library.publishing_hold(self._address, is_held)
+                self._library.publishing_hold(self._address, generation)
 
     def stalled(self) -> tuple[int, float] | None:
         """The topic in whose publisher the thread is now, by its number, and for how many seconds; None if in none."""

@@ -12,13 +12,15 @@ struct publishing {
     pthread_t thread;
     pthread_mutex_t lock; /* held by the thread, unless it waits or is in the middleware */
     pthread_cond_t changed;
-    bool has_ended, is_left, is_held; /* under the lock */
+    bool has_ended, is_left; /* under the lock */
+    uint32_t held;           /* likewise: a generation, or 0 */
     _Atomic bool is_stopping;
+    _Atomic uint32_t latest; /* generation */
     /* Written by the thread: */
-    edition edition;          /* of the counters */
-    _Atomic uint64_t passed;  /* of the ring: nothing in front of it is in use */
-    _Atomic int64_t since;    /* when it entered the middleware, or 0 */
-    _Atomic uint32_t topic;   /* where it did */
+    edition edition;             /* of the counters */
+    _Atomic uint32_t generation; /* nothing of an earlier one is in use */
+    _Atomic int64_t since;       /* when it entered the middleware, or 0 */
+    _Atomic uint32_t topic;      /* where it did */
     /* Of the thread: */
     struct ring *ring;
     counter *counters;
@@ -61,13 +63,15 @@ static void lose(struct publishing *publishing, const struct served *served, con
 
 /* ---- the middleware ---- */
 
-/* Publish what was composed, without the lock. Return false if the thread was left meanwhile. */
+/* Publish what was composed, without the lock. The counters balance meanwhile: the message waits. Return false if the
+ * thread was left. */
 static bool publish_composed(struct publishing *publishing, const struct served *served, const struct publish_target *target) {
     struct composed *composed = &publishing->composer.message;
     struct serialized_message message = {composed->data, composed->size, composed->capacity, ALLOCATOR};
     const void *publisher = target->topic->publisher;
     atomic_store_explicit(&publishing->topic, target->topic->id, memory_order_relaxed);
     atomic_store_explicit(&publishing->since, monotonic_ns(), memory_order_release);
+    edition_end(&publishing->edition);
     pthread_mutex_unlock(&publishing->lock);
     int error = publishing->publish(publisher, &message, NULL);
     struct error_text why = {""};
@@ -76,6 +80,7 @@ static bool publish_composed(struct publishing *publishing, const struct served 
         publishing->reset();
     }
     pthread_mutex_lock(&publishing->lock);
+    edition_begin(&publishing->edition);
     atomic_store_explicit(&publishing->since, 0, memory_order_relaxed);
     if (publishing->is_left) return false;
     if (error) lose(publishing, served, target, LOSS_PUBLISH_ERROR, PLACE_UNKNOWN, why.text);
@@ -155,16 +160,25 @@ static bool serve(struct publishing *publishing, const struct message_record *re
 
 /* Take messages, without the lock. Return how many bytes they have. */
 static size_t take(struct publishing *publishing, bool waits) {
-    atomic_store(&publishing->passed, ring_taken(publishing->ring));
     pthread_mutex_unlock(&publishing->lock);
     size_t size = ring_take(publishing->ring, publishing->records, sizeof publishing->records, waits ? -1 : 0);
     pthread_mutex_lock(&publishing->lock);
     return size;
 }
 
+/* Go on to a generation, unless it was reached, and wait there while it is held. */
+static void reach(struct publishing *publishing, uint32_t generation) {
+    if (generation <= atomic_load(&publishing->generation)) return;
+    atomic_store(&publishing->generation, generation);
+    while (publishing->held && publishing->held <= generation && !atomic_load(&publishing->is_stopping))
+        pthread_cond_wait(&publishing->changed, &publishing->lock);
+}
+
+/* Serve what was taken. Return false if the thread was left meanwhile. */
 static bool serve_all(struct publishing *publishing, size_t size) {
     for (size_t at = 0; at < size;) {
         const struct message_record *record = (const struct message_record *)(publishing->records + at);
+        reach(publishing, record->generation);
         edition_begin(&publishing->edition);
         bool goes_on = serve(publishing, record);
         edition_end(&publishing->edition);
@@ -179,10 +193,12 @@ static void *publishing_thread(void *of) {
     run_soon();
     pthread_mutex_lock(&publishing->lock);
     for (;;) {
-        bool is_stopping = atomic_load(&publishing->is_stopping); /* what is there by now is served */
-        size_t size = take(publishing, !is_stopping);
-        while (publishing->is_held) pthread_cond_wait(&publishing->changed, &publishing->lock);
-        if (!serve_all(publishing, size) || (is_stopping && !size)) break;
+        /* Read before the ring: what is there by now is served, and what comes later is of this generation at least. */
+        uint32_t latest = atomic_load(&publishing->latest);
+        bool is_stopping = atomic_load(&publishing->is_stopping);
+        size_t size = take(publishing, !is_stopping && latest <= atomic_load(&publishing->generation));
+        if (publishing->is_left || !serve_all(publishing, size) || (is_stopping && !size)) break;
+        if (!size) reach(publishing, latest);
     }
     publishing->has_ended = true;
     pthread_cond_broadcast(&publishing->changed);
@@ -222,13 +238,18 @@ struct publishing *publishing_open(struct ring *ring, counter *counters, struct 
     return publishing;
 }
 
-bool publishing_has_passed(struct publishing *publishing, uint64_t written) {
-    return atomic_load(&publishing->passed) >= written;
+void publishing_advance(struct publishing *publishing, uint32_t generation) {
+    atomic_store(&publishing->latest, generation);
+    ring_wake(publishing->ring);
 }
 
-void publishing_hold(struct publishing *publishing, bool is_held) {
+bool publishing_has_reached(struct publishing *publishing, uint32_t generation) {
+    return atomic_load(&publishing->generation) >= generation;
+}
+
+void publishing_hold(struct publishing *publishing, uint32_t generation) {
     pthread_mutex_lock(&publishing->lock);
-    publishing->is_held = is_held;
+    publishing->held = generation;
     pthread_cond_broadcast(&publishing->changed);
     pthread_mutex_unlock(&publishing->lock);
 }
@@ -244,6 +265,7 @@ bool publishing_stop(struct publishing *publishing) {
     atomic_store(&publishing->is_stopping, true);
     ring_wake(publishing->ring);
     pthread_mutex_lock(&publishing->lock);
+    pthread_cond_broadcast(&publishing->changed); /* if it is held */
     while (!publishing->has_ended && !pthread_cond_timedwait(&publishing->changed, &publishing->lock, &until)) {}
     bool has_ended = publishing->has_ended;
     publishing->is_left = !has_ended;

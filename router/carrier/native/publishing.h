@@ -54,11 +54,15 @@ struct publishing;
 struct publishing *publishing_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish,
                                    error_function *error, reset_function *reset);
 
-/* Whether nothing is in use that came into the ring before its writer had written so many bytes. */
-bool publishing_has_passed(struct publishing *publishing, uint64_t written);
+/* Have the thread go on to a generation once all that is in the ring is served: nothing of an earlier one comes any more. */
+void publishing_advance(struct publishing *publishing, uint32_t generation);
 
-/* Have the thread keep what it takes until it is resumed: another one serves first what belongs in front. */
-void publishing_hold(struct publishing *publishing, bool is_held);
+/* Whether the thread uses nothing of earlier generations any more. */
+bool publishing_has_reached(struct publishing *publishing, uint32_t generation);
+
+/* Have the thread serve nothing of that generation or a later one until it is called with 0: others serve first what
+ * belongs in front. */
+void publishing_hold(struct publishing *publishing, uint32_t generation);
 
 /* The topic in whose publisher the thread is now, by its id, and since when (monotonic); 0 if in none. */
 int64_t publishing_since(struct publishing *publishing, uint32_t *topic);
