@@ -11,7 +11,7 @@ import pytest
 from router.carrier.build import LIBRARY, build, is_current
 from router.carrier.library import load
 from router.compiler.lookup import Definitions
-from tests.carrier import building
+from tests.carrier import building, compositions
 from tests.carrier.building import sanitized_library
 
 SANITIZED = "CARRIER_TESTED_WITH_SANITIZERS"
@@ -42,3 +42,10 @@ def seams(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 @pytest.fixture(scope="session")
 def definitions() -> Definitions:
     return Definitions()
+
+
+@pytest.fixture(scope="session")
+def composing(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    """The publish thread's functions: see composing.c."""
+    made = tmp_path_factory.mktemp("carrier") / "composing.so"
+    return compositions.composing(made, SANITIZED in os.environ)

@@ -31,15 +31,16 @@ MakeEnvelope = Callable[[Any], bytes]
 @cache
 def made_wire() -> Wire:
     """The definitions in `protos/made`."""
-    return _wire(Path(__file__).parent / "protos", "made.Envelope")
+    return wire_of(Path(__file__).parent / "protos", "made.Envelope")
 
 
 @cache
 def rover_wire() -> Wire:
-    return _wire(PROTOS, "PBEnvelope")
+    return wire_of(PROTOS, "PBEnvelope")
 
 
-def _wire(root: Path, name: str) -> Wire:
+def wire_of(root: Path, name: str) -> Wire:
+    """The definitions in a folder, with an envelope whose oneof is `payload`."""
     schema = load_protos(Located(root, SPAN), Located(name, SPAN))
     return schema, find_envelope(schema, Located("payload", SPAN))
 
