@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from contextlib import closing
 from itertools import permutations
@@ -58,6 +59,7 @@ def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
         "    CDR: 8 bytes\n"
         "    when accel_x > 1 or accel_y > 1\n"
         "    data  float32  <-  accel_x * 2  : float32\n"
+        "    by the carrier\n"
         "\n"
     )
 
@@ -70,7 +72,96 @@ def test_who_serves_commands_from_ros_is_told(tmp_path: Path, capsys: pytest.Cap
     assert [line.strip() for line in told.splitlines() if line.startswith("    by ")] == [
         "by the carrier",
         f"by Python: `target_x: target_x * 2` needs it; its freshness is Python's  ({table}:3:42)",
+        "by the carrier",
     ]
+
+
+PROTO = """\
+syntax = "proto3";
+message Reading { float value = 1; map<string, string> words = 2; string text = 3; uint32 part = 4; }
+message PBEnvelope {
+  oneof payload {
+    Reading plain = 1; Reading decimal = 2; Reading newest = 3; Reading frame = 4; Reading sharing = 5;
+    Reading mapped = 6; Reading wide = 7; Reading sent = 8;
+  }
+}
+"""
+PUBLISHING = """\
+version: 1
+envelope: {protos: ., message: PBEnvelope, oneof: payload}
+listen: {here: {address: "127.0.0.1:25000"}}
+endpoints: {board: {address: "127.0.0.2:8", kind: board}}
+routes:
+  plain:
+    source: board
+    topics:
+      - {topic: a, type: std_msgs/msg/Float32, when: value > 1, max_rate: 5 Hz, fields: {data: value * 2}}
+      - {topic: b, type: std_msgs/msg/Header, fields: {frame_id: text + "!"}}
+    ttl: 1s
+  decimal:
+    source: board
+    topics: [{topic: c, type: std_msgs/msg/String, fields: {data: str(value)}}]
+  newest:
+    source: board
+    topics: [{topic: d, type: std_msgs/msg/Float32, max_rate: 5 Hz, keep: latest, fields: {data: value}}]
+  frame:
+    source: board
+    collect: {by: part, count: 2, order: part, timeout: 50ms}
+    topics: [{topic: e, type: std_msgs/msg/Float32, fields: {data: "items[0].value"}}]
+  sharing:
+    source: board
+    topics: [{topic: c, type: std_msgs/msg/String, fields: {data: text}}]
+  mapped:
+    source: board
+    topics: [{topic: f, type: diagnostic_msgs/msg/DiagnosticStatus, fields: {values: words}}]
+  wide:
+    source: board
+    topics: [{topic: g, type: wide_msgs/msg/Wide, when: value > 1, fields: {data: text}}]
+"""
+
+
+@pytest.fixture
+def publishing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A table in the working directory that publishes what the carrier can fill, and what only Python can."""
+    (tmp_path / "readings.proto").write_text(PROTO)
+    message = tmp_path / "share" / "wide_msgs" / "msg" / "Wide.msg"
+    message.parent.mkdir(parents=True)
+    message.write_text("wstring data\n")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}:{os.environ.get('AMENT_PREFIX_PATH', '')}")
+    monkeypatch.chdir(tmp_path)
+    path = Path("table.yaml")
+    path.write_text(PUBLISHING)
+    return path
+
+
+def test_who_publishes_on_a_topic_is_told_and_what_needs_python(
+    publishing: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = explained(capsys, publishing, "--no-code")
+    lines = re.findall(r"^  topic (\w)|^    by (.*)$", told, re.MULTILINE)
+    topics, executors = [topic for topic, _ in lines if topic], [by for _, by in lines if by]
+    assert list(zip(topics, executors, strict=True)) == [
+        ("a", "the carrier"),
+        ("b", "the carrier"),
+        ("c", "Python: `data: str(value)` needs it: only Python writes a float as text  (table.yaml:14:67)"),
+        ("d", "Python: `keep: latest` needs it  (table.yaml:17:15)"),
+        ("e", "Python: `collect` needs it  (table.yaml:20:5)"),
+        ("c", "Python: it shares 'c' with decimal, which needs Python  (table.yaml:14:15)"),
+        ("f", "Python: `values: words` needs it: it reads a map  (table.yaml:27:86)"),
+        ("g", "Python: `data: text` needs it: the carrier writes no wide strings  (table.yaml:30:83)"),
+    ]
+
+
+def test_the_difference_of_two_tables_leaves_out_who_publishes(
+    publishing: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("old.yaml").write_text(PUBLISHING.replace("str(value)", "text"))
+    assert main(["explain", "--diff", "old.yaml", str(publishing)]) == OK
+    told = capsys.readouterr().out
+    assert "str(value)" in told
+    assert "carrier" not in told
+    assert "Python" not in told
+    assert "route sharing" not in told
 
 
 def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_element(

@@ -187,7 +187,8 @@ class Lowering:
     def listed(self, node: ast.expr) -> Listed:
         """The list that an expression is."""
         if (member := _member(node)) is None:
-            raise NeedsPython("it makes a list")
+            is_map = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "entries"
+            raise NeedsPython("it reads a map" if is_map else "it makes a list")
         code, holder = self.message(member[0])
         declared = _readable(holder, member[1])
         is_octets = declared.type == FieldDescriptor.TYPE_BYTES
