@@ -1,4 +1,4 @@
-/* Evaluates the expressions of a topic, and writes its message as CDR: by a program that router/compiler/publishing.py
+/* Evaluates the expressions of a topic, and writes its message as CDR: by a program that router/compiler/lowering
  * makes of the same plan as the generated Python, with the same result to the last bit.
  *
  * Operations take their operands from a stack of values, and leave the result there. The compiler knows the type of each

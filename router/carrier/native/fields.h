@@ -1,7 +1,7 @@
 /* Reads the fields of a payload that a route's topics use into slots, as the protobuf library would parse them: the last
  * of several values counts, messages that come in parts are merged, and a member of a oneof clears the others.
  *
- * router/compiler/publishing.py says which fields these are. The carrier has checked the payload (envelope.h); what is
+ * router/compiler/lowering says which fields these are. The carrier has checked the payload (envelope.h); what is
  * not well formed all the same is refused. */
 #ifndef FIELDS_H
 #define FIELDS_H
