@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import socket
 import struct
 import subprocess
@@ -248,6 +249,38 @@ def test_metrics_tell_on_which_topics_a_publisher_is_stuck(site: Site, monkeypat
         monkeypatch.setattr(runtime.datapath, "stalled", lambda: ("ph", 2.5))
         monkeypatch.setattr(runtime._ros, "stalled", lambda: iter([("ph", 1.5), ("other", 0.009)]))
         assert stalled() == {"ph": 2.5, "other": 0}
+
+
+def test_metrics_tell_where_the_native_thread_is_stuck_while_forwarding_goes_on(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rcl = pytest.importorskip("router.ros.rcl", reason="needs ROS 2")
+    goes_on = threading.Event()
+
+    def block(*_: object) -> int:
+        goes_on.wait(10)
+        return 0
+
+    blocking = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(block)
+    functions = rcl.publish_functions()._replace(publish=ctypes.cast(blocking, ctypes.c_void_p).value)
+    monkeypatch.setattr(rcl, "publish_functions", lambda: functions)
+    wanted = TOPIC.replace("queue_depth: 10", "qos: {durability: transient_local}")
+    with Router(site.program(ROUTE + wanted)) as router:
+        if not isinstance(router._runtime.datapath, NativeDatapath):
+            pytest.skip("of the carrier")
+
+        def stalled() -> float:
+            return router._runtime.stalled()["ph"]
+
+        site.send(PH)
+        wait_until(lambda: stalled() >= 0.01)
+        site.send(PH)
+        assert [site.basestation.recv(1000) for _ in range(2)] == [PH, PH]
+        before = stalled()
+        wait_until(lambda: stalled() > before)
+        goes_on.set()
+        wait_until(lambda: stalled() == 0)
+    assert router.totals()["messages_published"] == 2
 
 
 def test_a_failing_mapping_is_told_once_with_the_line_of_the_table(site: Site) -> None:
