@@ -7,7 +7,7 @@ import os
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from ctypes import c_bool, c_int, c_int64, c_size_t, c_void_p
+from ctypes import POINTER, c_bool, c_char_p, c_int, c_int64, c_size_t, c_uint, c_void_p
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,7 +24,19 @@ from tests.engine.rig import Ledger
 
 MOST_COUNTERS = 1 << 16
 
-_MIDDLEWARE: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
+
+class Serialized(ctypes.Structure):
+    """The beginning of `struct serialized_message`."""
+
+    _fields_ = (("buffer", c_void_p), ("length", c_size_t))
+
+
+_MIDDLEWARE: Mapping[str, tuple[Any, tuple[type, ...]]] = {
+    "middleware_advertise": (c_void_p, ()),
+    "middleware_callers": (c_int, (c_void_p,)),
+    "middleware_count": (c_size_t, (c_void_p,)),
+    "middleware_impede": (None, (c_void_p, c_bool, c_uint, c_char_p)),
+    "middleware_message": (POINTER(Serialized), (c_void_p, c_size_t)),
     "middleware_open": (c_void_p, ()),
     "middleware_put": (None, (c_void_p, c_void_p, c_size_t, c_int64, c_int64)),
     "middleware_set": (None, (c_void_p, c_bool, c_bool)),

@@ -1,0 +1,296 @@
+/* Programs replace each other without a pause while datagrams come as fast as they can and are published, by a middleware
+ * that takes its time now and then, refuses, and is stuck at last. Generations are held and resumed, counters are read,
+ * and all ends at some moment. Fails unless each topic gets its messages in order and from a program that is alive, and
+ * the counters balance; sanitizers see the rest. A program is freed as soon as nobody can use it. */
+#include "publishing.h"
+
+#include <pthread.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include "clock.h"
+
+enum { ROUNDS = 12, PROGRAMS = 24, TOPICS = 2, QUEUE = 1 << 12, ALIVE = 0x600d, NUMBER = 2, SLOTS = 3 };
+/* Counters of each topic behind those of the listener and of the route. */
+enum { RECEIVED, BYTES, PADDED, REJECTED, UNKNOWN = REJECTED + REASONS, ACCEPTED, LAST, DURATION, TOPIC = DURATION + 14 };
+enum { WAITING, QUEUE_FULL, FILTERED, PUBLISHED, STALE, LIMITED, MAPPING, NON_FINITE, REFUSED, OF_TOPIC };
+enum { COUNTERS = TOPIC + TOPICS * OF_TOPIC };
+
+/* All that a program refers to. */
+struct made {
+    struct program program;
+    struct listener listener;
+    struct entry entry;
+    struct payload_case only;
+    struct route route;
+    struct part part;
+    struct waiting waiting[TOPICS];
+    const uint8_t *wanted[TOPICS];
+    struct publish_route publish;
+    struct publish_target targets[TOPICS];
+    struct publish_topic topics[TOPICS];
+    struct node_field of_payload, of_envelope;
+    struct node nodes[2];
+    struct value defaults[SLOTS], source;
+    struct operation operations[2];
+    uint32_t publishers[TOPICS]; /* ALIVE and their index */
+};
+
+/* All of a round. */
+struct stage {
+    counter *received, *published;
+    struct ring *events, *rejections, *messages;
+    struct deadmen *deadmen;
+    struct carrier *carrier;
+    struct publishing *publishing;
+    int socket;
+};
+
+static const struct wire_field of_envelope[] = {{1, WIRE_MESSAGE, WIRE_CASE | WIRE_ROUTED, 1}};
+static const struct wire_field of_payload[] = {{1, WIRE_VARINT, 0, 0}};
+static const struct wire_type types[] = {{of_envelope, 1, 0}, {of_payload, 1, 1}};
+static const struct wire_schema schema = {types, 2};
+
+static struct limit limit = {1000, 500, -1000};
+static uint8_t wanted[TOPICS] = {1, 1};
+static uint32_t latest[TOPICS]; /* numbers that were published; of the thread */
+static _Atomic bool is_stuck, has_ended;
+static _Atomic uint32_t inside;
+static struct publishing *left[ROUNDS]; /* by the caller, with what they hold */
+
+static void check(bool holds, const char *what) {
+    if (holds) return;
+    printf("failed: %s\n", what);
+    exit(1);
+}
+
+/* ---- the middleware ---- */
+
+static int publish(const void *publisher, const void *of, void *unused) {
+    static unsigned random = 1;
+    const struct serialized_message *message = of;
+    uint32_t kept = *(const uint32_t *)publisher, number;
+    (void)unused;
+    check(kept / TOPICS == ALIVE, "the publisher is alive");
+    check(message->length == 8, "the message is whole");
+    memcpy(&number, message->buffer + 4, sizeof number);
+    check(number > latest[kept % TOPICS], "messages are in order");
+    latest[kept % TOPICS] = number;
+    unsigned chosen = (unsigned)rand_r(&random) % 1000;
+    if (chosen < 20) usleep(chosen * 100);
+    atomic_fetch_add(&inside, 1);
+    while (atomic_load(&is_stuck)) usleep(100);
+    atomic_fetch_sub(&inside, 1);
+    return chosen == 999;
+}
+
+static struct error_text why(void) { return (struct error_text){"there is no room"}; }
+
+static void forget(void) {}
+
+/* ---- programs ---- */
+
+static uint32_t topic_counter(int topic, int which) { return (uint32_t)(TOPIC + topic * OF_TOPIC + which); }
+
+static void make_target(struct made *made, int index) {
+    made->publishers[index] = (uint32_t)(ALIVE * TOPICS + index);
+    made->topics[index] = (struct publish_topic){&made->publishers[index], &wanted[index], (uint32_t)index + 1, 0};
+    made->wanted[index] = &wanted[index];
+    made->waiting[index] = (struct waiting){(uint32_t)index + 1, topic_counter(index, WAITING),
+                                            topic_counter(index, QUEUE_FULL), topic_counter(index, FILTERED)};
+    made->targets[index] = (struct publish_target){
+        .topic = &made->topics[index], .operations = made->operations, .operation_count = 2,
+        .condition = index ? made->operations : NULL, .condition_count = (uint32_t)index, .limit = index ? &limit : NULL,
+        .published = topic_counter(index, PUBLISHED), .waiting = topic_counter(index, WAITING),
+        .filtered = topic_counter(index, FILTERED), .stale = topic_counter(index, STALE),
+        .rate_limited = topic_counter(index, LIMITED), .mapping_error = topic_counter(index, MAPPING),
+        .non_finite = topic_counter(index, NON_FINITE), .publish_error = topic_counter(index, REFUSED)};
+}
+
+static struct made *make(const struct stage *stage, uint32_t generation) {
+    struct made *made = calloc(1, sizeof *made);
+    check(made, "memory");
+    made->of_payload = (struct node_field){.number = 1, .type = TYPE_UINT32, .slot = NUMBER, .presence = NONE, .node = NONE,
+                                           .choice = NONE};
+    made->of_envelope = (struct node_field){.number = 1, .type = TYPE_MESSAGE, .slot = NONE, .presence = NONE,
+                                            .node = NODE_PAYLOAD, .choice = NONE};
+    made->nodes[NODE_PAYLOAD] = (struct node){&made->of_payload, 1, 0, 0};
+    made->nodes[NODE_ENVELOPE] = (struct node){&made->of_envelope, 1, 0, 0};
+    made->operations[0] = (struct operation){.kind = OP_LOAD, .slot = NUMBER};
+    made->operations[1] = (struct operation){.kind = OP_PUT, .slot = 4};
+    for (int index = 0; index < TOPICS; index++) make_target(made, index);
+    made->publish = (struct publish_route){.ttl = generation % 2 ? 0 : 5000000, .nodes = made->nodes,
+                                           .defaults = made->defaults, .sources = &made->source, .targets = made->targets,
+                                           .slot_count = SLOTS, .target_count = TOPICS};
+    made->part = (struct part){.ring = stage->messages, .publishes = &made->publish, .wanted = made->wanted,
+                               .targets = made->waiting, .wanted_count = TOPICS, .target_count = TOPICS};
+    made->route = (struct route){.parts = &made->part, .part_count = 1, .last_message = LAST, .duration = DURATION};
+    made->only = (struct payload_case){.number = 1, .unhandled = UNKNOWN};
+    made->entry = (struct entry){0, ACCEPTED};
+    made->listener = (struct listener){.fd = stage->socket, .entries = &made->entry, .columns = 1, .received = RECEIVED,
+                                       .received_bytes = BYTES, .padded = PADDED};
+    for (int reason = 0; reason < REASONS; reason++) made->listener.rejected[reason] = (uint32_t)(REJECTED + reason);
+    made->program = (struct program){.generation = generation, .listener_count = 1, .case_count = 1,
+                                     .unknown_case = UNKNOWN, .schema = &schema, .listeners = &made->listener,
+                                     .cases = &made->only, .routes = &made->route};
+    return made;
+}
+
+/* Free a program that nothing in the ring refers to. The receive thread may just be dropping such a message. */
+static void free_made(const struct stage *stage, struct made *made) {
+    uint64_t turns = carrier_turns(stage->carrier);
+    while (carrier_turns(stage->carrier) == turns) usleep(50);
+    memset(made, 0, sizeof *made);
+    free(made);
+}
+
+static struct made *replace_all(const struct stage *stage, struct made *running) {
+    for (uint32_t generation = 2; generation <= PROGRAMS; generation++) {
+        struct made *next = make(stage, generation);
+        struct change change = {.program = &next->program};
+        if (generation % 3 == 0) publishing_hold(stage->publishing, generation);
+        carrier_change(stage->carrier, &change);
+        publishing_advance(stage->publishing, generation);
+        __atomic_store_n(&wanted[0], generation % 5 != 0, __ATOMIC_RELAXED);
+        usleep(generation % 7 * 300);
+        while (!publishing_has_reached(stage->publishing, generation)) usleep(100);
+        free_made(stage, running);
+        running = next;
+        if (generation < PROGRAMS) publishing_hold(stage->publishing, 0); /* the last one is held to the end */
+    }
+    return running;
+}
+
+/* ---- other threads ---- */
+
+static size_t make_datagram(uint32_t number, uint8_t *data) {
+    size_t size = 3;
+    for (data[0] = 0x0a, data[2] = 8; number > 0x7f; number >>= 7) data[size++] = (uint8_t)(number | 0x80);
+    data[size++] = (uint8_t)number;
+    data[1] = (uint8_t)(size - 2);
+    return size;
+}
+
+static void *send_datagrams(void *of) {
+    const struct stage *stage = of;
+    int from = socket(AF_INET, SOCK_DGRAM, 0);
+    struct sockaddr_in to;
+    socklen_t length = sizeof to;
+    getsockname(stage->socket, (struct sockaddr *)&to, &length);
+    for (uint32_t number = 1; !atomic_load(&has_ended); number++) {
+        uint8_t data[8];
+        sendto(from, data, make_datagram(number, data), 0, (struct sockaddr *)&to, sizeof to);
+    }
+    close(from);
+    return NULL;
+}
+
+/* Whatever a topic no longer waits for has become of something. */
+static void check_balance(const int64_t *counts) {
+    for (int topic = 0; topic < TOPICS; topic++) {
+        int64_t sum = counts[topic_counter(topic, WAITING)];
+        for (int which = FILTERED; which <= REFUSED; which++) sum += counts[topic_counter(topic, which)];
+        check(sum == 0, "each message that was served is counted once");
+    }
+}
+
+static void *watch(void *of) {
+    const struct stage *stage = of;
+    static uint64_t records[4096];
+    int64_t counts[COUNTERS];
+    uint32_t topic;
+    while (!atomic_load(&has_ended)) {
+        if (publishing_counters(stage->publishing, counts, COUNTERS)) check_balance(counts);
+        if (publishing_since(stage->publishing, &topic)) check(topic <= TOPICS, "it is a topic");
+        carrier_pulse(stage->carrier);
+        ring_take(stage->events, records, sizeof records, 1);
+    }
+    return NULL;
+}
+
+/* ---- rounds ---- */
+
+static void open_stage(struct stage *stage) {
+    struct sockaddr_in any = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
+    stage->received = calloc(COUNTERS, sizeof *stage->received);
+    stage->published = calloc(COUNTERS, sizeof *stage->published);
+    stage->events = ring_open(1 << 14);
+    stage->rejections = ring_open(1 << 12);
+    stage->messages = ring_open(QUEUE);
+    stage->deadmen = deadmen_open(stage->received, stage->rejections);
+    stage->carrier = carrier_open(stage->deadmen, stage->received, stage->rejections);
+    stage->socket = socket(AF_INET, SOCK_DGRAM, 0);
+    check(!bind(stage->socket, (struct sockaddr *)&any, sizeof any), "bind");
+    stage->publishing = publishing_open(stage->messages, stage->published, stage->events, publish, why, forget);
+    check(stage->publishing, "the thread starts");
+}
+
+static void close_stage(struct stage *stage) {
+    carrier_close(stage->carrier);
+    deadmen_close(stage->deadmen);
+    ring_close(stage->messages);
+    ring_close(stage->events);
+    ring_close(stage->rejections);
+    free(stage->received);
+    free(stage->published);
+    close(stage->socket);
+}
+
+/* All that was received came to something. */
+static void check_accounts(const struct stage *stage) {
+    check_balance((const int64_t *)stage->published);
+    for (int topic = 0; topic < TOPICS; topic++) {
+        int64_t sum = 0;
+        for (int which = WAITING; which <= REFUSED; which++)
+            sum += stage->received[topic_counter(topic, which)] + stage->published[topic_counter(topic, which)];
+        check(sum == stage->received[ACCEPTED], "each message is counted once");
+        check(!(stage->received[topic_counter(topic, WAITING)] + stage->published[topic_counter(topic, WAITING)]),
+              "nothing waits");
+    }
+}
+
+/* Play a round. In some, the thread is stuck at the end, and left. */
+static void play(int round) {
+    struct stage stage;
+    bool gets_stuck = round % 4 == 3;
+    memset(latest, 0, sizeof latest);
+    open_stage(&stage);
+    struct made *first = make(&stage, 1);
+    struct change start = {.program = &first->program};
+    check(!carrier_start(stage.carrier, &start), "the carrier starts");
+    pthread_t sending, watching;
+    atomic_store(&has_ended, false);
+    pthread_create(&sending, NULL, send_datagrams, &stage);
+    pthread_create(&watching, NULL, watch, &stage);
+    struct made *last = replace_all(&stage, first);
+    if (gets_stuck) {
+        publishing_hold(stage.publishing, 0);
+        __atomic_store_n(&wanted[0], 1, __ATOMIC_RELAXED);
+        atomic_store(&is_stuck, true);
+        while (!atomic_load(&inside)) usleep(100);
+    }
+    usleep((unsigned)round * 100);
+    atomic_store(&has_ended, true);
+    pthread_join(sending, NULL);
+    pthread_join(watching, NULL);
+    carrier_stop_receiving(stage.carrier);
+    bool has_stopped = publishing_stop(stage.publishing);
+    check(has_stopped == !gets_stuck, "it stops unless it is stuck");
+    if (has_stopped) check_accounts(&stage);
+    else left[round] = stage.publishing;
+    printf("%lld received, %lld and %lld published\n", (long long)stage.received[ACCEPTED],
+           (long long)stage.published[topic_counter(0, PUBLISHED)], (long long)stage.published[topic_counter(1, PUBLISHED)]);
+    close_stage(&stage);
+    free(last);
+    atomic_store(&is_stuck, false);
+    while (atomic_load(&inside)) usleep(100);
+    if (!has_stopped) usleep(20000); /* it finds that it was left */
+}
+
+int main(void) {
+    for (int round = 0; round < ROUNDS; round++) play(round);
+    return 0;
+}

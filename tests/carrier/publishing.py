@@ -1,0 +1,174 @@
+"""A program whose topics the carrier publishes on, between sockets and a middleware of tests."""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from ctypes import c_int64, c_void_p
+from struct import Struct
+from time import monotonic, sleep
+from types import SimpleNamespace
+from typing import Any, cast
+
+from router.app.parts import Part, divided
+from router.carrier import structures as c
+from router.carrier.carrier import Carrier
+from router.carrier.deadmen import Deadmen
+from router.carrier.program import Names, NativeProgram, Outlets, PartTargets, native_program
+from router.carrier.publishing import PublishRoutes, PublishThread
+from router.carrier.ring import Ring
+from router.compiler.program import Handler, Program, TargetPlan
+from router.engine.pacing import RateLimit
+from tests.engine.rig import Ledger
+
+MOST_COUNTERS = 1 << 12
+_LOST = Struct("@IIIIIiII")
+_CALLED = "middleware_publish", "middleware_error", "middleware_forget_error"
+
+
+class Publisher:
+    """As `ros.endpoints.Publication`."""
+
+    def __init__(self, functions: ctypes.CDLL) -> None:
+        self._functions = functions
+        self.address: int = functions.middleware_advertise()
+        self.wanted = (ctypes.c_uint8 * 1)(1)
+
+    def impede(self, *, is_stuck: bool = False, delay_us: int = 0, refusal: str = "") -> None:
+        """Have whoever publishes wait, take its time, or be refused; without arguments, none of it."""
+        self._functions.middleware_impede(self.address, is_stuck, delay_us, refusal.encode())
+
+    @property
+    def is_called(self) -> bool:
+        """Whether a thread is in the middleware now."""
+        return bool(self._functions.middleware_callers(self.address))
+
+    @property
+    def count(self) -> int:
+        """How many messages were published."""
+        return int(self._functions.middleware_count(self.address))
+
+    def published(self) -> list[bytes]:
+        found = [self._functions.middleware_message(self.address, index).contents for index in range(self.count)]
+        return [ctypes.string_at(each.buffer, each.length) for each in found]
+
+
+class Publishing:
+    """The receive thread and the one that publishes. All targets of `program` are topics without Python.
+
+    `queue` is how many bytes may wait.
+    """
+
+    def __init__(
+        self, library: ctypes.CDLL, functions: ctypes.CDLL, program: Program, stack: ExitStack, queue: int = 1 << 16
+    ) -> None:
+        self.program = program
+        self._received, self._published, self._braked = ((c_int64 * MOST_COUNTERS)() for _ in range(3))
+        self._names = Names()
+        self._events, self._ring = Ring(library, 1 << 16), Ring(library, queue)
+        self.publishers = {plan.label: Publisher(functions) for plan in program.publishers}
+        self._deadmen = Deadmen(library, self._braked, Ring(library, 1 << 12), self._names)
+        self._sockets = {plan.name: stack.enter_context(_bound()) for plan in program.listeners}
+        self._peer = stack.enter_context(_bound())
+        self._limits: dict[object, c.Limit] = {}
+        self._carrier = Carrier(library, self._deadmen.address, self._received, Ring(library, 1 << 16))
+        self._programs = [self._made(program, 1)]  # all: a thread that is left may use any
+        addresses = tuple(ctypes.cast(getattr(functions, name), c_void_p).value or 0 for name in _CALLED)
+        self.thread = PublishThread(library, self._ring, self._published, self._events, cast("Any", addresses))
+        stack.callback(self._close)
+        self._carrier.start(self._programs[0])
+        self.sent = 0
+
+    def send(self, *datagrams: bytes, listener: str = "exact") -> None:
+        """Have the carrier receive these. It returns when they wait for the thread, or were dropped."""
+        for datagram in datagrams:
+            self._peer.sendto(datagram, self._sockets[listener].getsockname())
+            self.sent += 1
+            wait_until(lambda: self.ledger().total("datagrams_received") == self.sent)
+
+    def change(self, generation: int, program: Program | None = None) -> None:
+        """Receive with another program from now on; the thread goes on to it."""
+        self._programs.append(self._made(program or self.program, generation))
+        self._carrier.change(self._programs[-1], (), (), holds=False)
+        self.thread.advance(generation)
+
+    def stop_receiving(self) -> None:
+        self._carrier.stop_receiving()
+
+    def _close(self) -> None:
+        self._carrier.close()
+        for publisher in self.publishers.values():
+            publisher.impede()
+        self.thread.stop()
+
+    def ledger(self) -> Ledger:
+        """The counts of both threads; those of the thread that takes what waits first."""
+        size = self.program.counters.size
+        published, received = self.thread.counters(size), self._carrier.counters(size)
+        return Ledger(self.program, [mine + other for mine, other in zip(published, received, strict=True)])
+
+    def count(self, metric: str, *labels: str) -> int:
+        return self.ledger().total(metric, *labels)
+
+    def wait_for(self, metric: str, count: int) -> None:
+        wait_until(lambda: self.count(metric) == count)
+
+    def losses(self) -> list[tuple[str, str, int, str]]:
+        """The route, target, reason and text of each loss since the last call that the thread has reported."""
+        records, found, at = bytes(self._events.take()), [], 0
+        while at < len(records):
+            size, _, route, target, reason, *_ = _LOST.unpack_from(records, at)
+            text = records[at + _LOST.size : at + size].partition(b"\0")[0].decode()
+            found.append((self._names.name(route), self._names.name(target), reason, text))
+            at += size
+        return found
+
+    def stalled(self) -> tuple[str, float] | None:
+        """The topic in whose publisher the thread is now, and for how many seconds."""
+        stalled = self.thread.stalled()
+        return (self._names.name(stalled[0]), stalled[1]) if stalled else None
+
+    def _made(self, program: Program, generation: int) -> NativeProgram:
+        parts = divided(program, publishes=True)
+        assert not any(parts[part] for part in Part if part is not Part.PUBLISHED)
+        routes = PublishRoutes(program, self.publishers, self._names.number, self._limit)
+
+        def parts_of(handler: Handler) -> Sequence[PartTargets]:
+            targets = parts[Part.PUBLISHED].get(handler.route, ())
+            made = routes.route(handler, targets) if targets else None
+            return [PartTargets(self._ring.address, targets, is_always_wanted=False, publishes=made)] if made else ()
+
+        listening = {name: SimpleNamespace(socket=each, is_inherited=False) for name, each in self._sockets.items()}
+        outlets = Outlets(
+            listeners=cast("Any", listening),
+            senders={},
+            wanted={topic: each.wanted for topic, each in self.publishers.items()},
+            feeds=lambda _route, _names: (),
+            limit=self._limit,
+            carried=lambda _: (),
+            parts=parts_of,
+            names=self._names,
+        )
+        native = native_program(program, generation, outlets)
+        native.arrays.append(routes)
+        return native
+
+    def _limit(self, handler: Handler, target: TargetPlan) -> c.Limit:
+        assert target.max_rate is not None
+        period = RateLimit.period(target.max_rate)
+        return self._limits.setdefault((handler.route, target), c.Limit(period, period - period // 2, -period))
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    deadline = monotonic() + 20
+    while not condition():
+        assert monotonic() < deadline, "it never happened"
+        sleep(0.001)
+
+
+def _bound() -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.bind(("127.0.0.1", 0))
+    return made

@@ -1,0 +1,359 @@
+"""The thread that publishes: what becomes of each message, changes of programs, stops, a middleware that is stuck."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from time import sleep
+
+import pytest
+
+from tests.carrier.building import MEMORY, RACES, run_program
+from tests.carrier.commanding import middleware
+from tests.carrier.publishing import Publishing, wait_until
+from tests.engine.rig import STRANGER, Rig, program
+from tests.engine.test_both_directions import enveloped
+
+_FLOAT = "type: std_msgs/msg/Float32, fields: {data: "
+ROUTES = f"""\
+  imu_info:
+    source: any
+    topics:
+      - {{topic: accel, {_FLOAT}accel_x}}}}
+      - {{topic: inverse, {_FLOAT}"1 / accel_y"}}, when: accel_x < 100}}
+      - {{topic: whole, type: std_msgs/msg/Int32, fields: {{data: round(accel_z)}}}}
+      - {{topic: seldom, {_FLOAT}accel_x}}, max_rate: 0.001 Hz}}
+  gps_info:
+    source: any
+    topics: [{{topic: position, {_FLOAT}hdop}}}}, {{topic: accel, {_FLOAT}hdop}}}}]
+"""
+SHORT_LIVED = f"""\
+  imu_info:
+    source: any
+    topics: [{{topic: accel, {_FLOAT}accel_x}}}}]
+    ttl: 1ms
+"""
+STALE, PUBLISH_ERROR = 2, 7
+
+
+@pytest.fixture(scope="session")
+def functions(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    return middleware(tmp_path_factory.mktemp("middleware") / "middleware.so")
+
+
+Open = Callable[..., Publishing]
+
+
+@pytest.fixture
+def opened(library: ctypes.CDLL, functions: ctypes.CDLL, tmp_path: Path) -> Iterator[Open]:
+    """Receives by a table of these routes, and publishes."""
+    with ExitStack() as stack:
+
+        def made(routes: str = ROUTES, queue: int = 1 << 16) -> Publishing:
+            return Publishing(library, functions, program(tmp_path, routes), stack, queue)
+
+        yield made
+
+
+def imu(x: float = 1.0, y: float = 2.0, z: float = 3.0) -> bytes:
+    return enveloped(imu_info={"accel_x": x, "accel_y": y, "accel_z": z})
+
+
+def gps(hdop: float = 1.0) -> bytes:
+    return enveloped(gps_info={"hdop": hdop})
+
+
+def number(cdr: bytes) -> float:
+    (found,) = struct.unpack("<xxxxf", cdr)
+    return float(found)
+
+
+def check_books(publishing: Publishing) -> None:
+    """They balance, and nothing waits."""
+    assert list(publishing.ledger().imbalances()) == []
+    assert publishing.count("messages_waiting") == 0
+
+
+# ---- outcomes
+
+
+def compare(publishing: Publishing, *datagrams: bytes, listener: str = "exact") -> None:
+    """The engine in Python publishes the same, and counts the same."""
+    rig = Rig(
+        publishing.program, frozenset(topic for topic, each in publishing.publishers.items() if not each.wanted[0])
+    )
+    rig.now = 10**12
+    for datagram in datagrams:
+        rig.receive(datagram, STRANGER, listener)
+    publishing.send(*datagrams, listener=listener)
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    for topic, publisher in publishing.publishers.items():
+        assert publisher.published() == [cdr for name, cdr in rig.published if name == topic]
+    assert publishing.ledger().counted("messages_", "datagrams_") == rig.counted("messages_", "datagrams_")
+    assert [(route, topic) for route, topic, *_ in publishing.losses()] == [
+        (report.place, report.target) for report in rig.reports
+    ]
+    check_books(publishing)
+
+
+def test_each_message_comes_to_what_it_comes_to_in_python(opened: Open) -> None:
+    publishing = opened()
+    publishing.publishers["position"].wanted[0] = 0
+    compare(
+        publishing, imu(), imu(2.5), imu(y=0.0), imu(z=math.nan), imu(z=math.inf), imu(x=1000.0, y=0.0), gps(), gps(7.5)
+    )
+    route = "imu_info", "whole"
+    assert publishing.count("messages_dropped", *route, "non_finite") == 2
+    assert publishing.count("messages_dropped", "imu_info", "inverse", "mapping_error") == 1
+    assert publishing.count("messages_dropped", "imu_info", "seldom", "rate_limited") == 5
+    assert publishing.count("messages_filtered", "imu_info", "inverse") == 1
+    assert publishing.count("messages_filtered", "gps_info", "position") == 2
+
+
+def test_an_envelope_may_have_several_fields_and_lack_its_zeros(opened: Open) -> None:
+    parts = imu(1.0, 2.0, 3.0), imu(5.0, 0.0, 0.0)
+    compare(opened(), gps(3.0) + imu(), imu() + gps(9.0), parts[0] + parts[1], parts[1] + parts[0])
+    compare(opened(), imu(5.0, 1.0, 0.0)[:-1], gps(0.5).rstrip(b"\0"), (gps(2.0) + imu(1.0, 0.5)).rstrip(b"\0"),
+            listener="trimmed")  # fmt: skip
+
+
+def test_nobody_wants_a_topic_for_a_while(opened: Open) -> None:
+    publishing = opened(SHORT_LIVED.replace("1ms", "1h"))
+    accel = publishing.publishers["accel"]
+    for turn in range(40):
+        accel.wanted[0] = turn // 10 % 2
+        publishing.send(imu(float(turn)))
+        wait_until(lambda: not publishing.count("messages_waiting"))
+    assert [number(cdr) for cdr in accel.published()] == [*range(10, 20), *range(30, 40)]
+    assert publishing.count("messages_filtered") == 20
+    check_books(publishing)
+
+
+def test_what_waits_for_a_topic_that_nobody_wants_any_more_is_filtered(opened: Open) -> None:
+    publishing = opened()
+    accel, position = publishing.publishers["accel"], publishing.publishers["position"]
+    position.impede(is_stuck=True)
+    publishing.send(gps(), imu(), imu())
+    accel.wanted[0] = 0
+    position.impede()
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    assert accel.count == 0
+    assert publishing.count("messages_filtered", "imu_info", "accel") == 2
+    check_books(publishing)
+
+
+def test_what_has_waited_too_long_is_stale(opened: Open) -> None:
+    publishing = opened(SHORT_LIVED)
+    accel = publishing.publishers["accel"]
+    accel.impede(is_stuck=True)
+    publishing.send(imu(1.0))
+    wait_until(lambda: accel.is_called or publishing.count("messages_dropped"))
+    publishing.send(imu(2.0), imu(3.0))
+    sleep(0.01)
+    accel.impede()
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    assert publishing.count("messages_dropped", "imu_info", "accel", "stale") >= 2
+    assert ("imu_info", "accel", STALE, "") in publishing.losses()
+    check_books(publishing)
+
+
+def test_a_middleware_that_refuses_says_why(opened: Open) -> None:
+    publishing = opened(SHORT_LIVED.replace("1ms", "1h"))
+    accel = publishing.publishers["accel"]
+    reasons = ["there is no room", "x" * 1000, "the others have gone: ä"]
+    for reason in reasons:
+        accel.impede(refusal=reason)
+        publishing.send(imu())
+        wait_until(lambda: not publishing.count("messages_waiting"))
+    accel.impede()
+    publishing.send(imu(4.0))
+    publishing.wait_for("messages_published", 1)
+    assert publishing.losses() == [("imu_info", "accel", PUBLISH_ERROR, reason[:255]) for reason in reasons]
+    assert publishing.count("messages_dropped", "imu_info", "accel", "publish_error") == 3
+    assert [number(cdr) for cdr in accel.published()] == [4.0]
+    check_books(publishing)
+
+
+# ---- a middleware that is stuck
+
+
+def test_a_full_queue_drops_its_oldest_messages(opened: Open) -> None:
+    publishing = opened(ROUTES, 1 << 12)
+    accel = publishing.publishers["accel"]
+    accel.impede(is_stuck=True)
+    publishing.send(gps(0.0))
+    wait_until(lambda: accel.is_called)
+    publishing.send(*(gps(float(turn)) for turn in range(1, 200)))
+    dropped = publishing.count("messages_dropped", "gps_info", "accel", "queue_full")
+    assert dropped == publishing.count("messages_dropped", "gps_info", "position", "queue_full")
+    assert 0 < dropped < 199
+    assert list(publishing.ledger().imbalances()) == []
+    assert publishing.count("messages_waiting", "gps_info", "accel") == 200 - dropped
+    accel.impede()
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    expected = [0.0, *map(float, range(dropped + 1, 200))]
+    for publisher in (accel, publishing.publishers["position"]):
+        assert [number(cdr) for cdr in publisher.published()] == expected
+    check_books(publishing)
+
+
+def test_a_topic_that_is_stuck_is_named(opened: Open) -> None:
+    publishing = opened()
+    assert publishing.stalled() is None
+    position = publishing.publishers["position"]
+    position.impede(is_stuck=True)
+    publishing.send(gps())
+    wait_until(lambda: position.is_called)
+    stalled = publishing.stalled()
+    assert stalled is not None
+    assert stalled[0] == "position"
+    sleep(0.01)
+    later = publishing.stalled()
+    assert later is not None
+    assert later[1] >= stalled[1] + 0.01
+    position.impede()
+    wait_until(lambda: publishing.stalled() is None)
+
+
+def test_a_stop_publishes_what_waits(opened: Open) -> None:
+    publishing = opened()
+    accel = publishing.publishers["accel"]
+    accel.impede(is_stuck=True)
+    publishing.send(*(gps(float(turn)) for turn in range(50)))
+    publishing.stop_receiving()
+    accel.impede()
+    assert publishing.thread.stop()
+    assert publishing.thread.stop()
+    assert [number(cdr) for cdr in accel.published()] == list(range(50))
+    assert publishing.stalled() is None
+    check_books(publishing)
+
+
+def test_a_thread_that_is_stuck_is_left_and_publishes_nothing_more(opened: Open) -> None:
+    publishing = opened()
+    accel = publishing.publishers["accel"]
+    accel.impede(is_stuck=True)
+    publishing.send(*(gps(float(turn)) for turn in range(50)))
+    wait_until(lambda: accel.is_called)
+    publishing.stop_receiving()
+    assert not publishing.thread.stop()
+    assert not publishing.thread.stop()
+    before = publishing.ledger().counted("")
+    accel.impede()
+    wait_until(lambda: not accel.is_called)
+    sleep(0.05)
+    assert (accel.count, publishing.publishers["position"].count) == (1, 1)
+    assert publishing.ledger().counted("") == before
+    assert publishing.thread.wait_for(99, 0.1)
+
+
+def test_a_thread_that_is_slow_is_left_likewise(opened: Open) -> None:
+    publishing = opened()
+    accel = publishing.publishers["accel"]
+    accel.impede(delay_us=5000)
+    publishing.send(*(gps(float(turn)) for turn in range(400)))
+    publishing.stop_receiving()
+    assert not publishing.thread.stop()
+    left_at = accel.count
+    sleep(0.1)
+    assert accel.count <= left_at + 1
+    assert accel.count < 400
+
+
+def test_books_are_read_while_a_publisher_is_stuck(opened: Open) -> None:
+    """There is no waiting for the middleware, and each target is counted as far as it was served."""
+    publishing = opened()
+    whole = publishing.publishers["whole"]
+    whole.impede(is_stuck=True)
+    publishing.send(imu(), imu())
+    wait_until(lambda: whole.is_called)
+    assert list(publishing.ledger().imbalances()) == []
+    assert publishing.count("messages_published", "imu_info") == 2
+    assert [publishing.count("messages_waiting", "imu_info", topic) for topic in ("accel", "whole")] == [1, 2]
+    whole.impede()
+
+
+# ---- generations
+
+
+def test_programs_follow_each_other(opened: Open, tmp_path: Path) -> None:
+    publishing = opened()
+    accel = publishing.publishers["accel"]
+    doubled = program(tmp_path, ROUTES.replace("accel_x}}", "accel_x * 2}}"))
+    accel.impede(is_stuck=True)
+    publishing.send(imu(1.0), imu(2.0))
+    wait_until(lambda: accel.is_called)
+    publishing.change(2, doubled)
+    publishing.send(imu(3.0))
+    assert not publishing.thread.wait_for(2, 0.05)
+    accel.impede()
+    assert publishing.thread.wait_for(2, 10)
+    publishing.send(imu(4.0))
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    assert [number(cdr) for cdr in accel.published()] == [1.0, 2.0, 6.0, 8.0]
+    check_books(publishing)
+
+
+def test_a_generation_is_reached_without_messages(opened: Open) -> None:
+    publishing = opened()
+    for generation in (2, 3, 7):
+        assert not publishing.thread.wait_for(generation, 0.01)
+        publishing.change(generation)
+        assert publishing.thread.wait_for(generation, 10)
+        assert publishing.thread.wait_for(generation - 1, 10)
+
+
+def test_a_generation_that_is_held_begins_later(opened: Open) -> None:
+    """What came before is published; then the generation is reached, and others may serve what belongs in front."""
+    publishing = opened()
+    accel = publishing.publishers["accel"]
+    accel.impede(is_stuck=True)
+    publishing.send(imu(1.0), imu(2.0))
+    publishing.thread.hold(2)
+    publishing.change(2)
+    publishing.send(imu(3.0), imu(4.0))
+    accel.impede()
+    assert publishing.thread.wait_for(2, 10)
+    sleep(0.02)
+    assert [number(cdr) for cdr in accel.published()] == [1.0, 2.0]
+    assert publishing.count("messages_waiting", "imu_info", "accel") == 2
+    assert publishing.stalled() is None
+    publishing.thread.hold(0)
+    wait_until(lambda: not publishing.count("messages_waiting"))
+    assert [number(cdr) for cdr in accel.published()] == [1.0, 2.0, 3.0, 4.0]
+    check_books(publishing)
+
+
+def test_a_generation_without_messages_is_held_as_well(opened: Open) -> None:
+    publishing = opened()
+    publishing.thread.hold(2)
+    publishing.change(2)
+    assert publishing.thread.wait_for(2, 10)
+    publishing.send(imu())
+    sleep(0.02)
+    assert publishing.publishers["accel"].count == 0
+    publishing.thread.hold(0)
+    publishing.wait_for("messages_waiting", 0)
+
+
+def test_a_stop_does_not_wait_for_what_is_held(opened: Open) -> None:
+    publishing = opened()
+    publishing.thread.hold(2)
+    publishing.change(2)
+    publishing.send(imu(1.0), imu(2.0))
+    publishing.stop_receiving()
+    assert publishing.thread.stop()
+    assert [number(cdr) for cdr in publishing.publishers["accel"].published()] == [1.0, 2.0]
+    check_books(publishing)
+
+
+@pytest.mark.parametrize(
+    "sanitizers",
+    ["", pytest.param(RACES, marks=pytest.mark.slow), pytest.param(MEMORY, marks=pytest.mark.slow)],
+)
+def test_programs_change_while_messages_come(tmp_path: Path, sanitizers: str) -> None:
+    run_program("publish", tmp_path, sanitizers=sanitizers)
