@@ -16,6 +16,7 @@ from functools import cache, partial
 from itertools import count
 from socket import inet_ntoa
 from struct import Struct
+from time import sleep
 from typing import TYPE_CHECKING, cast
 
 from router.app.parts import OF_PYTHON, Part, Parts, divided
@@ -67,6 +68,8 @@ _QUEUE, _MIRRORED, _EVENTS = 1 << 20, 1 << 22, 1 << 18
 
 _PATIENCE_S = 1.0
 """How long a reload and a stop wait for a thread of Python that may be stuck in the middleware."""
+
+_TURN_S = 0.002
 
 _MIRROR = Struct("@IIqIIII")
 """`struct mirror_record`."""
@@ -355,7 +358,16 @@ class NativeDatapath:
             return True
         late = left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
         has_published = self._publishing.wait_for(wiring.native.generation, _PATIENCE_S)
-        return not late and has_published and all(commands.has_passed for commands in self._commands)
+        return not late and has_published and self._has_turned() and all(commands.has_passed for commands in self._commands)
+
+    def _has_turned(self) -> bool:
+        """Wait until the receive thread is done with what it now handles: it may be dropping an earlier message."""
+        turns = self._carrier.turns
+        for _ in range(int(_PATIENCE_S / _TURN_S)):
+            if self._carrier.turns != turns:
+                return True
+            sleep(_TURN_S)
+        return False
 
     def observe(self, *, is_observed: bool) -> None:
         lost = self._context.counts.counters.index("mirror_dropped")

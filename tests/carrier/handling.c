@@ -1,4 +1,6 @@
-/* The receive thread without its thread and without sockets: tests give it datagrams. It is compiled with clocked.h. */
+/* The receive thread and the one that publishes, without threads and sockets: tests give them datagrams, and take what
+ * is published. It is compiled with clocked.h. */
+#include "publishing.c"
 #include "receive.c"
 #include "seams.c"
 
@@ -15,4 +17,29 @@ void seam_handle(struct carrier *carrier, uint32_t listener, const void *data, s
     memset(carrier->datagram, 0xa5, sizeof carrier->datagram);
     if (size) memcpy(carrier->datagram, data, size);
     handle(carrier, &received, arrived_at);
+}
+
+/* The thread that publishes, as it is between two messages. */
+struct publishing *seam_publishing_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish);
+void seam_publish(struct publishing *publishing);
+void seam_publishing_close(struct publishing *publishing);
+
+struct publishing *seam_publishing_open(struct ring *ring, counter *counters, struct ring *events, publish_function *publish) {
+    struct publishing *made = calloc(1, sizeof *made);
+    *made = (struct publishing){.ring = ring, .counters = counters, .reporter.events = events, .publish = publish};
+    pthread_mutex_init(&made->lock, NULL);
+    composer_open(&made->composer);
+    return made;
+}
+
+/* Serve all that waits. */
+void seam_publish(struct publishing *publishing) {
+    pthread_mutex_lock(&publishing->lock);
+    for (size_t size; (size = take(publishing, false));) serve_all(publishing, size);
+    pthread_mutex_unlock(&publishing->lock);
+}
+
+void seam_publishing_close(struct publishing *publishing) {
+    composer_close(&publishing->composer);
+    free(publishing);
 }

@@ -12,10 +12,11 @@ from tests.carrier.conftest import SANITIZED
 from tests.carrier.whole import compare, library
 
 
+@pytest.mark.parametrize("publishes", [True, False])
 @pytest.mark.parametrize("count", [3_000, pytest.param(100_000, marks=pytest.mark.slow)])
-def test_the_same_datagrams_have_the_same_outcome(count: int, tmp_path: Path) -> None:
+def test_the_same_datagrams_have_the_same_outcome(count: int, publishes: bool, tmp_path: Path) -> None:
     loaded = library(tmp_path / "carrier.so", MEMORY if SANITIZED in os.environ else "")
-    difference, fates = compare(loaded, tmp_path, count, seed=count)
+    difference, fates = compare(loaded, tmp_path, count, seed=count, publishes=publishes)
     assert difference is None
     assert fates["datagrams_sent", "manual_drive", "driving_board"]
     assert fates["datagrams_sent", "gps_info", "paced"]

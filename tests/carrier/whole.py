@@ -6,7 +6,7 @@ import ctypes
 import random
 import socket
 from collections.abc import Callable, Mapping, Sequence
-from ctypes import c_int64, c_size_t, c_uint32, c_void_p
+from ctypes import POINTER, c_int, c_int64, c_size_t, c_uint32, c_void_p
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +19,7 @@ from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.library import load
 from router.carrier.program import Names, Outlets, PartTargets, native_program
+from router.carrier.publishing import PublishRoutes
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
@@ -26,11 +27,13 @@ from router.engine import MAX_DATAGRAM, PartEngine
 from router.engine.binding import State
 from router.engine.pacing import RateLimit
 from tests.carrier.building import sanitizing
+from tests.carrier.commanding import Serialized
 from tests.carrier.datagrams import Maker
 from tests.engine.rig import HEAD, Ledger, Rig, program
 from tests.engine.test_both_directions import enveloped
 
 MS = 1_000_000
+_PUBLISH = ctypes.CFUNCTYPE(c_int, c_void_p, POINTER(Serialized), c_void_p)
 HERE = Path(__file__).parent
 
 WHOLE_HEAD = HEAD.replace(
@@ -99,7 +102,7 @@ def table(folder: Path) -> Program:
 
 def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
     """The carrier with clocks that are set, and `seam_handle`. For `sanitizers`, see `sanitizer_variables`."""
-    files = [HERE / "handling.c", *(path for path in sources() if path.name != "receive.c")]
+    files = [HERE / "handling.c", *(path for path in sources() if path.name not in {"publishing.c", "receive.c"})]
     flags = sanitizing(sanitizers) if sanitizers else ["-O2"]
     flags += ["-fPIC", "-shared", "-include", str(HERE / "clocked.h"), f"-I{NATIVE}"]
     compile_c([*flags, *map(str, files), "-o", str(output)], "gcc" if sanitizers else None)
@@ -108,7 +111,19 @@ def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
     loaded.seam_next_due.restype, loaded.seam_next_due.argtypes = c_int64, (c_void_p,)
     loaded.seam_handle.restype = None
     loaded.seam_handle.argtypes = (c_void_p, c_uint32, ctypes.c_char_p, c_size_t, c_uint32, c_uint32, c_int64)
+    loaded.seam_publishing_open.restype = c_void_p
+    loaded.seam_publishing_open.argtypes = (c_void_p, c_void_p, c_void_p, _PUBLISH)
+    loaded.seam_publish.restype, loaded.seam_publish.argtypes = None, (c_void_p,)
+    loaded.seam_publishing_close.restype, loaded.seam_publishing_close.argtypes = None, (c_void_p,)
     return loaded
+
+
+class _Publication:
+    """As `ros.endpoints.Publication`; `address` says to the callback which topic it is."""
+
+    def __init__(self, number: int, is_wanted: bool) -> None:
+        self.address = number
+        self.wanted = (ctypes.c_uint8 * 1)(is_wanted)
 
 
 class _Destination:
@@ -144,27 +159,41 @@ class _Destination:
 
 
 class Whole:
-    """As `Rig`: `sent` by endpoint and `published` by topic are what came out of it."""
+    """As `Rig`: `sent` by endpoint and `published` by topic are what came out of it.
 
-    def __init__(self, loaded: ctypes.CDLL, made: Program, unwanted: frozenset[str] = UNWANTED) -> None:
+    `publishes`: the carrier publishes what it can, else Python all.
+    """
+
+    def __init__(
+        self, loaded: ctypes.CDLL, made: Program, *, publishes: bool, unwanted: frozenset[str] = UNWANTED
+    ) -> None:
         self._library, self._program = loaded, made
         self._names = Names()
         self._clock, self._wall = (c_int64.in_dll(loaded, name) for name in ("seam_monotonic", "seam_wall"))
         self._rig = Rig(made, unwanted)  # for its timers and topics
         size = len(made.counters.fresh_counts())
-        self._counts = (c_int64 * size)()
+        self._counts, self._publish_counts = (c_int64 * size)(), (c_int64 * size)()
         self._events = Ring(loaded, 1 << 18)
         self._destinations = {plan.name: _Destination(loaded, plan.name == "refused") for plan in made.senders}
         self._set_clocks()
         self._deadmen = Deadmen(loaded, self._counts, self._events, self._names)
         senders = cast("Mapping[str, NativeSender]", self._destinations)
         self._braking = {plan.route: self._deadmen.add(plan, made.counters, senders) for plan in made.deadmen}
-        self._divided = divided(made, publishes=False)
+        self._divided = divided(made, publishes=publishes)
         self._rings = {part: Ring(loaded, 1 << 17) for part in OF_PYTHON}
         self._parts = {part: self._engine(part) for part in OF_PYTHON}
         self._functions = {part: engine.functions() for part, engine in self._parts.items()}
         self._limits = State()
-        wanted = {topic: (ctypes.c_uint8 * 1)(topic not in unwanted) for topic in self._rig.wanted}
+        self._topics = list(self._rig.wanted)
+        publications = {
+            topic: _Publication(number, topic not in unwanted) for number, topic in enumerate(self._topics, 1)
+        }
+        self._routes = PublishRoutes(made, publications, self._names.number, self._limit)
+        self._publish = _PUBLISH(self._published_natively)
+        self._published = Ring(loaded, 1 << 17)
+        self._publishing = loaded.seam_publishing_open(
+            self._published.address, self._publish_counts, self._events.address, self._publish
+        )
         listening = SimpleNamespace(socket=SimpleNamespace(fileno=lambda: -1), is_inherited=False)
         self._native = native_program(
             made,
@@ -172,7 +201,7 @@ class Whole:
             Outlets(
                 listeners=cast("Any", {plan.name: listening for plan in made.listeners}),
                 senders={name: each.address for name, each in self._destinations.items()},
-                wanted=wanted,
+                wanted={topic: each.wanted for topic, each in publications.items()},
                 feeds=lambda route, names: [(each.address, disarms) for each, disarms in self._feeds(route, names)],
                 limit=self._limit,
                 carried=lambda handler: self._divided[Part.SENT].get(handler.route, ()),
@@ -190,6 +219,7 @@ class Whole:
         for engine in self._parts.values():
             engine.close()
         self._library.carrier_close(self._carrier)
+        self._library.seam_publishing_close(self._publishing)
         self._braking.clear()
         for destination in self._destinations.values():
             destination.close()
@@ -208,6 +238,8 @@ class Whole:
         self._collect()
         for part in (Part.DESTINATIONS, Part.TOPICS):
             self._serve(part)
+        self._library.seam_publish(self._publishing)
+        self._events.take()
 
     def pass_time(self, ns: int) -> None:
         """Moves the clocks, and serves deadmen and timers when they are due."""
@@ -225,7 +257,8 @@ class Whole:
 
     def counts(self) -> list[int]:
         """Those of all threads."""
-        return [native + other for native, other in zip(self._counts, self._rig.counts, strict=True)]
+        of_threads = zip(self._counts, self._publish_counts, self._rig.counts, strict=True)
+        return [sum(counts) for counts in of_threads]
 
     def _set_clocks(self) -> None:
         self._clock.value, self._wall.value = self._rig.now, Rig.WALL + self._rig.now
@@ -254,8 +287,14 @@ class Whole:
         key = handler.route, target
         return self._limits.keep(key, lambda: c.Limit(period, period - period // 2, -period))
 
+    def _published_natively(self, publisher: int, message: Any, _: object) -> int:
+        """As a middleware."""
+        cdr = ctypes.string_at(message.contents.buffer, message.contents.length)
+        self._rig.published.append((self._topics[publisher - 1], cdr))
+        return 0
+
     def _parts_of(self, handler: Handler) -> list[PartTargets]:
-        return [
+        parts = [
             PartTargets(
                 self._rings[part].address,
                 self._divided[part][handler.route],
@@ -264,6 +303,10 @@ class Whole:
             for part in OF_PYTHON
             if handler.route in self._functions[part]
         ]
+        if targets := self._divided[Part.PUBLISHED].get(handler.route):
+            publishes = self._routes.route(handler, targets)
+            parts.append(PartTargets(self._published.address, targets, is_always_wanted=False, publishes=publishes))
+        return parts
 
     def _serve(self, part: Part) -> None:
         """As `Worker`."""
@@ -284,13 +327,13 @@ class Whole:
 
 
 class Comparison:
-    """The same datagrams, at the same times, to both."""
+    """The same datagrams, at the same times, to both. `publishes` is as in `Whole`."""
 
-    def __init__(self, loaded: ctypes.CDLL, made: Program, seed: int) -> None:
+    def __init__(self, loaded: ctypes.CDLL, made: Program, seed: int, *, publishes: bool) -> None:
         self._noise = random.Random(seed)
         self._maker = Maker(made.envelope.message_class.DESCRIPTOR, self._noise)  # type: ignore[arg-type]  # or upb's
         self._program = made
-        self.python, self.carrier = Rig(made, UNWANTED), Whole(loaded, made)
+        self.python, self.carrier = Rig(made, UNWANTED), Whole(loaded, made, publishes=publishes)
         self.python.failures["refused"] = ConnectionRefusedError("refused")
 
     def datagram(self) -> bytes:
@@ -348,13 +391,13 @@ class Comparison:
         for name, data in python.sent:
             sent[name].append(data)
         python.sent.clear()
-        found = [
-            f"{name}: {carrier.sent[name]}, not {each}" for name, each in sent.items() if carrier.sent[name] != each
-        ]
+        found = [f"{name}: {carrier.sent[name]}, not {sent[name]}" for name in sent if carrier.sent[name] != sent[name]]
+        for each in (carrier.published, python.published):
+            each.sort(key=lambda published: published[0])  # several threads publish, each topic in order
         if carrier.published != python.published:
             found.append(f"published {carrier.published}, not {python.published}")
-        for each in carrier.sent.values():
-            each.clear()
+        for datagrams in carrier.sent.values():
+            datagrams.clear()
         carrier.published.clear()
         python.published.clear()
         counts = carrier.counts()
@@ -371,10 +414,10 @@ class Comparison:
 
 
 def compare(
-    loaded: ctypes.CDLL, folder: Path, count: int, seed: int
+    loaded: ctypes.CDLL, folder: Path, count: int, seed: int, *, publishes: bool
 ) -> tuple[str | None, Mapping[tuple[str, ...], int]]:
     """Give `count` datagrams to both. Returns the first difference, and what was counted in Python."""
-    comparison = Comparison(loaded, table(folder), seed)
+    comparison = Comparison(loaded, table(folder), seed, publishes=publishes)
     try:
         for number in range(count):
             if found := comparison.step():

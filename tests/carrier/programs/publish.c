@@ -139,7 +139,8 @@ static struct made *make(const struct stage *stage, uint32_t generation) {
     return made;
 }
 
-/* Free a program that nothing in the ring refers to. The receive thread may just be dropping such a message. */
+/* Free a program that nothing in the ring refers to. The receive thread may just be dropping such a message: it is done
+ * with that a turn later. */
 static void free_made(const struct stage *stage, struct made *made) {
     uint64_t turns = carrier_turns(stage->carrier);
     while (carrier_turns(stage->carrier) == turns) usleep(50);
