@@ -97,6 +97,10 @@ _BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
 _UNARY: dict[type[ast.unaryop], Callable[[Any], Any]] = {
     ast.Not: operator.not_, ast.USub: operator.neg, ast.UAdd: operator.pos,
 }  # fmt: skip
+_GIVE_FLOATS = frozenset(
+    {"radians", "degrees", "sqrt", "sin", "cos", "tan", "atan2", "hypot", "float32", "float64", "seconds"}
+)
+_GIVE_AN_ARGUMENT = frozenset({"min", "max", "clamp"})
 _COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
     ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt,
     ast.GtE: operator.ge, ast.In: lambda x, y: x in y, ast.NotIn: lambda x, y: x not in y,
@@ -107,7 +111,9 @@ _COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
 class _Evaluator:
     context: Context
 
-    def visit(self, node: ast.expr, expected: Type | None = None) -> Any:  # noqa: C901, PLR0912 - a case a syntax
+    def visit(  # noqa: C901, PLR0912 - a case a syntax
+        self, node: ast.expr, expected: Type | None = None
+    ) -> Any:
         match node:
             case ast.Constant():
                 return node.value
@@ -130,13 +136,35 @@ class _Evaluator:
             case ast.Compare():
                 return self._compare(node)
             case ast.IfExp():
-                return self.visit(node.body if self.visit(node.test) else node.orelse, expected)
+                chosen = self.visit(node.body if self.visit(node.test) else node.orelse, expected)
+                return float(chosen) if self._is_float(node) else chosen
             case ast.Call(func=ast.Name("has")):
                 return self._has(node.args[0])
             case ast.Call(func=ast.Name(name)):
-                return self._call(name, [self.visit(argument) for argument in node.args], expected)
+                value: Any = self._call(name, [self.visit(argument) for argument in node.args], expected)
+                return float(value) if name in _GIVE_AN_ARGUMENT and self._is_float(node) else value
             case _:
                 raise TypeError(f"{type(node).__name__} is not part of the language")
+
+    def _is_float(self, node: ast.expr) -> bool:
+        """Whether an expression gives a float, whatever is chosen in it."""
+        match node:
+            case ast.IfExp():
+                return self._is_float(node.body) or self._is_float(node.orelse)
+            case ast.UnaryOp():
+                return self._is_float(node.operand)
+            case ast.BinOp():
+                return isinstance(node.op, ast.Div) or self._is_float(node.left) or self._is_float(node.right)
+            case ast.Call(func=ast.Name(name)):
+                return name in _GIVE_FLOATS or (
+                    name in {"abs", *_GIVE_AN_ARGUMENT} and any(map(self._is_float, node.args))
+                )
+            case ast.Subscript(value=ast.List(elements)):
+                return any(map(self._is_float, elements))
+            case ast.Compare() | ast.BoolOp() | ast.Subscript():
+                return False
+            case _:
+                return isinstance(self.visit(node), float)
 
     def _name(self, name: str, expected: Type | None) -> object:
         view = self.context.view

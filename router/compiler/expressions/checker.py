@@ -258,6 +258,8 @@ def call_of(function: Function, arguments: Sequence[Typed], span: SourceSpan, ex
         kind = function.result([argument.kind for argument in arguments])
     except ValueError as error:
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, f"{function.name}(): {error}") from None
+    if function.gives_an_argument:
+        arguments = [operators.as_float(argument, kind) for argument in arguments]
     return Typed.at(span, kind, call(function.name, *[argument.node for argument in arguments]))
 
 

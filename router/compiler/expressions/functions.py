@@ -35,6 +35,9 @@ NS_PER_MILLISECOND = 1_000_000
 FLOAT32_END = 3.4028235677973366e38
 """The smallest magnitude that does not round to a finite float32."""
 
+TIME_END = 1 << 63
+"""The first time, in ns, that 64 bits do not hold."""
+
 # implementations
 
 
@@ -71,7 +74,7 @@ def wrap(x: int, low: int, high: int) -> int:
 
 def to_float32(x: float) -> float:
     if math.isinf(x) or abs(x) < FLOAT32_END or math.isnan(x):
-        return x
+        return float(x)
     raise MappingError(f"{x} is too large for a float32")
 
 
@@ -80,11 +83,18 @@ def seconds(time: int) -> float:
 
 
 def time_from_seconds(x: float) -> int:
-    return _to_int(round, x * NS_PER_SECOND)
+    return _to_time(x * NS_PER_SECOND)
 
 
 def time_from_milliseconds(x: float) -> int:
-    return _to_int(round, x * NS_PER_MILLISECOND)
+    return _to_time(x * NS_PER_MILLISECOND)
+
+
+def _to_time(ns: float) -> int:
+    time = _to_int(round, ns)
+    if -TIME_END <= time < TIME_END:
+        return time
+    raise MappingError(f"{time} ns are no time: it has 64 bits")
 
 
 # kinds of results
@@ -186,7 +196,8 @@ class Function:
     """One function. `result` tells the kind of a call from the kinds of its arguments.
 
     The last parameter may be repeated when `variadic`; `optional` of the last ones may be left out.
-    A function with optional bounds takes them from the integer field that it fills (see expressions).
+    A function with optional bounds takes them from the integer field that it fills (see expressions). One that
+    `gives_an_argument` gives a float if one of them may be one.
     """
 
     name: str
@@ -197,6 +208,7 @@ class Function:
     examples: tuple[tuple[str, object], ...]
     variadic: bool = False
     optional: int = 0
+    gives_an_argument: bool = False
 
     @property
     def signature(self) -> str:
@@ -222,9 +234,9 @@ _SIZED = (StringKind, BytesKind, ListKind)
 _DECLARED = (
     Function("abs", (_number(),), _absolute, abs, "The magnitude of a number.", (("abs(-3)", 3),)),
     Function("min", (_number("a"), _number("b")), _extreme(min), min, "The smallest argument.",
-             (("min(2, 1.5)", 1.5),), variadic=True),
+             (("min(2, 1.5)", 1.5),), variadic=True, gives_an_argument=True),
     Function("max", (_number("a"), _number("b")), _extreme(max), max, "The largest argument.",
-             (("max(2, 3, 1)", 3),), variadic=True),
+             (("max(2, 3, 1)", 3),), variadic=True, gives_an_argument=True),
     Function("round", (_number(),), _integer, round_half_even,
              "The nearest integer, the even one of two. NaN and infinities drop the target.",
              (("round(2.6)", 3), ("round(2.5)", 2), ("round(-0.5)", 0))),
@@ -233,7 +245,7 @@ _DECLARED = (
     Function("ceil", (_number(),), _integer, ceil, "The integer at or above.", (("ceil(2.1)", 3),)),
     Function("clamp", (_number(), _number("low"), _number("high")), _clamped, clamp,
              "The number, held between two bounds; without bounds, those of the integer field that it fills.",
-             (("clamp(300, 0, 255)", 255), ("clamp(-1.5, -1.0, 1.0)", -1.0)), optional=2),
+             (("clamp(300, 0, 255)", 255), ("clamp(-1.5, -1.0, 1.0)", -1.0)), optional=2, gives_an_argument=True),
     Function("wrap", (_whole(), _whole("low"), _whole("high")), _wrapped, wrap,
              "The integer, counted on from the low bound when it passes the high one; without bounds, those of "
              "the integer field that it fills.",
@@ -261,9 +273,11 @@ _DECLARED = (
     Function("seconds", (Parameter("time", (TimeKind,), "a time"),), _always(FloatKind(64)), seconds,
              "A time as seconds since 1970.", (("seconds(time_from_seconds(1.5))", 1.5),)),
     Function("time_from_seconds", (_number(),), _always(TimeKind()), time_from_seconds,
-             "Seconds since 1970 as a time.", (("time_from_seconds(2)", 2_000_000_000),)),
+             "Seconds since 1970 as a time, which has 64 bits in nanoseconds.",
+             (("time_from_seconds(2)", 2_000_000_000),)),
     Function("time_from_milliseconds", (_number(),), _always(TimeKind()), time_from_milliseconds,
-             "Milliseconds since 1970 as a time.", (("time_from_milliseconds(1500)", 1_500_000_000),)),
+             "Milliseconds since 1970 as a time, likewise.",
+             (("time_from_milliseconds(1500)", 1_500_000_000),)),
 )  # fmt: skip
 
 FUNCTIONS: Mapping[str, Function] = {function.name: function for function in _DECLARED}

@@ -29,6 +29,7 @@ from router.compiler.expressions.kinds import (
 )
 from router.compiler.expressions.scope import ExpressionError, Typed
 from router.compiler.expressions.syntax import forbidden
+from router.compiler.source import call
 from router.errors import Code, SourceSpan
 
 WIDEST = 512
@@ -109,6 +110,15 @@ _DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
 
 
 # arithmetic
+
+
+def as_float(operand: Typed, kind: Kind) -> Typed:
+    """An operand of what gives a value of `kind`: where that is a float, an integer becomes one."""
+    if not isinstance(kind, FloatKind) or as_int(operand.kind) is None:
+        return operand
+    node = operand.node
+    made = ast.Constant(float(node.value)) if isinstance(node, ast.Constant) else call("float64", node)  # type: ignore[arg-type]
+    return Typed.at(operand.span, kind, made)
 
 
 def unary(op: ast.unaryop, operand: Typed, span: SourceSpan) -> Typed:
@@ -249,7 +259,7 @@ def choice(test: Typed, body: Typed, orelse: Typed, span: SourceSpan) -> Typed:
     if kind is None:
         message = f"this is {body.kind} or {orelse.kind}, which no field holds"
         raise ExpressionError(span, Code.TYPE_MISMATCH, message)
-    return Typed.at(span, kind, ast.IfExp(test.node, body.node, orelse.node))
+    return Typed.at(span, kind, ast.IfExp(test.node, *[as_float(each, kind).node for each in (body, orelse)]))
 
 
 def want_bool(operand: Typed, word: str) -> None:
