@@ -5,7 +5,7 @@ A value that a field cannot hold raises MappingError.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from typing import Any, NamedTuple, TypeVar
 
 from router.compiler.cdr.primitives import (
@@ -43,7 +43,19 @@ def entries(values: Mapping[Any, object]) -> tuple[Entry, ...]:
     return tuple(Entry(key, values[key]) for key in sorted(values))
 
 
-# checks of values that fill fields; tables cannot call these
+# checks of values that are read, or fill fields; tables cannot call these
+
+
+def checked_text(x: str | bytes) -> str:
+    """Return text that protobuf did not check: it gives bytes where they are no UTF-8."""
+    if isinstance(x, str):
+        return x
+    raise MappingError(f"{x!r} is no text")
+
+
+def checked_texts(values: Sequence[str | bytes]) -> Sequence[str]:
+    """Return a list of such texts."""
+    return [checked_text(value) for value in values]
 
 
 def fit(x: int, low: int, high: int) -> int:
@@ -78,7 +90,7 @@ def fit_length(values: Values, least: int, most: int) -> Values:
 
 
 _CALLED = (
-    entries, fit, fit_length, fit_text, fit_wide_text,
+    checked_text, checked_texts, entries, fit, fit_length, fit_text, fit_wide_text,
     put_text, put_wide_text, put_numbers, put_length, want_length,
     refuse, cut_off, text, texts, wide_text, wide_texts, numbers,
 )  # fmt: skip

@@ -97,7 +97,8 @@ class Field:
 
     `number` is the protobuf field number (0 for ROS). `has_presence` says that "not set" differs from
     the default, `is_required` that there is no message without it (proto2, and both parts of a map entry).
-    `oneof` is the protobuf oneof that it is a member of; an optional field may have one of its own.
+    `oneof` is the protobuf oneof that it is a member of; an optional field may have one of its own. `is_unchecked` text
+    may be something else than UTF-8, as in proto2: protobuf then gives bytes.
     `default` is a ROS field's declared default, None where the type's zero is meant. `comment` is the
     documentation beside it, as one line.
     """
@@ -110,6 +111,7 @@ class Field:
     oneof: str | None = None
     default: object = None
     comment: str = ""
+    is_unchecked: bool = False
 
 
 @dataclass(eq=False, slots=True)

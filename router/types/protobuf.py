@@ -33,6 +33,7 @@ from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, Messa
 from router.types.proto_files import OPTIONS, PROTO, Folder, envelope_file, reached, read_folder
 from router.types.proto_source import Part, ProtoSources
 from router.types.protoc import WELL_KNOWN, check_protos, compile_protos, findings_of
+from router.types.wire import validates_text
 
 MessageClass = type[Message]
 
@@ -322,6 +323,7 @@ def build_types(
                 is_required=field.is_required or messages[message.full_name].is_map_entry,
                 oneof=field.containing_oneof.name if field.containing_oneof else None,
                 comment=sources.comment(f"{message.full_name}.{field.name}"),
+                is_unchecked=field.type == FieldDescriptor.TYPE_STRING and not validates_text(field),
             )
             for field in message.fields
         )

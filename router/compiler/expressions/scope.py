@@ -66,6 +66,8 @@ def value_of(message: ast.expr, member: Field) -> ast.expr:
     """A field of a message object. A protobuf map is read as the list of its entries."""
     value = attribute(message, member.name)
     element = member.type.element if isinstance(member.type, List) else None
+    if member.is_unchecked:
+        return call("checked_texts" if element else "checked_text", value)
     return call("entries", value) if isinstance(element, MessageType) and element.is_map_entry else value
 
 
