@@ -11,7 +11,8 @@ enum { HEADER = 4, FIRST_CAPACITY = 4096 };
 bool composer_open(struct composer *composer) {
     memset(composer, 0, sizeof *composer);
     composer->fields.slots = calloc(UINT16_MAX + 1, sizeof *composer->fields.slots);
-    composer->fields.cells = malloc(MOST_CELLS * sizeof *composer->fields.cells);
+    composer->fields.cells = malloc(FIRST_CELLS * sizeof *composer->fields.cells);
+    composer->fields.cell_capacity = FIRST_CELLS;
     composer->text = malloc(MOST_TEXT);
     composer->message.data = malloc(FIRST_CAPACITY);
     composer->message.capacity = FIRST_CAPACITY;
@@ -264,8 +265,6 @@ static struct value current(const struct composer *composer, const struct loop *
 static void advance(struct composer *composer, struct loop *loop) {
     if (loop->byte) loop->byte++;
     else loop->cell = composer->fields.cells[loop->cell].next;
-    composer->fields.cell_count = loop->cell_count;
-    composer->text_size = loop->text_size;
 }
 
 /* ---- execution ---- */
@@ -298,10 +297,9 @@ static int execute(struct composer *composer, const struct operation *operations
     struct value *slots = fields->slots;
     struct composed *message = &composer->message;
     struct value *top = composer->stack; /* the first one is never used; `top[1]` is what an operation has taken off */
-    struct loop loops[MOST_LOOPS + 1], *loop = loops; /* nor is the first of these */
+    struct loop loops[MOST_LOOPS + 2], *loop = loops; /* nor is the first of these */
     bool outside;
     int64_t ignored;
-    composer->text_size = 0;
     for (const struct operation *op = operations, *end = operations + count; op < end; op++) {
         switch ((enum operation_kind)op->kind) {
         case OP_INTEGER: (++top)->integer = op->integer; break;
@@ -407,6 +405,8 @@ static int execute(struct composer *composer, const struct operation *operations
             break;
         }
         case OP_AGAIN:
+            fields->cell_count = loop->cell_count;
+            composer->text_size = loop->text_size;
             if (--loop->left) {
                 advance(composer, loop);
                 *++top = current(composer, loop);
@@ -427,16 +427,25 @@ static int execute(struct composer *composer, const struct operation *operations
     return COMPOSED;
 }
 
+/* Execute a program. What it has taken of cells and text is free again. */
+static int run(struct composer *composer, const struct operation *operations, uint32_t count, uint32_t *at) {
+    uint32_t cell_count = composer->fields.cell_count;
+    int outcome = execute(composer, operations, count, at);
+    composer->fields.cell_count = cell_count;
+    composer->text_size = 0;
+    return outcome;
+}
+
 int compose(struct composer *composer, const struct operation *operations, uint32_t count, uint32_t *at) {
     static const uint8_t CDR_LE[HEADER] = {0, 1, 0, 0};
     memcpy(composer->message.data, CDR_LE, sizeof CDR_LE);
     composer->message.size = sizeof CDR_LE;
-    return execute(composer, operations, count, at);
+    return run(composer, operations, count, at);
 }
 
 int compose_condition(struct composer *composer, const struct operation *operations, uint32_t count, bool *is_true,
                       uint32_t *at) {
-    int outcome = execute(composer, operations, count, at);
+    int outcome = run(composer, operations, count, at);
     *is_true = composer->stack[1].integer;
     return outcome;
 }

@@ -15,7 +15,7 @@
 
 enum {
     MOST_STACKED = 256,  /* values at a time, and one that is not used */
-    MOST_LOOPS = 8,      /* lists in lists */
+    MOST_LOOPS = 8,      /* lists in lists, and one more to check texts */
     MOST_TEXT = 1 << 20  /* bytes of text that a program puts together: the compiler has added them up */
 };
 

@@ -1,5 +1,6 @@
 #include "fields.h"
 
+#include <stdlib.h>
 #include <string.h>
 
 #include "wire.h"
@@ -83,8 +84,18 @@ static bool read_scalar(struct bytes *from, enum field_type type, struct value *
     return true;
 }
 
+static bool has_cell(struct fields *fields) {
+    if (fields->cell_count < fields->cell_capacity) return true;
+    uint32_t capacity = 2 * fields->cell_capacity;
+    struct cell *cells = realloc(fields->cells, capacity * sizeof *cells);
+    if (!cells) return false;
+    fields->cells = cells;
+    fields->cell_capacity = capacity;
+    return true;
+}
+
 static bool add(struct fields *fields, struct value *list, struct value element) {
-    if (fields->cell_count == MOST_CELLS) return false;
+    if (!has_cell(fields)) return false;
     uint32_t index = fields->cell_count++;
     fields->cells[index].value = element;
     if (list->size++) fields->cells[list->list.last].next = index;

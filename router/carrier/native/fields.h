@@ -13,7 +13,7 @@
 #include "envelope.h"
 
 enum {
-    MOST_CELLS = MAX_DATAGRAM, /* elements of lists: each takes a byte of the datagram at least */
+    FIRST_CELLS = MAX_DATAGRAM, /* enough for a datagram: each element of a list takes a byte of it at least */
     MOST_NODES_DEEP = 32       /* messages in messages */
 };
 
@@ -82,8 +82,8 @@ struct fields {
     const struct node *nodes;
     const struct value *defaults; /* what slots hold where nothing was read */
     struct value *slots;
-    struct cell *cells; /* MOST_CELLS */
-    uint32_t cell_count;
+    struct cell *cells; /* grows where messages in lists are read more than once */
+    uint32_t cell_count, cell_capacity;
 };
 
 /* Read a message of `size` bytes into the slots of a node, which have their defaults. */
