@@ -1,16 +1,17 @@
-"""Hypothesis strategies: messages as bytes that protobuf parses, with fields in any order, several times, or unknown."""
+"""Messages at random, as protobuf parses them: with fields in any order, several times, or unknown."""
 
 from __future__ import annotations
 
 import math
+import random
 import struct
 from functools import cache
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 from hypothesis import strategies as st
 
-from router.types.descriptors import message_of
-from router.types.wire import parses
+from router.types.protobuf import PayloadCase
+from router.types.wire import delimited, parses
 from tests.engine.wire import I32, I64, LEN, VARINT, tag, varint
 
 GROUP, GROUP_END = 3, 4
@@ -23,64 +24,70 @@ _ZIGZAG = {_F.TYPE_SINT32, _F.TYPE_SINT64}
 
 _INTEGERS = (0, 0, 1, 2, 3, 9, -1, -7, 127, 128, 255, 256, 300, 32767, -32769, (1 << 24) + 1, (1 << 31) - 1, -(1 << 31),
              (1 << 32) - 1, 1 << 32, (1 << 53) + 1, (1 << 63) - 1, -(1 << 63), (1 << 64) - 1)  # fmt: skip
-_FLOATS = (0.0, -0.0, 0.5, 1.0, -1.5, 2.5, 90.0, 360.5, 1e-45, 1e38, -3.4028234663852886e38, 1e9, 1.7e308, -1e300, 5e-324,
-           math.inf, -math.inf, math.nan)  # fmt: skip
+_FLOATS = (0.0, -0.0, 0.5, 1.0, -1.5, 2.5, 90.0, 360.5, 1e-45, 1e38, -3.4028234663852886e38, 1e9, 1.7e308, -1e300,
+           5e-324, math.inf, -math.inf, math.nan)  # fmt: skip
 _TEXTS = ("", "", "a", "é", "\0", "abcdefgh" * 3, "\U0001f600", "\uffff", "a\0b")
 _NOT_UTF8 = (b"\xff", b"\xed\xa0\x80", b"a\xc3")
-_INTEGER = st.sampled_from(_INTEGERS) | st.integers(-(1 << 63), (1 << 64) - 1)
-_SINGLE = st.sampled_from(
-    [struct.pack("<f", each) for each in _FLOATS if abs(each) < 3.5e38 or not math.isfinite(each)]
-)
-_DOUBLE = st.sampled_from([struct.pack("<d", each) for each in _FLOATS])
-_TEXT = st.sampled_from([*(text.encode() for text in _TEXTS), b"x" * 300])
+_SINGLES = [struct.pack("<f", each) for each in _FLOATS if abs(each) < 3.5e38 or not math.isfinite(each)]
+_DOUBLES = [struct.pack("<d", each) for each in _FLOATS]
+_STRINGS = [*(text.encode() for text in _TEXTS), b"x" * 300]
+
+
+def payloads(case: PayloadCase) -> st.SearchStrategy[list[bytes]]:
+    """Several at a time, all of which protobuf parses. They do not shrink, but there can be many of them."""
+    descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's
+
+    def some(seed: int) -> list[bytes]:
+        noise = random.Random(seed)
+        return [data for _ in range(10) if parses(descriptor, data := _message(noise, descriptor, _DEEPEST))]
+
+    return st.integers(0, (1 << 64) - 1).map(some)
 
 
 @cache
-def messages(descriptor: Descriptor) -> st.SearchStrategy[bytes]:
-    """Those that protobuf parses."""
-    return _message(descriptor, _DEEPEST).filter(lambda data: parses(descriptor, data))
+def _fields(descriptor: Descriptor) -> list[FieldDescriptor]:
+    return list(descriptor.fields)
 
 
-@cache
-@st.composite
-def _message(draw: st.DrawFn, descriptor: Descriptor, depth: int) -> bytes:
-    fields = [field for field in descriptor.fields if depth or field.message_type is None]
-    count = draw(st.sampled_from([0, 1, 2, 3, 5, min(12, len(fields))])) if fields else 0
-    parts = [draw(_field(draw(st.sampled_from(fields)), depth)) for _ in range(count)]
-    if draw(st.integers(0, 9)) == 9:
-        parts.append(tag(draw(st.sampled_from([18999, 77])), LEN) + b"\x02\x08\x01")
+def _message(noise: random.Random, descriptor: Descriptor, depth: int) -> bytes:
+    fields = _fields(descriptor)
+    count = noise.choice((0, 1, 2, 3, 5, len(fields), 2 * len(fields))) if fields else 0
+    parts = [_field(noise, noise.choice(fields), depth) for _ in range(count)]
+    if noise.random() < 0.1:
+        parts.append(tag(noise.choice((18999, 77)), LEN) + b"\x02\x08\x01")
     return b"".join(parts)
 
 
-@cache
-@st.composite
-def _field(draw: st.DrawFn, field: FieldDescriptor, depth: int) -> bytes:
-    if field.type == _F.TYPE_GROUP:
-        inner = draw(_message(message_of(field), depth - 1))
-        return tag(field.number, GROUP) + inner + tag(field.number, GROUP_END)
+def _field(noise: random.Random, field: FieldDescriptor, depth: int) -> bytes:
     if field.message_type is not None:
-        return _delimited(field.number, draw(_message(message_of(field), depth - 1)))
+        inner = _message(noise, field.message_type, depth - 1) if depth else b""
+        if field.type == _F.TYPE_GROUP:
+            return tag(field.number, GROUP) + inner + tag(field.number, GROUP_END)
+        return delimited(field.number, inner)
     if field.type in {_F.TYPE_STRING, _F.TYPE_BYTES}:
-        return _delimited(field.number, draw(_TEXT | st.sampled_from(_NOT_UTF8)))
-    if field.is_repeated and draw(st.booleans()):
-        return _delimited(field.number, b"".join(draw(st.lists(_scalar(field), max_size=4))))
+        is_text = noise.random() < 0.95
+        return delimited(field.number, noise.choice(_STRINGS if is_text else _NOT_UTF8))
+    if field.is_repeated and noise.random() < 0.5:
+        return delimited(field.number, b"".join(_scalar(noise, field) for _ in range(noise.randrange(5))))
     wire_type = I32 if field.type in _FIXED32 else I64 if field.type in _FIXED64 else VARINT
-    return tag(field.number, wire_type) + draw(_scalar(field))
+    return tag(field.number, wire_type) + _scalar(noise, field)
 
 
-def _scalar(field: FieldDescriptor) -> st.SearchStrategy[bytes]:
+def _scalar(noise: random.Random, field: FieldDescriptor) -> bytes:
+    is_edge = noise.random() < 0.6
+    real = round(noise.uniform(-1000, 1000), noise.randrange(4))
     if field.type == _F.TYPE_FLOAT:
-        return _SINGLE | st.binary(min_size=4, max_size=4)
+        return noise.choice(_SINGLES) if is_edge else noise.choice((noise.randbytes(4), struct.pack("<f", real)))
     if field.type == _F.TYPE_DOUBLE:
-        return _DOUBLE | st.binary(min_size=8, max_size=8)
+        return noise.choice(_DOUBLES) if is_edge else noise.choice((noise.randbytes(8), struct.pack("<d", real)))
+    number = noise.choice(_INTEGERS) if is_edge else noise.choice((noise.randrange(1000), noise.getrandbits(64)))
     if field.type in _FIXED32:
-        return _INTEGER.map(lambda number: struct.pack("<I", number & 0xFFFF_FFFF))
+        return struct.pack("<I", number & 0xFFFF_FFFF)
     if field.type in _FIXED64:
-        return _INTEGER.map(lambda number: struct.pack("<Q", number & (1 << 64) - 1))
-    if field.enum_type is not None:
-        numbers = [value.number for value in field.enum_type.values]
-        return (st.sampled_from(numbers) | st.sampled_from(_INTEGERS)).map(_varint)
-    return _INTEGER.map(_zigzag if field.type in _ZIGZAG else _varint)
+        return struct.pack("<Q", number & (1 << 64) - 1)
+    if field.enum_type is not None and noise.random() < 0.7:
+        number = noise.choice(field.enum_type.values).number
+    return _zigzag(number) if field.type in _ZIGZAG else _varint(number)
 
 
 def _varint(number: int) -> bytes:
@@ -89,7 +96,3 @@ def _varint(number: int) -> bytes:
 
 def _zigzag(number: int) -> bytes:
     return varint((number << 1 ^ number >> 63) & (1 << 64) - 1)
-
-
-def _delimited(number: int, content: bytes) -> bytes:
-    return tag(number, LEN) + varint(len(content)) + content

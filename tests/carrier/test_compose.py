@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from ctypes import CDLL
 from functools import cache
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, assume, event, given, settings
+from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 from router.compiler import check_table
@@ -20,15 +21,15 @@ from router.compiler.program import Handler, Program
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
 from tests.carrier.compositions import FILTERED, Composer, both
-from tests.carrier.messages import messages
+from tests.carrier.messages import payloads
 from tests.compiler.compiling import AUTO, Published, field_map
 from tests.compiler.generated_types import defaults
 from tests.compiler.payloads import Wire, made_wire, wire_of
 from tests.compiler.test_expressions import filled_fields, texts
 from tests.tables import ROUTES
 
-MANY = settings(max_examples=20 * settings().max_examples, suppress_health_check=list(HealthCheck))
-SOME = settings(max_examples=2 * settings().max_examples, suppress_health_check=list(HealthCheck))
+MANY = settings(max_examples=10 * settings().max_examples, suppress_health_check=list(HealthCheck))
+SOME = settings(max_examples=settings().max_examples, suppress_health_check=list(HealthCheck))
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "tables"
 F32, F64, U8, I16, I32, U32, I64, U64 = (
     Float(32), Float(64), Int(8, False), Int(16, True), Int(32, True), Int(32, False), Int(64, True), Int(64, False)
@@ -84,26 +85,22 @@ def _assert_same(library: CDLL, program: Program, number: int, handler: Handler)
     carried = program.lowered[handler.route].targets
 
     @SOME
-    @given(messages(handler.case.message_class.DESCRIPTOR), st.data())
-    def same(payload: bytes, data: st.DataObject) -> None:
-        expected = in_python(parse(payload))
-        assert {topic: carrier(payload, topic) for topic in carried} == expected
-        envelope = data.draw(_around(program, number, payload))
-        parsed = program.envelope.message_class.FromString(envelope)
-        assume(parsed.WhichOneof(program.envelope.oneof) == handler.case.name)
-        expected = in_python(getattr(parsed, handler.case.name))
-        assert {topic: carrier(envelope, topic, is_single=False) for topic in carried} == expected
+    @given(payloads(handler.case), st.randoms())
+    def same(made: list[bytes], noise: random.Random) -> None:
+        for payload in made:
+            expected = in_python(parse(payload))
+            assert {topic: carrier(payload, topic) for topic in carried} == expected
+            parts = [delimited(number, payload), delimited(number, noise.choice(made)), delimited(30, b"unknown")]
+            parts.append(delimited(noise.choice([*program.inbound]), b""))
+            noise.shuffle(parts)
+            envelope = b"".join(parts)
+            parsed = program.envelope.message_class.FromString(envelope)
+            if parsed.WhichOneof(program.envelope.oneof) != handler.case.name:
+                continue
+            expected = in_python(getattr(parsed, handler.case.name))
+            assert {topic: carrier(envelope, topic, is_single=False) for topic in carried} == expected
 
     same()
-
-
-@st.composite
-def _around(draw: st.DrawFn, program: Program, number: int, payload: bytes) -> bytes:
-    """An envelope with a payload in several parts, perhaps another case between them, and an unknown field."""
-    cut = draw(st.sampled_from([payload, b""]))
-    parts = [delimited(number, payload), delimited(number, cut), delimited(30, b"unknown")]
-    parts.append(delimited(draw(st.sampled_from(sorted(program.inbound))), b""))
-    return b"".join(draw(st.permutations(parts)))
 
 
 # ---- random mappings
@@ -141,7 +138,7 @@ def _messages_of(draw: st.DrawFn, payload: MessageType, depth: int) -> MessageTy
         return MessageType("made/msg/Empty")
     chosen = draw(st.lists(st.sampled_from(fields), min_size=1, unique=True))
     made = [Field(field.name, draw(targets(field.type, depth - 1))) for field in chosen]
-    unset = st.sampled_from([F64, I16, String(), List(F32, 2), List(I64)])
+    unset: st.SearchStrategy[Type] = st.sampled_from([F64, I16, String(), List(F32, 2), List(I64)])
     for place, declared in enumerate(draw(st.lists(unset, max_size=3))):
         made.append(Field(f"unset_{place}", declared, default=draw(defaults(declared))))
     return MessageType("made/msg/Made", tuple(draw(st.permutations(made))))
@@ -176,8 +173,7 @@ def test_random_mappings_make_the_same_messages(
     except AssertionError:
         event("nothing in common")
         return
-    for _ in range(3):
-        payload = data.draw(messages(case.message_class.DESCRIPTOR))
+    for payload in data.draw(payloads(case)):
         expected = python(payload)
         event(expected if isinstance(expected, str) else "published")
         assert carrier(payload) == expected
@@ -202,8 +198,7 @@ def test_random_expressions_have_the_same_values(
     except Unlowered as reason:
         event(f"needs Python: {str(reason).rsplit(': ', maxsplit=1)[-1]}")
         return
-    for _ in range(5):
-        payload = data.draw(messages(case.message_class.DESCRIPTOR))
+    for payload in data.draw(payloads(case)):
         expected = python(payload)
         event(expected if isinstance(expected, str) else "published")
         assert carrier(payload) == expected, (text, when)

@@ -14,7 +14,7 @@ from google.protobuf.descriptor import Descriptor
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.executors import CARRIER, Executor, Executors
 from router.compiler.expressions import ParsedReads
-from router.compiler.lowering.expressions import Lowering, Names
+from router.compiler.lowering.expressions import Lowering, Names, readable
 from router.compiler.lowering.messages import MessageWriter, Unlowered
 from router.compiler.lowering.operations import (
     MAX_DATAGRAM,
@@ -140,8 +140,15 @@ def _name_messages(names: Names, target: CheckedTarget, payload: Node) -> None:
     for path, variable in reads.variables.items():
         node = payload
         for name in path:
-            node = node.message(name)
+            node = node.message(_readable_message(node, name, target))
         names.messages[variable] = node
+
+
+def _readable_message(node: Node, name: str, target: CheckedTarget) -> str:
+    try:
+        return readable(node, name).name
+    except NeedsPython as reason:
+        raise Unlowered(target.label, str(reason), target.span) from None
 
 
 def _target(target: CheckedTarget, lowering: Lowering) -> LoweredTarget:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 from google.protobuf.descriptor import FieldDescriptor
@@ -51,7 +51,6 @@ from router.compiler.lowering.values import (
     want_signed,
 )
 from router.types.descriptors import message_of
-from router.types.wire import validates_text
 
 _ELEMENTS = 0, 0xFFFF_FFFF
 
@@ -181,16 +180,21 @@ class Lowering:
                 return (*listed.code, *operations), entered
             case _ if (member := _member(node)) is not None:
                 code, holder_node = self.message(member[0])
-                return code, holder_node.message(_readable(holder_node, member[1]).name)
+                return code, holder_node.message(readable(holder_node, member[1]).name)
         raise NeedsPython("it uses whole messages")
 
     def listed(self, node: ast.expr) -> Listed:
         """The list that an expression is."""
+        match node:
+            case ast.Call(ast.Name("checked_texts"), [inner]):
+                made = self.listed(inner)
+                check = Operation(Op.EACH, made.slot, size=3), *map(Operation, (Op.UTF8, Op.DROP, Op.AGAIN))
+                return replace(made, code=(*made.code, *check))
         if (member := _member(node)) is None:
             is_map = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "entries"
             raise NeedsPython("it reads a map" if is_map else "it makes a list")
         code, holder = self.message(member[0])
-        declared = _readable(holder, member[1])
+        declared = readable(holder, member[1])
         is_octets = declared.type == FieldDescriptor.TYPE_BYTES
         if not declared.is_repeated and not is_octets:
             raise NeedsPython("it uses whole messages")
@@ -200,16 +204,15 @@ class Lowering:
         member = _member(node)
         assert member is not None  # noqa: S101 - its callers have matched one
         code, holder = self.message(member[0])
-        declared = _readable(holder, member[1])
+        declared = readable(holder, member[1])
         if declared.is_repeated or declared.message_type is not None:
             raise NeedsPython("it uses whole messages")
-        return loaded(code, holder.value(declared.name), declared)
+        return Value((*code, Operation(Op.LOAD, holder.value(declared.name))), type_of(declared))
 
     def _element(self, listed: Listed, index: int) -> Value:
         if listed.is_octets or listed.field.message_type is not None:
             raise NeedsPython("it uses whole messages")
-        made = Value((*listed.code, Operation(Op.ELEMENT, listed.slot, number=index)), type_of(listed.field))
-        return _checked(made, listed.field)
+        return Value((*listed.code, Operation(Op.ELEMENT, listed.slot, number=index)), type_of(listed.field))
 
     # names
 
@@ -359,7 +362,7 @@ def _member(node: ast.expr) -> tuple[ast.expr, str] | None:
     return None
 
 
-def _readable(holder: Node, name: str) -> FieldDescriptor:
+def readable(holder: Node, name: str) -> FieldDescriptor:
     """The field of a message, if the carrier reads it as protobuf does."""
     declared = holder.descriptor.fields_by_name[name]
     if declared.type == FieldDescriptor.TYPE_GROUP:
@@ -385,17 +388,6 @@ def type_of(declared: FieldDescriptor) -> Type:
             return Octets()
         case _:
             return Real()
-
-
-def loaded(before: Code, slot: Slot, declared: FieldDescriptor) -> Value:
-    """A value that was read from a field."""
-    return _checked(Value((*before, Operation(Op.LOAD, slot)), type_of(declared)), declared)
-
-
-def _checked(value: Value, declared: FieldDescriptor) -> Value:
-    """Text that parsing has not checked, as in proto2, is checked when it is used."""
-    is_unchecked = isinstance(value.type, Text) and not validates_text(declared)
-    return value.then(Op.UTF8) if is_unchecked else value
 
 
 # ---- operators
@@ -565,11 +557,6 @@ def _time(value: Value, factor: int) -> Value:
             return fit(_rounded(Op.ROUND, product), integer(INT64[0]), integer(INT64[1]))
 
 
-def _float32(value: Value) -> Value:
-    """A large integer stays one, as in Python: it becomes a float32 where it fills one."""
-    return value if isinstance(value.type, Integer) else value.then(Op.FLOAT32)
-
-
 def _int(value: Value) -> Value:
     return Value(value.code, Integer(0, 1)) if isinstance(value.type, Truth) else value
 
@@ -582,13 +569,14 @@ def _fit_text(value: Value, most: Value) -> Value:
 
 _FUNCTIONS: Mapping[str, Callable[..., Value]] = {
     "abs": _absolute,
+    "checked_text": lambda text: text.then(Op.UTF8),
     "min": _extreme(Op.LEAST, Op.REAL_LEAST, min),
     "max": _extreme(Op.GREATEST, Op.REAL_GREATEST, max),
     "clamp": _clamped,
     "wrap": _wrapped,
     "fit": fit,
     "fit_text": _fit_text,
-    "float32": _float32,
+    "float32": lambda x: to_real(x).then(Op.FLOAT32),
     "float64": to_real,
     "int": _int,
     "seconds": lambda time: time.then(Op.SECONDS, Real()),
