@@ -358,7 +358,12 @@ class NativeDatapath:
             return True
         late = left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
         has_published = self._publishing.wait_for(wiring.native.generation, _PATIENCE_S)
-        return not late and has_published and self._has_turned() and all(commands.has_passed for commands in self._commands)
+        return (
+            not late
+            and has_published
+            and self._has_turned()
+            and all(commands.has_passed for commands in self._commands)
+        )
 
     def _has_turned(self) -> bool:
         """Wait until the receive thread is done with what it now handles: it may be dropping an earlier message."""
