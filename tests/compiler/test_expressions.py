@@ -242,6 +242,38 @@ def test_inferred_kind(text: str, kind: Kind) -> None:
     assert typed.kind == kind
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["min(i32, f32)", "max(i32, -inf)", "clamp(f32, 0, 9)", "i32 if flag else f32", "float32(i32)",
+     "float32(round(f64))", "mode if flag else 0.5"],
+)  # fmt: skip
+def test_integer_is_a_float_where_an_expression_gives_either(text: str) -> None:
+    """So that `-clamp(x, 0, 9)` is -0.0, like every other float."""
+    message = SimpleNamespace(i32=0, f32=-1.0 if "clamp" in text else 1.0, f64=0.25, flag=True, mode=0)
+    for whole, value in ((text, "0.0"), (f"-({text})", "-0.0"), (f"({text}) * -3", "-0.0")):
+        _, run = compiled(whole, scope_of(SOURCE, [MODE]))
+        assert repr(run(message)) == value
+        assert repr(evaluate(written(whole), context_of(message, SOURCE, [MODE]))) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "time"),
+    [
+        ("time_from_seconds(9223372036)", 9223372036 * 10**9),
+        ("time_from_seconds(9223372037)", None),
+        ("time_from_seconds(-9223372036.854775)", -9223372036854774784),
+        ("time_from_seconds(9223372036.854775807)", None),
+        ("time_from_milliseconds(-9223372036854)", -9223372036854 * 10**6),
+        ("time_from_milliseconds(u64)", None),
+        ("time_from_milliseconds(1e300)", None),
+    ],
+)
+def test_a_time_has_64_bits(text: str, time: int | None) -> None:
+    _, run = compiled(text, scope_of(SOURCE))
+    message = SimpleNamespace(u64=(1 << 64) - 1)
+    assert outcome(lambda: run(message)) == (MAPPING_FAILURES if time is None else time)
+
+
 def test_bounds_of_clamp_and_wrap_come_from_the_field() -> None:
     for text in ("clamp(i32)", "wrap(i32) if flag else clamp(u64)"):
         typed, _ = compiled(text, scope_of(SOURCE, [MODE]), Int(8, signed=False))
