@@ -108,6 +108,14 @@ static double modulo(double a, double b) {
     return (b < 0) != (remainder < 0) ? remainder + b : remainder;
 }
 
+/* Python has one NaN for what these make of any. */
+static double angle(double y, double x) { return isnan(x) || isnan(y) ? (double)NAN : atan2(y, x); }
+
+static double length(double x, double y) {
+    double result = hypot(x, y);
+    return isnan(result) ? (double)NAN : result;
+}
+
 /* A whole number has no negative zero. */
 static double whole(double number) { return number + 0.0; }
 
@@ -348,8 +356,8 @@ static int execute(struct composer *composer, const struct operation *operations
         case OP_SIN: FUNCTION(sin)
         case OP_COS: FUNCTION(cos)
         case OP_TAN: FUNCTION(tan)
-        case OP_ATAN2: top--; top->real = atan2(top->real, top[1].real); break;
-        case OP_HYPOT: top--; top->real = hypot(top->real, top[1].real); break;
+        case OP_ATAN2: top--; top->real = angle(top->real, top[1].real); break;
+        case OP_HYPOT: top--; top->real = length(top->real, top[1].real); break;
         case OP_FLOAT32: WANT(fits_float32(top->real));
 
         case OP_INTEGER_TO_REAL: top->real = op->flag ? (double)(uint64_t)top->integer : (double)top->integer; break;

@@ -287,11 +287,11 @@ class Lowering:
                 raise NeedsPython("it looks into a list of the message")
         sought = self._named(f"sought {len(self.names.temporaries)}", self.value(node.left))
         again = Value((Operation(Op.LOAD, sought.code[-1].slot),), sought.type)
-        found = (*sought.code, Operation(Op.DROP), *integer(0).code)
+        found = [*sought.code, Operation(Op.DROP), *integer(0).code]
         for each in elements:
-            code = _compared(Relation.EQUAL, again, self.value(each)).code
-            found = (*found, *code, Operation(Op.EITHER))
-        return Value((*found, Operation(Op.NOT)) if isinstance(op, ast.NotIn) else found, Truth())
+            found += *_compared(Relation.EQUAL, again, self.value(each)).code, Operation(Op.EITHER)
+        made = Value(tuple(found), Truth())
+        return made.then(Op.NOT) if isinstance(op, ast.NotIn) else made
 
     def _choice(self, node: ast.IfExp) -> Value:
         test = self.value(node.test)
@@ -408,10 +408,11 @@ def _constant(value: object) -> Value:
 
 def _chained(op: Op, codes: Sequence[Code]) -> Code:
     """Several truths, of which those behind a decision are not evaluated."""
-    made = codes[-1]
-    for code in reversed(codes[:-1]):
-        made = (*code, Operation(op, len(made)), *made)
-    return made
+    left, made = sum(map(len, codes)) + len(codes) - 1, list[Operation]()
+    for code in codes[:-1]:
+        left -= len(code) + 1
+        made += *code, Operation(op, left)
+    return (*made, *codes[-1])
 
 
 def _unary(op: ast.unaryop, value: Value) -> Value:
@@ -484,15 +485,15 @@ def _absolute(value: Value) -> Value:
 def _extreme(integers: Op, reals: Op, pick: Callable[[list[int]], int]) -> Callable[..., Value]:
     def lowered(*values: Value) -> Value:
         first, *others = alike(values)
-        made, result = first.code, common([first, *others])
+        made, result = [*first.code], common([first, *others])
         is_integer = isinstance(result, Integer)
         if isinstance(result, Integer):
             want_signed(first, *others)
             bounds = [each.type for each in (first, *others) if isinstance(each.type, Integer)]
             result = Integer(pick([each.low for each in bounds]), pick([each.high for each in bounds]))
         for each in others:
-            made = (*made, *each.code, Operation(integers if is_integer else reals))
-        return Value(made, result)
+            made += *each.code, Operation(integers if is_integer else reals)
+        return Value(tuple(made), result)
 
     return lowered
 
