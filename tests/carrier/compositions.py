@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from router.carrier import structures as c
-from router.carrier.build import NATIVE, compile_c, sources
+from router.carrier.build import NATIVE, compile_c
 from router.carrier.publishing import native_route, native_values
 from router.compiler.cdr import write_message
 from router.compiler.checked import CheckedRoute, CheckedTarget
@@ -36,11 +36,11 @@ Compose = Callable[[bytes], "bytes | str"]
 """Returns the message that a payload gives, else FILTERED or why it is refused."""
 
 
-def composing(output: Path, sanitized: bool) -> ctypes.CDLL:
-    """The functions of composing.c, in a library that is made as `output`."""
-    files = [Path(__file__).parent / "composing.c", *(path for path in sources() if path.name != "publishing.c")]
-    flags = [*(sanitizing(MEMORY) if sanitized else ["-O2"]), "-fPIC", "-shared", f"-I{NATIVE}"]
-    compile_c([*flags, *map(str, files), "-o", str(output)], "gcc" if sanitized else None)
+def composing(output: Path, library: Path, *, is_sanitized: bool) -> ctypes.CDLL:
+    """The functions of composing.c, in a library that is made as `output` and uses that of the carrier."""
+    flags = [*(sanitizing(MEMORY) if is_sanitized else ["-O1"]), "-fPIC", "-shared", f"-I{NATIVE}"]
+    files = [str(Path(__file__).parent / "composing.c"), str(library)]
+    compile_c([*flags, *files, "-o", str(output)], "gcc" if is_sanitized else None)
     loaded = ctypes.CDLL(str(output))
     loaded.seam_composing_open.restype, loaded.seam_composing_open.argtypes = c_void_p, (c_void_p,)
     loaded.seam_composing_close.restype, loaded.seam_composing_close.argtypes = None, (c_void_p,)

@@ -45,7 +45,7 @@ def definitions() -> Definitions:
 
 
 @pytest.fixture(scope="session")
-def composing(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+def composing(built: Path, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     """The publish thread's functions: see composing.c."""
     made = tmp_path_factory.mktemp("carrier") / "composing.so"
-    return compositions.composing(made, SANITIZED in os.environ)
+    return compositions.composing(made, built, is_sanitized=SANITIZED in os.environ)

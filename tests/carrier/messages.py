@@ -34,14 +34,15 @@ _STRINGS = [*(text.encode() for text in _TEXTS), b"x" * 300]
 
 
 def payloads(case: PayloadCase) -> st.SearchStrategy[list[bytes]]:
-    """Several at a time, all of which protobuf parses. They do not shrink, but there can be many of them."""
+    """Several at a time. They do not shrink, but there can be many of them."""
+    return st.integers(0, (1 << 64) - 1).map(lambda seed: some_payloads(case, seed))
+
+
+def some_payloads(case: PayloadCase, seed: int) -> list[bytes]:
+    """At most ten, all of which protobuf parses."""
     descriptor: Descriptor = case.message_class.DESCRIPTOR  # type: ignore[assignment]  # or upb's
-
-    def some(seed: int) -> list[bytes]:
-        noise = random.Random(seed)
-        return [data for _ in range(10) if parses(descriptor, data := _message(noise, descriptor, _DEEPEST))]
-
-    return st.integers(0, (1 << 64) - 1).map(some)
+    noise = random.Random(seed)
+    return [data for _ in range(10) if parses(descriptor, data := _message(noise, descriptor, _DEEPEST))]
 
 
 @cache

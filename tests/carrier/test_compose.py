@@ -23,15 +23,15 @@ from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
 from tests.carrier.compositions import FILTERED, Composer, both
-from tests.carrier.messages import payloads
+from tests.carrier.messages import payloads, some_payloads
+from tests.compiler.comparing import same as same_value
 from tests.compiler.compiling import AUTO, Published, field_map
-from tests.compiler.generated_types import defaults
+from tests.compiler.generated_types import EACH_TYPE, defaults
 from tests.compiler.payloads import Wire, made_wire, wire_of
 from tests.compiler.test_expressions import filled_fields, texts
 from tests.tables import ROUTES
 
-MANY = settings(max_examples=10 * settings().max_examples, suppress_health_check=list(HealthCheck))
-SOME = settings(max_examples=settings().max_examples, suppress_health_check=list(HealthCheck))
+MANY = settings(max_examples=6 * settings().max_examples, suppress_health_check=list(HealthCheck))
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "tables"
 F32, F64, U8, I16, I32, U32, I64, U64 = (
     Float(32), Float(64), Int(8, False), Int(16, True), Int(32, True), Int(32, False), Int(64, True), Int(64, False)
@@ -86,7 +86,7 @@ def _assert_same(library: CDLL, program: Program, number: int, handler: Handler)
 
     carried = program.lowered[handler.route].targets
 
-    @SOME
+    @EACH_TYPE
     @given(payloads(handler.case), st.randoms())
     def same(made: list[bytes], noise: random.Random) -> None:
         for payload in made:
@@ -103,6 +103,26 @@ def _assert_same(library: CDLL, program: Program, number: int, handler: Handler)
             assert {topic: carrier(envelope, topic, is_single=False) for topic in carried} == expected
 
     same()
+
+
+def test_rclpy_reads_of_them_what_it_reads_of_those_of_python(composing: CDLL, definitions: Definitions) -> None:
+    pytest.importorskip("rclpy")
+    from tests.compiler.ros_objects import deserialized
+
+    checked = check_table(ROUTES / "rover.yaml", {}, definitions)
+    made = checked.program
+    assert made is not None
+    types = {target.label: target.type.name for route in checked.routes for target in route.targets if target.type}
+    for handlers in made.inbound.values():
+        for handler in handlers:
+            if handler.route not in made.lowered:
+                continue
+            carrier, serve = Composer(composing, made.lowered[handler.route]), Published(made, handler)
+            for payload in some_payloads(handler.case, seed=handler.case.number):
+                for topic, expected in serve(handler.case.message_class.FromString(payload)).items():
+                    message = carrier(payload, topic)
+                    assert isinstance(message, bytes)
+                    assert same_value(deserialized(types[topic], message), deserialized(types[topic], expected))
 
 
 # ---- random mappings
@@ -262,7 +282,7 @@ def test_what_is_lowered_makes_the_same_messages(
     declared = wire[1].cases[case]
     python, carrier = both(composing, wire, declared, fields, target, ros_types=(KINDS,))
 
-    @SOME
+    @EACH_TYPE
     @given(payloads(declared))
     def same(made: list[bytes]) -> None:
         for payload in made:
@@ -313,7 +333,7 @@ def test_hypot_differs_by_the_last_bit_at_most(composing: CDLL) -> None:
     fields, target = field_map(it="hypot(real, single)"), target_of(it=F64)
     python, carrier = both(composing, wire, declared, fields, target)
 
-    @SOME
+    @EACH_TYPE
     @given(payloads(declared))
     def same(made: list[bytes]) -> None:
         for payload in made:
