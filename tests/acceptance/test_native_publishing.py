@@ -1,0 +1,280 @@
+"""What a running router publishes on topics natively and in Python, for ROS software in other processes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from itertools import count
+from pathlib import Path
+from time import sleep, time
+
+import pytest
+
+from router.compiler import check_table
+from tests import ros_child
+from tests.acceptance.gateway_clients import Dashboard
+from tests.acceptance.payloads import WIRE
+from tests.acceptance.site import BARE, RouterProcess, Site, balance, site, total, wait_until
+from tests.ports import free_port
+from tests.ros import peers
+from tests.ros.peers import Subscriber
+
+FLOAT = "std_msgs/msg/Float32"
+_FLOAT = f"type: {FLOAT}, fields: {{{{data: accel_x}}}}"
+IMU_IN_PYTHON, GPS_IN_PYTHON = 'when: str(accel_y) != "x"', 'when: str(hdop) != "x"'
+"""True, and nothing that the carrier evaluates."""
+
+
+def imu(number: float) -> bytes:
+    case = WIRE.case("imu_info")
+    return WIRE.encode(case, case.message_class(accel_x=number))
+
+
+def gps(number: float) -> bytes:
+    case = WIRE.case("gps_info")
+    return WIRE.encode(case, case.message_class(hdop=number))
+
+
+def next_of(subscriber: Subscriber) -> float:
+    """The next message. The topic may have a second publisher, which matches as well."""
+    while (line := subscriber.line()) == "matched":
+        pass
+    (found,) = struct.unpack("<xxxxf", bytes.fromhex(line))
+    return float(found)
+
+
+def taken(subscriber: Subscriber, many: int) -> list[float]:
+    """The next messages."""
+    return [next_of(subscriber) for _ in range(many)]
+
+
+@contextmanager
+def hearing(*topics: str, options: Sequence[str] = ()) -> Iterator[list[Subscriber]]:
+    """A subscriber of each topic; the router has discovered them all by then."""
+    with ExitStack() as closing:
+        opened = [Subscriber(topic, FLOAT, *options) for topic in topics]
+        for each in opened:
+            closing.callback(each.close)
+        for each in opened:
+            assert each.line() == "matched"
+        sleep(0.2)  # the other side learns of it later
+        yield opened
+
+
+@contextmanager
+def running(folder: Path, routes: str) -> Iterator[tuple[Site, RouterProcess]]:
+    with site(folder) as place, RouterProcess(folder, place.table(BARE + routes)) as router:
+        yield place, router
+
+
+@contextmanager
+def sending(place: Site, *makers: type[bytes] | object, period: float = 0.002) -> Iterator[list[int]]:
+    """Datagrams flow meanwhile, each of its makers with the same numbers from 0. Yields how many numbers it was so far."""
+    sent, has_ended = [0], threading.Event()
+
+    def send() -> None:
+        for each in count():
+            for make in makers:
+                place.send("sensor_board", make(float(each)))  # type: ignore[operator]
+            sent[0] = each + 1
+            if has_ended.wait(period):
+                return
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield sent
+    finally:
+        has_ended.set()
+        thread.join()
+
+
+def published_natively(place: Site) -> dict[str, bool]:
+    """By topic: whether the carrier can."""
+    checked = check_table(place.folder / "table.yaml", {})
+    assert checked.program is not None, checked.diagnostics
+    executors = checked.program.executors.items()
+    return {topic: executor.is_carrier for (_, topic, _), executor in executors if topic is not None}
+
+
+BESIDE = f"""\
+routes:
+  imu_info:
+    source: any
+    topics:
+      - {{{{topic: beside_a, {_FLOAT}}}}}
+      - {{{{topic: beside_b, {_FLOAT}, {IMU_IN_PYTHON}}}}}
+      - {{{{topic: beside_latest, {_FLOAT}, keep: latest, max_rate: 1000 Hz}}}}
+      - {{{{topic: beside_shared, {_FLOAT}}}}}
+      - {{{{topic: beside_kept, {_FLOAT}, qos: {{{{durability: transient_local, depth: 5}}}}}}}}
+  gps_info:
+    source: any
+    topics: [{{{{topic: beside_shared, type: {FLOAT}, fields: {{{{data: hdop}}}}, {GPS_IN_PYTHON}}}}}]
+gateways:
+  dashboard:
+    transport: {{{{websocket: 127.0.0.5:DASHBOARD}}}}
+    topics: {{{{include: [/none]}}}}
+    inbound: [{{{{topic: beside_a, type: {FLOAT}}}}}]
+"""
+"""Braces are doubled once for `Site.table`."""
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Site, int]]:
+    """A router with topics of all kinds, and the port of its gateway."""
+    port = free_port(kind=socket.SOCK_STREAM)
+    with running(tmp_path_factory.mktemp("beside"), BESIDE.replace("DASHBOARD", str(port))) as (place, _):
+        assert published_natively(place) == {
+            "beside_a": True,
+            "beside_b": False,
+            "beside_latest": False,
+            "beside_shared": False,
+            "beside_kept": True,
+        }
+        yield place, port
+
+
+def test_topics_of_both_get_all_values_in_order(beside: tuple[Site, int]) -> None:
+    place, _ = beside
+    before = place.scrape()
+    with hearing("beside_a", "beside_b", "beside_latest") as (native, python, latest):
+        for each in range(300):
+            place.send("sensor_board", imu(each))
+            if each % 10 == 0:
+                sleep(0.01)
+        assert taken(native, 300) == taken(python, 300) == list(range(300))
+        values = [0.0]
+        while values[-1] != 299:
+            values += taken(latest, 1)
+        assert values == sorted(values)
+        balance(place.settle(before, 300), ())
+
+
+def test_a_topic_of_two_routes_is_in_order(beside: tuple[Site, int]) -> None:
+    place, _ = beside
+    with hearing("beside_shared") as (shared,):
+        for each in range(0, 200, 2):
+            place.send("sensor_board", imu(each), gps(each + 1))
+            sleep(0.001)
+        assert taken(shared, 200) == list(range(200))
+
+
+def test_who_joins_late_gets_the_last_values(beside: tuple[Site, int]) -> None:
+    place, _ = beside
+    before = place.scrape()
+    place.send("sensor_board", *(imu(1000.0 + each) for each in range(20)))
+    place.settle(before, 20)
+    with hearing("beside_kept", options=("--transient-local",)) as (late,):
+        assert taken(late, 5) == [1015.0, 1016.0, 1017.0, 1018.0, 1019.0]
+
+
+def test_a_gateway_publishes_on_the_topic_of_a_route_at_the_same_time(beside: tuple[Site, int]) -> None:
+    place, port = beside
+    with hearing("beside_a") as (both,), Dashboard(port) as client:
+        before = place.scrape()
+        with sending(place, imu) as sent:
+            for each in range(200):
+                client.ask(op="publish", topic="/beside_a", data={"data": -1.0 - each}, time=time())
+            published = 0
+            while published < 200:
+                published = total(place.changes(before), "messages_published", route="dashboard")
+        found = taken(both, 200 + sent[0])
+        assert [value for value in found if value < 0] == [-1.0 - each for each in range(200)]
+        assert [value for value in found if value >= 0] == list(range(sent[0]))
+
+
+@pytest.mark.parametrize("options", [("--best-effort",), ()])
+def test_a_subscriber_with_a_shared_memory_of_its_own(beside: tuple[Site, int], options: Sequence[str]) -> None:
+    """As one in a container: the middleware takes it for one on this computer, but cannot reach it by shared memory."""
+    place, _ = beside
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        pytest.skip("only root can have a /dev/shm of its own, by unshare")
+    peer = [sys.executable, str(peers.__file__), "subscribe", "beside_a", FLOAT, *options]
+    command = ["unshare", "-m", "sh", "-c", 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', "sh", *peer]
+    environment = {
+        **os.environ,
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(ros_child.__file__).with_suffix(".xml")),
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    with (
+        hearing("beside_a") as (near,),
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as apart,
+    ):
+        assert apart.stdout is not None
+        assert apart.stdin is not None
+        assert apart.stdout.readline() == "matched\n"
+        with sending(place, imu) as sent:
+            wait_until(lambda: sent[0] >= 300)
+        assert taken(near, sent[0]) == list(range(sent[0]))
+        apart.stdin.close()
+        apart.stdout.read()
+        assert apart.wait(60) == 0
+
+
+# ---- subscribers that go
+
+
+def test_subscribers_are_killed_while_datagrams_flow(tmp_path: Path) -> None:
+    routes = f"""\
+routes:
+  imu_info:
+    source: any
+    destinations: [basestation]
+    topics: [{{{{topic: killed_a, {_FLOAT}}}}}, {{{{topic: killed_b, {_FLOAT}, {IMU_IN_PYTHON}}}}}]
+"""
+    with running(tmp_path, routes) as (place, router), hearing("killed_a") as (stays,):
+        with sending(place, imu) as sent:
+            for _ in range(3):
+                killed = [Subscriber(topic, FLOAT, *how) for topic in ("killed_a", "killed_b") for how in _RELIABILITY]
+                for each in killed:
+                    assert each.line() == "matched"
+                    assert next_of(each) >= 0
+                for each in killed:
+                    each.kill()
+        assert [place.receive("basestation") for _ in range(sent[0])] == [imu(each) for each in range(sent[0])]
+        counts = place.settle(Counter(), sent[0])
+        balance(counts, ())
+        lost = total(counts, "messages_dropped", target="killed_a")
+        lost += total(counts, "messages_filtered", target="killed_a")
+        values = taken(stays, sent[0] - lost)
+        assert values == sorted(set(values))
+        assert router.stop(signal.SIGTERM) == 0
+
+
+_RELIABILITY: Sequence[Sequence[str]] = ((), ("--best-effort",))
+
+
+# ---- reloads
+
+
+def test_topics_change_places_in_reloads_while_datagrams_flow(tmp_path: Path) -> None:
+    """Each reload moves one topic from Python to the carrier, and the other one back."""
+    routes = f"""\
+routes:
+  imu_info:
+    source: any
+    topics: [{{{{topic: moved_a, {_FLOAT}, FIRST}}}}, {{{{topic: moved_b, {_FLOAT}, SECOND}}}}]
+"""
+    when = "when: accel_y < 5", IMU_IN_PYTHON
+    tables = [routes.replace("FIRST", first).replace("SECOND", second) for first, second in (when, when[::-1])]
+    with running(tmp_path, tables[0]) as (place, router), hearing("moved_a", "moved_b") as (first, second):
+        with sending(place, imu) as sent:
+            for turn in range(1, 9):
+                place.table(BARE + tables[turn % 2])
+                assert published_natively(place) == {"moved_a": turn % 2 == 0, "moved_b": turn % 2 == 1}
+                router.process.send_signal(signal.SIGHUP)
+                wait_until(lambda: len(router.events("table reloaded")) == turn, "the reload")  # noqa: B023 - at once
+        counts = place.settle(Counter(), sent[0])
+        assert total(counts, "messages_published") == 2 * sent[0]
+        assert taken(first, sent[0]) == list(range(sent[0]))
+        assert taken(second, sent[0]) == list(range(sent[0]))
+        assert not [line for line in router.log() if line["level"] in {"error", "critical"}]
