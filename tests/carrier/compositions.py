@@ -87,6 +87,10 @@ class Composer:
         return reason
 
 
+class Misfit(Exception):
+    """What is wrong with a mapping."""
+
+
 def both(
     library: ctypes.CDLL,
     wire: Wire,
@@ -96,12 +100,13 @@ def both(
     when: str = "",
     ros_types: tuple[MessageType, ...] = (),
 ) -> tuple[Compose, Compose]:
-    """How Python and the carrier compose a mapping without findings. Raises Unlowered, ExpressionError for `when`."""
+    """How Python and the carrier compose a mapping. Raises Unlowered, Misfit, or ExpressionError for `when`."""
     schema, envelope = wire
     scope = Scope(case.type, tuple(schema.enums.values()), ros_types, ParsedReads())
     condition = check(written(when), scope) if when else None
     mapping = build(fields, target, scope, SPAN)
-    assert mapping.findings == []
+    if mapping.findings:
+        raise Misfit(mapping.findings)
     declared = cast("Any", SimpleNamespace(when=when, span=SPAN, endpoint=SimpleNamespace(value=TOPIC)))
     checked = CheckedTarget(declared, None, target, scope.reads, condition, mapping.plan, tuple(mapping.rows))
     route = CheckedRoute(cast("Any", SimpleNamespace(name="route")), case, (checked,))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, event, given, settings
+from hypothesis import HealthCheck, assume, event, given, settings
 from hypothesis import strategies as st
 
 from router.compiler import check_table
@@ -22,7 +22,7 @@ from router.compiler.program import Handler, Program
 from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
-from tests.carrier.compositions import FILTERED, Composer, both
+from tests.carrier.compositions import FILTERED, Composer, Misfit, both
 from tests.carrier.messages import payloads, some_payloads
 from tests.compiler.comparing import same as same_value
 from tests.compiler.compiling import AUTO, Published, field_map
@@ -192,7 +192,7 @@ def test_random_mappings_make_the_same_messages(
     except Unlowered as reason:
         event(f"needs Python: {str(reason).split(':')[-1]}")
         return
-    except AssertionError:
+    except Misfit:
         event("nothing in common")
         return
     for payload in data.draw(payloads(case)):
@@ -210,11 +210,12 @@ def test_random_expressions_have_the_same_values(
     composing: CDLL, filled: tuple[Type, str], when: str, data: st.DataObject
 ) -> None:
     declared, text = filled
+    assume("hypot" not in text + when)  # see below
     wire = source_wire()
     case = wire[1].cases["source"]
     try:
         python, carrier = both(composing, wire, case, field_map(it=text), target_of(before=Bool(), it=declared), when)
-    except (AssertionError, ExpressionError):
+    except (Misfit, ExpressionError):
         event("does not fit")
         return
     except Unlowered as reason:

@@ -137,7 +137,7 @@ class _Evaluator:
                 return self._compare(node)
             case ast.IfExp():
                 chosen = self.visit(node.body if self.visit(node.test) else node.orelse, expected)
-                return float(chosen) if self._is_float(node) else chosen
+                return float(chosen) if self._is_float(node, expected) else chosen
             case ast.Call(func=ast.Name("has")):
                 return self._has(node.args[0])
             case ast.Call(func=ast.Name(name)):
@@ -146,11 +146,11 @@ class _Evaluator:
             case _:
                 raise TypeError(f"{type(node).__name__} is not part of the language")
 
-    def _is_float(self, node: ast.expr) -> bool:
+    def _is_float(self, node: ast.expr, expected: Type | None = None) -> bool:
         """Whether an expression gives a float, whatever is chosen in it."""
         match node:
             case ast.IfExp():
-                return self._is_float(node.body) or self._is_float(node.orelse)
+                return self._is_float(node.body, expected) or self._is_float(node.orelse, expected)
             case ast.UnaryOp():
                 return self._is_float(node.operand)
             case ast.BinOp():
@@ -164,7 +164,7 @@ class _Evaluator:
             case ast.Compare() | ast.BoolOp() | ast.Subscript():
                 return False
             case _:
-                return isinstance(self.visit(node), float)
+                return isinstance(self.visit(node, expected), float)
 
     def _name(self, name: str, expected: Type | None) -> object:
         view = self.context.view
