@@ -22,7 +22,7 @@ from router.compiler.program import Handler, Program
 from router.table.model import FieldMap
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
 from router.types.wire import delimited
-from tests.carrier.compositions import FILTERED, Composer, Misfit, both
+from tests.carrier.compositions import FILTERED, MAPPING_ERROR, Composer, Misfit, both
 from tests.carrier.messages import payloads, some_payloads
 from tests.compiler.comparing import same as same_value
 from tests.compiler.compiling import AUTO, Published, field_map
@@ -325,6 +325,30 @@ def test_what_is_too_much_for_the_carrier_needs_python(
     python, carrier = both(composing, wire, declared, fields, target)
     for payload in (b"", declared.message_class(**({"i32": 7} if case == "scalars" else {})).SerializeToString()):
         assert carrier(payload) == python(payload)
+
+
+@pytest.mark.parametrize("text", [b"", b"a", b"\xff", b"\xed\xa0\x80", "é".encode()])
+@pytest.mark.parametrize(
+    ("it", "declared"),
+    [("text", String()), ("len(text)", U32), ("text == 'a'", Bool()), ("texts", List(String())), ("texts[0]", String()),
+     ("len(texts)", U32), ("needed", I32)],
+)  # fmt: skip
+def test_text_that_protobuf_does_not_check_is_checked_where_it_is_used(
+    composing: CDLL, it: str, declared: Type, text: bytes
+) -> None:
+    wire = hard_wire()
+    case = wire[1].cases["old"]
+    python, carrier = both(composing, wire, case, field_map(it=it), target_of(it=declared))
+    payload = delimited(7, text) + delimited(8, b"first") + delimited(8, text)
+    assert carrier(payload) == python(payload)
+    assert (carrier(payload) == MAPPING_ERROR) == (text[:1] in (b"\xff", b"\xed") and it != "needed")
+
+
+@pytest.mark.parametrize("it", ["single.inside", "message.single.inside", "len(single.nested)"])
+def test_fields_of_a_group_need_python(composing: CDLL, it: str) -> None:
+    wire = hard_wire()
+    with pytest.raises(Unlowered, match="group"):
+        both(composing, wire, wire[1].cases["old"], field_map(it=it), target_of(it=I32 if "len" not in it else U32))
 
 
 def test_hypot_differs_by_the_last_bit_at_most(composing: CDLL) -> None:
