@@ -49,14 +49,19 @@ _INNER = _type(numbers=List(I32), texts=List(String()), points=List(_POINT))
 COMPOSITIONS: list[tuple[str, FieldMap, MessageType, str]] = [
     ("scalars", AUTO, _type(i32=I32, s32=I32, sf32=I32, u32=U32, f32=U32, i64=I64, s64=I64, sf64=I64, u64=U64, f64=U64,
                             single=F32, real=F64, flag=Bool(), text=String(), data=List(U8)), ""),
-    ("scalars", field_map(a="i32 // s32 + i64 % u32", b="round(real * single)", c="source + text + str(u64)",
-                          d="hypot(real, single) ** 0.5", e="clamp(int(real), -5, 5)", f="len(text) - len(data)",
+    ("scalars", field_map(a="i32 // 7 + i64 % -3", b="round(real * single)", c="source + text + str(u64)",
+                          d="hypot(real, single) ** 2", e="clamp(round(real), -5, 5)", f="clamp(len(text) - len(data), -9, 9)",
                           g='text if flag and text < "m" else source'),
      _type(a=I64, b=I64, c=String(), d=F64, e=I32, f=I32, g=String()), 'flag or real > 0.5 or text == "a"'),
+    ("scalars", field_map(a="i32 // s32 + i64 % u32", b="real / single", c="sqrt(real) + sin(single)"),
+     _type(a=I64, b=F64, c=F64), "s32 != 0 and not (u32 < 2)"),
+    ("scalars", field_map(a="wrap(i32, -7, 9)", b="abs(real) % 1.5 + min(single, 2.0) // 0.25", c="clamp(floor(real), -9, 9) + clamp(ceil(single), 0, 7)",
+                          d="atan2(real, single) - max(real, -single)", e="degrees(single)"),
+     _type(a=I32, b=F64, c=I64, d=F64, e=F64), ""),
     ("optional", AUTO, _type(number=I32, single=F32, flag=Bool(), text=String(), data=List(U8), point=_POINT), ""),
     ("many", AUTO, _type(numbers=List(I64), singles=List(F32), texts=List(String()), flags=List(Bool()),
                          points=List(_POINT), many=List(_INNER)), ""),
-    ("many", field_map(a="numbers[3] + len(points)", b="points[1].x", c="texts[0] + texts[1]"),
+    ("many", field_map(a="numbers[0] + len(points)", b="points[0].x", c="texts[0] + texts[0]"),
      _type(a=I64, b=F64, c=String()), "len(many) < 3"),
     ("choice", AUTO, _type(number=I32, point=_POINT, text=String(), flag=Bool()), ""),
     ("choice", field_map(a="number", b="text"), _type(a=I32, b=String()), ""),
@@ -107,12 +112,13 @@ def build(folder: Path) -> Path:
             f"{{nodes_{index}, defaults_{index}, literals_{index}, condition_{index}, operations_{index}, "
             f"{len(lowered.layout.defaults)}, {len(target.condition)}, {len(target.operations)}}}"
         )
-        maker = Maker(envelope.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
-        number = envelope.cases[case].number
+        around, payload = (
+            Maker(each.message_class.DESCRIPTOR, noise)  # type: ignore[arg-type]  # or upb's
+            for each in (envelope, envelope.cases[case])
+        )
         for seed in range(SEEDS):
-            payload = maker.payload(number)
-            (corpus / f"{index}-{seed}").write_bytes(bytes([index, 0]) + payload)
-            (corpus / f"{index}-{seed}-in").write_bytes(bytes([index, 1]) + maker.datagram())
+            (corpus / f"{index}-{seed}").write_bytes(bytes([index, 0]) + payload.message())
+            (corpus / f"{index}-{seed}-in").write_bytes(bytes([index, 1]) + around.datagram())
     declarations.append(f"enum {{ COMPOSITION_COUNT = {len(rows)} }};")
     declarations.append(f"static const struct composition compositions[] = {{{', '.join(rows)}}};")
     (folder / "compositions.h").write_text("\n".join(declarations) + "\n")

@@ -1,0 +1,88 @@
+"""Topics that a whole router publishes on natively, and what it does where rcl is not as expected."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+if os.environ.get("ROUTER_CARRIER") == "python":
+    pytest.skip("is about the carrier", allow_module_level=True)
+
+from router.app import Router
+from router.app.native_datapath import NativeDatapath
+from tests.app.conftest import Site, numbered
+from tests.ros.peers import Subscriber, wait_until
+
+FLOAT = "std_msgs/msg/Float32"
+ROUTES = f"""\
+  ph_info:
+    source: any
+    topics: [{{topic: published_ph, type: {FLOAT}, fields: {{data: ph_value}}}}]
+"""
+
+
+@pytest.fixture
+def subscriber() -> Iterator[Subscriber]:
+    with closing(Subscriber("published_ph", FLOAT)) as made:
+        yield made
+
+
+def thread_names() -> list[str]:
+    return [(task / "comm").read_text().strip() for task in Path("/proc/self/task").iterdir()]
+
+
+def await_subscriber(router: Router, subscriber: Subscriber) -> None:
+    """Both sides know each other."""
+    ros = router._runtime._ros
+    assert ros is not None
+    assert subscriber.line() == "matched"
+    wait_until(lambda: ros.wanted["published_ph"][0])
+
+
+def number(line: str) -> float:
+    (found,) = struct.unpack("<xxxxf", bytes.fromhex(line))
+    return float(found)
+
+
+def test_a_message_is_published_while_python_is_held(site: Site, subscriber: Subscriber) -> None:
+    python = ctypes.PyDLL(None)  # calls through PyDLL keep the interpreter lock
+    datagram, line = numbered(7), ctypes.create_string_buffer(100)
+    with site.router(ROUTES) as router:
+        assert "publish" in thread_names()
+        await_subscriber(router, subscriber)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.connect(("127.0.0.1", site.listen))
+            python.send(sender.fileno(), datagram, len(datagram), 0)
+            size = python.read(subscriber.process.stdout.fileno(), line, len(line))
+        assert number(line.raw[:size].decode()) == 7.0
+        wait_until(lambda: router.total("messages_published") == 1)
+        assert router.total("messages_waiting") == 0
+
+
+def test_python_publishes_where_rcl_is_not_as_expected(
+    site: Site, subscriber: Subscriber, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("router.ros.rcl.publish_functions", lambda: None)
+    with capture_logs() as logs, site.router(ROUTES) as router:
+        assert isinstance(router._runtime.datapath, NativeDatapath)
+        assert "publish" not in thread_names()
+        await_subscriber(router, subscriber)
+        for turn in range(3):
+            site.send(*(numbered(10 * turn + each) for each in range(10)))
+            assert [number(subscriber.line()) for _ in range(10)] == [10 * turn + each for each in range(10)]
+            site.write(ROUTES + f"    ttl: {turn + 1}s\n")
+            assert router.reload().ok
+        wait_until(lambda: router.total("messages_published") == 30)
+    warnings = [line for line in logs if line["log_level"] == "warning" and "rcl" in line["event"]]
+    assert [line["event"] for line in warnings] == [
+        "rcl is not as the carrier expects it, and Python publishes, more slowly"
+    ]
