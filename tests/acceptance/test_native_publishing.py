@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
@@ -77,14 +77,14 @@ def running(folder: Path, routes: str) -> Iterator[tuple[Site, RouterProcess]]:
 
 
 @contextmanager
-def sending(place: Site, *makers: type[bytes] | object, period: float = 0.002) -> Iterator[list[int]]:
+def sending(place: Site, *makers: Callable[[float], bytes], period: float = 0.002) -> Iterator[list[int]]:
     """Datagrams flow meanwhile, each of its makers with the same numbers from 0. Yields how many numbers it was so far."""
     sent, has_ended = [0], threading.Event()
 
     def send() -> None:
         for each in count():
             for make in makers:
-                place.send("sensor_board", make(float(each)))  # type: ignore[operator]
+                place.send("sensor_board", make(float(each)))
             sent[0] = each + 1
             if has_ended.wait(period):
                 return

@@ -89,6 +89,12 @@ def test_each_record_is_taken_or_dropped(tmp_path: Path, sanitizers: str, capaci
     run_program("queue", tmp_path, 200_000 if sanitizers else 300_000, capacity, sanitizers=sanitizers)
 
 
+@pytest.mark.parametrize("which", [1, 2, 3])
+@pytest.mark.parametrize("sanitizers", ["", pytest.param(RACES, marks=pytest.mark.slow)])
+def test_nothing_that_wakes_a_reader_is_lost(tmp_path: Path, sanitizers: str, which: int) -> None:
+    run_program("wakes", tmp_path, 50_000, which, sanitizers=sanitizers)
+
+
 @pytest.fixture
 def ring(library: ctypes.CDLL) -> int:
     return int(library.ring_open(CAPACITY))

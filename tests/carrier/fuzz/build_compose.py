@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import random
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -21,7 +21,7 @@ from router.compiler import check_table
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.compiler.expressions import ParsedReads, Scope, check
 from router.compiler.lowering import LoweredRoute, lower
-from router.compiler.lowering.operations import Code, Slot
+from router.compiler.lowering.operations import Code
 from router.compiler.mapping import build as build_mapping
 from router.table.model import FieldMap
 from router.types.model import Bool, Field, Float, Int, List, MessageType, String, Type
@@ -164,10 +164,10 @@ def _value(value: float | bytes | None) -> str:
 
 
 def _bits(number: float) -> int:
-    if isinstance(number, float):
-        (bits,) = struct.unpack("@Q", struct.pack("@d", number))
-        return int(bits)
-    return number & 0xFFFF_FFFF_FFFF_FFFF
+    if isinstance(number, int):
+        return number & 0xFFFF_FFFF_FFFF_FFFF
+    (bits,) = struct.unpack("@Q", struct.pack("@d", number))
+    return int(bits)
 
 
 def main() -> None:
