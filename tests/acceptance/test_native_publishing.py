@@ -78,7 +78,7 @@ def running(folder: Path, routes: str) -> Iterator[tuple[Site, RouterProcess]]:
 
 @contextmanager
 def sending(place: Site, *makers: Callable[[float], bytes], period: float = 0.002) -> Iterator[list[int]]:
-    """Datagrams flow meanwhile, each of its makers with the same numbers from 0. Yields how many numbers it was so far."""
+    """Datagrams flow meanwhile, by each maker with the same numbers from 0. Yields how many numbers it was so far."""
     sent, has_ended = [0], threading.Event()
 
     def send() -> None:
