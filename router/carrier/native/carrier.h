@@ -1,7 +1,8 @@
 /* The carrier: receives datagrams, forwards them, and hands to Python what only Python can do.
  *
  * It executes a program: immutable arrays that router/carrier/program.py makes of a compiled table. All arrays belong to
- * the caller and must live until another program was adopted and the rings hold nothing that refers to them. */
+ * the caller and must live until another program was adopted, the rings hold nothing that refers to them, and the receive
+ * thread has made another turn since (`carrier_turns`): it may be dropping such a message. */
 #ifndef CARRIER_H
 #define CARRIER_H
 
