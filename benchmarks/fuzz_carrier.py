@@ -44,7 +44,8 @@ def fuzz(schema: str, count: int, seed: int, found: Callable[[str], None]) -> Co
 
 def compare_whole(count: int, seed: int) -> int:
     with tempfile.TemporaryDirectory() as folder:
-        difference, fates = whole.compare(whole.library(Path(folder, "carrier.so")), Path(folder), count, seed)
+        library = whole.library(Path(folder, "carrier.so"))
+        difference, fates = whole.compare(library, Path(folder), count, seed, publishes=True)
     for labels, number in fates.items():
         print(*labels, number)
     print(difference or "no difference")

@@ -53,8 +53,7 @@ def main() -> None:
     args = arguments()
     pace = QUICK if args.quick else replace(Pace(), seconds=args.seconds)
     output = args.output or (None if args.quick else results.DEFAULT)
-    # All of them leave nothing to merge with: results of another machine, such as a clone brings, are replaced.
-    known = results.load(output) if output and args.only != list(SCENARIOS) else results.empty()
+    known = results.load(output) if output else results.empty()
     build()
     for routes in (sized.SMALL, sized.LARGE):
         sized.write(routes, sized.folder(routes))

@@ -58,12 +58,11 @@ def text(name: str, entry: Mapping[str, Any]) -> str:
 
 def page(results: Mapping[str, Any]) -> str:
     """All scenarios, as the body of a page of docs/."""
-    machine = results["machine"]
-    lines = [
-        fill(f"{machine['cpu']}, {machine['cores']} cores, Linux {machine['kernel']}, Python {machine['python']}.")
-    ]
+    lines: list[str] = []
     for name, entry in results["scenarios"].items():
         rounds = f"Medians of {entry['repeat']} fresh processes, {entry['date']}, commit {entry['commit']}."
-        lines += ["", f"## `{name}`", "", fill(f"{entry['title']}. {rounds}", WIDTH), ""]
+        on = entry["machine"]
+        machine = f"{on['cpu']}, {on['cores']} cores, Linux {on['kernel']}, Python {on['python']}."
+        lines += ["", f"## `{name}`", "", fill(f"{entry['title']}. {rounds} {machine}", WIDTH), ""]
         lines += [f"| {' | '.join(row)} |" for row in (HEADINGS, ("---",) * len(HEADINGS), *cells(entry))]
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines[1:], ""])
