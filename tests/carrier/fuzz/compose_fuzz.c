@@ -38,7 +38,7 @@ static int run(const struct composition *chosen, bool is_envelope, const uint8_t
     fields->slots[SLOT_SOURCE] = (struct value){.bytes = (const uint8_t *)"a board", .size = 7};
     composer.literals = chosen->literals;
     if (!fields_read(fields, is_envelope ? NODE_ENVELOPE : NODE_PAYLOAD, data, size)) return LOSS_MAPPING_ERROR;
-    demand(fields->cell_count <= MOST_CELLS);
+    demand(fields->cell_count <= fields->cell_capacity);
     if (chosen->condition_count) {
         int outcome = compose_condition(&composer, chosen->condition, chosen->condition_count, &is_true, &at);
         if (outcome != COMPOSED) return outcome;
