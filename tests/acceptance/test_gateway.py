@@ -393,9 +393,8 @@ def test_what_only_the_router_publishes_is_filled_while_a_client_is_there(tmp_pa
     with scene(tmp_path, IMU_ONLY, "DASHBOARD") as now:
         send = partial(now.site.send, "sensor_board", imu)
         time.sleep(3)  # as long as it looks often, because it has just started
-        for _ in range(10):
-            send()
         filtered = key("messages_filtered", route="imu_info", target="imu_data")
-        wait_until(lambda: now.site.scrape()[filtered] == 10, "what nobody wants")
+        with repeating(send):  # a machine that is busy takes longer to start
+            wait_until(lambda: now.site.scrape()[filtered] >= 10, "what nobody wants")
         with Dashboard(now.ports["DASHBOARD"]) as client, repeating(send):
             assert client.next("data")["topic"] == "/imu_data"
