@@ -4,6 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "numbers.h"
 #include "utf8.h"
 
 enum { HEADER = 4, FIRST_CAPACITY = 4096 };
@@ -119,11 +120,6 @@ static double length(double x, double y) {
 /* A whole number has no negative zero. */
 static double whole(double number) { return number + 0.0; }
 
-/* The smallest magnitude that does not round to a finite float32. */
-static const double FLOAT32_END = 3.4028235677973366e38;
-
-static bool fits_float32(double number) { return !isfinite(number) || fabs(number) < FLOAT32_END; }
-
 static const double END = 9223372036854775808.0; /* the integers end there */
 
 /* A whole number as an integer between two others; those beyond are `outside`. */
@@ -223,21 +219,16 @@ static bool put(struct composed *message, const void *bytes, size_t size, size_t
 
 static bool put_integer(struct composed *message, uint64_t bits, uint16_t size) {
     uint8_t bytes[8];
-    for (unsigned index = 0; index < size; index++) bytes[index] = (uint8_t)(bits >> (8 * index));
+    store_little_endian(bytes, bits, size);
     return put(message, bytes, size, size);
 }
 
 static bool put_float(struct composed *message, double number) {
-    float narrow = (float)number;
-    uint32_t bits;
-    memcpy(&bits, &narrow, sizeof bits);
-    return fits_float32(number) && put_integer(message, bits, sizeof bits);
+    return fits_float32(number) && put_integer(message, float32_bits(number), sizeof(float));
 }
 
 static bool put_double(struct composed *message, double number) {
-    uint64_t bits;
-    memcpy(&bits, &number, sizeof bits);
-    return put_integer(message, bits, sizeof bits);
+    return put_integer(message, float64_bits(number), sizeof number);
 }
 
 static bool put_text(struct composed *message, const struct value *text) {

@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+#include "numbers.h"
 #include "utf8.h"
 
 /* ---- reading ---- */
@@ -89,29 +90,10 @@ struct value {
 /* Scalars in bytes, by enum scalar. */
 static const uint8_t SIZES[] = {1, 1, 1, 2, 2, 4, 4, 8, 8, 4, 8};
 
-static uint64_t load_little_endian(const uint8_t *from, unsigned size) {
-    uint64_t bits = 0;
-    for (unsigned index = 0; index < size; index++) bits |= (uint64_t)from[index] << (8 * index);
-    return bits;
-}
-
 static struct value of_signed(uint64_t bits, unsigned size) {
     uint64_t sign = (uint64_t)1 << (8 * size - 1);
     uint64_t extended = (bits ^ sign) - sign;
     return (struct value){extended, (double)(int64_t)extended};
-}
-
-static double of_float32(uint64_t bits) {
-    uint32_t low = (uint32_t)bits;
-    float number;
-    memcpy(&number, &low, sizeof number);
-    return (double)number;
-}
-
-static double of_float64(uint64_t bits) {
-    double number;
-    memcpy(&number, &bits, sizeof number);
-    return number;
 }
 
 static struct value load(const uint8_t *from, enum scalar type) {
@@ -153,7 +135,7 @@ static void write_bytes(struct writer *writer, const void *bytes, size_t size) {
 
 static void write_little_endian(struct writer *writer, uint64_t value, unsigned size) {
     uint8_t bytes[8];
-    for (unsigned index = 0; index < size; index++) bytes[index] = (uint8_t)(value >> (8 * index));
+    store_little_endian(bytes, value, size);
     write_bytes(writer, bytes, size);
 }
 
@@ -166,19 +148,6 @@ static void write_varint(struct writer *writer, uint64_t value) {
 }
 
 static uint64_t zigzag(uint64_t bits) { return bits << 1 ^ (bits >> 63 ? UINT64_MAX : 0); }
-
-static uint64_t float32_bits(double number) {
-    float narrow = (float)number;
-    uint32_t bits;
-    memcpy(&bits, &narrow, sizeof bits);
-    return bits;
-}
-
-static uint64_t float64_bits(double number) {
-    uint64_t bits;
-    memcpy(&bits, &number, sizeof bits);
-    return bits;
-}
 
 static uint64_t encoded(const struct value *value, enum encoding encoding) {
     switch (encoding) {
@@ -199,17 +168,9 @@ static void write_tag(struct writer *writer, const struct write_op *op) {
     if (op->tag) write_varint(writer, op->tag);
 }
 
-/* The smallest magnitude that does not round to a finite float32. */
-static const double FLOAT32_END = 3.4028235677973366e38;
-
-static bool is_infinite_as_float32(double number) {
-    bool is_finite = number - number == 0;
-    return is_finite && (number >= FLOAT32_END || number <= -FLOAT32_END);
-}
-
 static bool write_scalar(struct writer *writer, const struct write_op *op, const uint8_t *from) {
     struct value value = load(from, op->scalar);
-    if (op->flags & WANTS_FLOAT32 && is_infinite_as_float32(value.number)) return false;
+    if (op->flags & WANTS_FLOAT32 && !fits_float32(value.number)) return false;
     uint64_t bits = encoded(&value, op->encoding);
     if (!bits && !(op->flags & WRITES_DEFAULT)) return true;
     write_encoded(writer, bits, op->encoding);

@@ -3,6 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "numbers.h"
 #include "wire.h"
 
 /* Find a field. Most messages have theirs in order: `guess` is where the next one is then. */
@@ -33,25 +34,6 @@ static uint32_t wire_type_of(enum field_type type) {
     }
 }
 
-static uint64_t load(const uint8_t *from, unsigned size) {
-    uint64_t bits = 0;
-    for (unsigned index = 0; index < size; index++) bits |= (uint64_t)from[index] << (8 * index);
-    return bits;
-}
-
-static double of_float(uint64_t bits) {
-    uint32_t low = (uint32_t)bits;
-    float number;
-    memcpy(&number, &low, sizeof number);
-    return (double)number;
-}
-
-static double of_double(uint64_t bits) {
-    double number;
-    memcpy(&number, &bits, sizeof number);
-    return number;
-}
-
 static int64_t of_zigzag(uint64_t bits) { return (int64_t)(bits >> 1 ^ (bits & 1 ? UINT64_MAX : 0)); }
 
 /* What protobuf makes of the bits of a scalar. */
@@ -63,8 +45,8 @@ static struct value scalar(enum field_type type, uint64_t bits) {
     case TYPE_UINT32: return (struct value){.integer = (uint32_t)bits};
     case TYPE_SINT32: return (struct value){.integer = (int32_t)of_zigzag((uint32_t)bits)};
     case TYPE_SINT64: return (struct value){.integer = of_zigzag(bits)};
-    case TYPE_FLOAT: return (struct value){.real = of_float(bits)};
-    case TYPE_DOUBLE: return (struct value){.real = of_double(bits)};
+    case TYPE_FLOAT: return (struct value){.real = of_float32(bits)};
+    case TYPE_DOUBLE: return (struct value){.real = of_float64(bits)};
     default: return (struct value){.integer = (int64_t)bits};
     }
 }
@@ -78,7 +60,7 @@ static bool read_scalar(struct bytes *from, enum field_type type, struct value *
         const uint8_t *at = from->at;
         unsigned size = wire_type == I32 ? 4 : 8;
         if (!skip(from, size)) return false;
-        bits = load(at, size);
+        bits = load_little_endian(at, size);
     }
     *value = scalar(type, bits);
     return true;
