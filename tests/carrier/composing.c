@@ -11,7 +11,8 @@ struct publishing *seam_composing_open(counter *counters) {
     if (!publishing) return NULL;
     publishing->counters = counters;
     publishing->reporter.events = ring_open(4096);
-    if (publishing->reporter.events && composer_open(&publishing->composer)) return publishing;
+    if (composer_open(&publishing->composer) && publishing->reporter.events) return publishing;
+    composer_close(&publishing->composer);
     free(publishing);
     return NULL;
 }

@@ -17,9 +17,7 @@ bool composer_open(struct composer *composer) {
     composer->text = malloc(MOST_TEXT);
     composer->message.data = malloc(FIRST_CAPACITY);
     composer->message.capacity = FIRST_CAPACITY;
-    if (composer->fields.slots && composer->fields.cells && composer->text && composer->message.data) return true;
-    composer_close(composer);
-    return false;
+    return composer->fields.slots && composer->fields.cells && composer->text && composer->message.data;
 }
 
 void composer_close(struct composer *composer) {

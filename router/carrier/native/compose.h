@@ -136,7 +136,7 @@ struct composer {
 
 enum { COMPOSED = -1 };
 
-/* Allocate what a composer needs. Return false for lack of memory. */
+/* Allocate what a composer needs. Return false for lack of memory. To be closed in either case. */
 bool composer_open(struct composer *composer);
 void composer_close(struct composer *composer);
 

@@ -227,11 +227,8 @@ struct publishing *publishing_open(struct ring *ring, counter *counters, struct 
     publishing->reset = reset;
     pthread_mutex_init(&publishing->lock, NULL);
     condition_open(&publishing->changed);
-    if (!composer_open(&publishing->composer)) {
-        publishing_close(publishing);
-        return NULL;
-    }
-    if (start_thread(&publishing->thread, "publish", publishing_thread, publishing)) {
+    if (!composer_open(&publishing->composer) ||
+        start_thread(&publishing->thread, "publish", publishing_thread, publishing)) {
         publishing_close(publishing);
         return NULL;
     }
