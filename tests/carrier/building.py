@@ -31,15 +31,8 @@ def sanitizing(sanitizers: str) -> list[str]:
 
 
 def sanitized_library(output: Path) -> Path:
-    """The library with AddressSanitizer and UndefinedBehaviorSanitizer, for processes with `sanitizer_variables`."""
+    """The library with AddressSanitizer and UndefinedBehaviorSanitizer, for processes that preload libasan."""
     return build(output, sanitizing(MEMORY), "gcc")
-
-
-def sanitizer_variables() -> dict[str, str]:
-    """The environment of a Python that loads `sanitized_library`: Python itself leaks on purpose."""
-    command = ["/usr/bin/env", "gcc", "-print-file-name=libasan.so"]
-    runtime = subprocess.check_output(command, text=True).strip()
-    return {"LD_PRELOAD": runtime, "ASAN_OPTIONS": "detect_leaks=0", "UBSAN_OPTIONS": "print_stacktrace=1"}
 
 
 def seams(output: Path) -> ctypes.CDLL:

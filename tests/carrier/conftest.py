@@ -15,7 +15,7 @@ from tests.carrier import building, compositions
 from tests.carrier.building import sanitized_library
 
 SANITIZED = "CARRIER_TESTED_WITH_SANITIZERS"
-"""An environment variable. test_sanitized.py sets it, with those that sanitizers need."""
+"""An environment variable. `make test-all` sets it, with those that sanitizers need."""
 
 
 @pytest.fixture(scope="session")

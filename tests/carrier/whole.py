@@ -101,7 +101,7 @@ def table(folder: Path) -> Program:
 
 
 def library(output: Path, sanitizers: str = "") -> ctypes.CDLL:
-    """The carrier with clocks that are set, and `seam_handle`. For `sanitizers`, see `sanitizer_variables`."""
+    """The carrier with clocks that are set, and `seam_handle`. With `sanitizers`, processes must preload libasan."""
     files = [HERE / "handling.c", *(path for path in sources() if path.name not in {"publishing.c", "receive.c"})]
     flags = sanitizing(sanitizers) if sanitizers else ["-O2"]
     flags += ["-fPIC", "-shared", "-include", str(HERE / "clocked.h"), f"-I{NATIVE}"]
