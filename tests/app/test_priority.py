@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.acceptance.site import RouterProcess, site
+from tests.acceptance.site import RouterProcess, site, wait_until
 
 if os.environ.get("ROUTER_CARRIER") == "python":
     pytest.skip("Python has no such threads", allow_module_level=True)
@@ -31,10 +31,14 @@ def test_native_threads_run_first_where_they_may(within: Sequence[str], policy: 
     if subprocess.run(["/usr/bin/env", *within, "true"], capture_output=True, check=False).returncode:
         pytest.skip(f"no {within[0]} here, or it may not do this")
     with site(tmp_path) as place, RouterProcess(tmp_path, place.table(), within=within) as router:
-        policies = {
-            (thread / "comm").read_text().strip(): os.sched_getscheduler(int(thread.name))
-            for thread in Path(f"/proc/{router.process.pid}/task").iterdir()
-        }
-    assert {name: policies[name] for name in THREADS} == dict.fromkeys(THREADS, policy)
-    others = {each for name, each in policies.items() if name not in THREADS}
-    assert others.isdisjoint({os.SCHED_FIFO, os.SCHED_RR})
+        wait_until(lambda: all(policies(router).get(name) == policy for name in THREADS), f"policy {policy}")
+        others = {each for name, each in policies(router).items() if name not in THREADS}
+        assert others.isdisjoint({os.SCHED_FIFO, os.SCHED_RR})
+
+
+def policies(router: RouterProcess) -> dict[str, int]:
+    """By the name of the thread, which asks for its own when it first runs."""
+    return {
+        (thread / "comm").read_text().strip(): os.sched_getscheduler(int(thread.name))
+        for thread in Path(f"/proc/{router.process.pid}/task").iterdir()
+    }
