@@ -205,7 +205,7 @@ static void serve_arrivals(struct commands *commands) {
 static void *commands_thread(void *of) {
     struct commands *commands = of;
     if (commands->is_urgent) run_first();
-    else run_soon();
+    else run_in_turn(); /* Fast DDS wakes it with the lock of its reader in hand */
     pthread_mutex_lock(&commands->lock);
     while (!commands->is_stopping && !commands->is_left) serve_arrivals(commands);
     serve_rest(commands, commands->current, NULL);

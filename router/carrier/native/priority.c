@@ -24,17 +24,23 @@ static bool take_priority(void) {
     return !sched_setscheduler(0, SCHED_FIFO, &least);
 }
 
+static void take_usual_policy(void) { sched_setscheduler(0, SCHED_OTHER, &(struct sched_param){0}); }
+
 static void take_short_slices(void) {
     struct scheduling wanted = {.size = sizeof wanted, .policy = SCHED_OTHER, .runtime = SLICE};
     wanted.nice = getpriority(PRIO_PROCESS, 0);
     if (!syscall(SYS_sched_setattr, 0, &wanted, 0)) return;
-    sched_setscheduler(0, SCHED_OTHER, &(struct sched_param){0});
+    take_usual_policy();
 }
 
 /* Whether nobody has chosen a policy for the router. A thread of Python that opens ROS passes on the batch policy. */
 static bool is_ours_to_choose(void) {
     int inherited = sched_getscheduler(0);
     return inherited == SCHED_OTHER || inherited == SCHED_BATCH;
+}
+
+void run_in_turn(void) {
+    if (is_ours_to_choose()) take_usual_policy();
 }
 
 void run_soon(void) {

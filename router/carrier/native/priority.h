@@ -1,4 +1,4 @@
-/* Threads that run as soon as they wake up, in place of one that computes: they will not compute for long. */
+/* When threads run that wake up. Most do so at once, in place of one that computes: they will not compute for long. */
 #ifndef PRIORITY_H
 #define PRIORITY_H
 
@@ -17,6 +17,10 @@ bool run_first(void);
 
 /* Ask for the shortest slices only: for a thread that may block or compute, but should not wait for others for long. */
 void run_soon(void);
+
+/* Have the usual policy, also where Python has passed on another one: for a thread that is woken by one that holds a lock
+ * which it needs. In front of that thread it would wait for the lock: two switches more for each message. */
+void run_in_turn(void);
 
 /* Take the priority from the calling thread for a turn of 100 ms after one of which it used three quarters: a flood would
  * leave others next to nothing of its processor core. `now` is monotonic. */
