@@ -150,11 +150,19 @@ class Runtime:
             self.wiring = change.wiring
 
     def _finish(self, change: Change, earlier: Wiring | None) -> None:
-        """Close what only the earlier program used, all of it even if one step raises.
+        """Watch the peers of new topics, and close what only the earlier program used.
 
-        If a thread is stuck there, as in the middleware, that stays open until it goes on.
+        If a thread is stuck there, as in the middleware, that stays open until it goes on. All of it is done even if
+        one step raises.
         """
         change.undo.pop_all()  # discarded
+        with ExitStack() as last_first:
+            last_first.callback(self._close_passed, change, earlier)
+            if self._ros is not None and change.topics is not None:
+                self._ros.watch(change.topics)
+
+    def _close_passed(self, change: Change, earlier: Wiring | None) -> None:
+        """Close what all threads have passed, in this reload and in those before."""
         with ExitStack() as last_first:
             if self.datapath.has_passed(change.wiring):
                 last_first.callback(self._context.counts.replace, change.wiring.program.counters)

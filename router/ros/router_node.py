@@ -29,8 +29,8 @@ class RouterNode:
     with an incompatible QoS, and for some seconds after that. `subscriber_joined(topic)` is called there too. Nothing
     is received before `start`.
 
-    Topics are replaced in three steps: `prepare` opens what is new, `apply` uses it, `finish` closes what is no longer
-    used. After `prepare`, `abandon` undoes it.
+    Topics are replaced in four steps: `prepare` opens what is new, `apply` uses it, `watch` waits for its events,
+    `finish` closes what is no longer used. After `prepare`, `abandon` undoes it.
     """
 
     publish_errors = (rclpy_implementation.RCLError,)
@@ -151,17 +151,20 @@ class RouterNode:
         for topic, cdr, sent_at in more:
             receive[topic](cdr, sent_at)
 
-    def finish(self, change: RosChange) -> None:
-        """Close endpoints that are no longer used; no thread may publish there."""
-        for topic in self.publish.keys() - self._publications.keys():
-            del self.publish[topic], self.wanted[topic]
+    def watch(self, change: RosChange) -> None:
+        """Wait for events of the endpoints in use: `wanted` follows new subscribers from now on."""
         if change.left or change.opened:
             self._events.stop()
-            for opened in change.left:
-                self._close_one(opened)
             self._peers.forget_all_but(self._publications)
             self._events = self._event_thread()
             self._events.start()
+
+    def finish(self, change: RosChange) -> None:
+        """Close endpoints that are no longer used; no thread may publish there, or wait for their events."""
+        for topic in self.publish.keys() - self._publications.keys():
+            del self.publish[topic], self.wanted[topic]
+        for opened in change.left:
+            self._close_one(opened)
 
     def _use(self, change: RosChange) -> None:
         self._publications, self._subscriptions = change.publications, change.subscriptions

@@ -6,6 +6,7 @@ import ctypes
 import os
 import socket
 import struct
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -19,6 +20,7 @@ if os.environ.get("ROUTER_CARRIER") == "python":
 
 from router.app import Router
 from router.app.native_datapath import NativeDatapath
+from router.ros import rcl
 from tests.app.conftest import Site, numbered
 from tests.ros.peers import Subscriber, wait_until
 
@@ -66,6 +68,35 @@ def test_a_message_is_published_while_python_is_held(site: Site, subscriber: Sub
         assert number(line.raw[:size].decode()) == 7.0
         wait_until(lambda: router.total("messages_published") == 1)
         assert router.total("messages_waiting") == 0
+
+
+def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
+    site: Site, subscriber: Subscriber, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_in, goes_on = threading.Event(), threading.Event()
+
+    def block(*_: object) -> int:
+        is_in.set()
+        goes_on.wait(60)
+        return 0
+
+    blocking = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(block)
+    functions = rcl.publish_functions()
+    assert functions is not None
+    functions = functions._replace(publish=ctypes.cast(blocking, ctypes.c_void_p).value or 0)
+    monkeypatch.setattr(rcl, "publish_functions", lambda: functions)
+    monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
+    stuck = ROUTES.replace("published_ph,", "published_stuck, qos: {durability: transient_local},")
+    later = f"{{topic: published_ph, type: {FLOAT}, fields: {{data: ph_value}}}}"
+    with site.router(stuck) as router:
+        site.send(numbered(1))
+        try:
+            assert is_in.wait(20)
+            site.write(stuck.replace("}}]", f"}}}}, {later}]"))
+            assert router.reload().ok
+            await_subscriber(router, subscriber)
+        finally:
+            goes_on.set()
 
 
 def test_python_publishes_where_rcl_is_not_as_expected(

@@ -33,6 +33,7 @@ def change(ros: RouterNode, receive: dict[str, Take], *plans: object, published:
     made = ros.prepare(published, plans, SPANS)  # type: ignore[arg-type]
     with ros.paused():
         ros.apply(made, receive)
+    ros.watch(made)
     ros.finish(made)
 
 

@@ -155,6 +155,7 @@ def test_two_of_our_own_that_do_not_go_together_are_counted() -> None:
         change = ros.prepare([string_topic(RELIABLE)], [string_topic(RELIABLE)], {"greeting": SPAN})
         with ros.paused():
             ros.apply(change, {"greeting": lambda *_: None})
+        ros.watch(change)
         ros.finish(change)
         apart.wait_for()
 
