@@ -43,7 +43,7 @@ from router.carrier.publishing import PublishRoutes
 from router.carrier.ring import Ring
 from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
-from router.carrier.worker import Stage, Worker, left_behind
+from router.carrier.worker import Stage, Worker
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine import MAX_DATAGRAM, OutboundEngine, PartEngine
 from router.engine.binding import State
@@ -97,7 +97,7 @@ class NativeDatapath:
         self._generations = count(1)
         context.counts.most = MOST_COUNTERS
         self._wiring: NativeWiring | None = None
-        self._is_running = False
+        self._is_running = self._has_stopped = False
         report, failed = context.reporter.report, context.reporter.failed
         received, braked, published = (Ring(library, _EVENTS) for _ in range(3))
         receive_counts, deadman_counts, publish_counts = (_fixed_counts() for _ in range(3))
@@ -356,14 +356,13 @@ class NativeDatapath:
         assert isinstance(wiring, NativeWiring)  # noqa: S101 - made by `wire`
         if not self._is_running:
             return True
-        late = left_behind(list(self._workers.values()), wiring.native.generation, _PATIENCE_S)
-        has_published = self._publishing.wait_for(wiring.native.generation, _PATIENCE_S)
-        return (
-            not late
-            and has_published
-            and self._has_turned()
-            and all(commands.has_passed for commands in self._commands)
-        )
+        generation = wiring.native.generation
+        late = [each.name for each in self._workers.values() if not each.wait_for(generation, _PATIENCE_S)]
+        if not self._publishing.wait_for(generation, _PATIENCE_S):
+            late.append("publish")
+        if late:
+            logger.error("a thread is stuck, and what it uses stays open", threads=late)
+        return not late and self._has_turned() and all(commands.has_passed for commands in self._commands)
 
     def _has_turned(self) -> bool:
         """Wait until the receive thread is done with what it now handles: it may be dropping an earlier message."""
@@ -393,12 +392,14 @@ class NativeDatapath:
         self._stop_threads_of_ros()
 
     def _stop_threads_of_ros(self) -> None:
+        self._has_stopped = True
         have_ended = [self._publishing.stop(), *(commands.stop() for commands in self._commands)]
         if not all(have_ended) and self._ros is not None:
             self._ros.leave_open()
 
     def close(self) -> None:
-        self._stop_threads_of_ros()  # if the start has failed
+        if not self._has_stopped:  # the start has failed
+            self._stop_threads_of_ros()
         for deadman in self._wiring.deadmen.values() if self._wiring else ():
             deadman.end()
         self._events.close()

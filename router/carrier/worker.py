@@ -14,7 +14,6 @@ from time import sleep
 
 from router.carrier.ring import Ring
 from router.engine.dispatch import ServePart
-from router.log import logger
 
 _TRIES, _TRY_S = 100, 0.0002
 
@@ -172,11 +171,3 @@ class Worker:
                 counts[index] -= 1
             self._edition += 1
             position += size
-
-
-def left_behind(workers: Sequence[Worker], generation: int, timeout: float) -> list[str]:
-    """Wait until the workers serve that generation; return the names of those that do not within `timeout` s each."""
-    late = [worker.name for worker in workers if not worker.wait_for(generation, timeout)]
-    if late:
-        logger.error("a thread is stuck, and what it uses stays open", threads=late)
-    return late

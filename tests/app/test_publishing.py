@@ -88,7 +88,7 @@ def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
     monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
     stuck = ROUTES.replace("published_ph,", "published_stuck, qos: {durability: transient_local},")
     later = f"{{topic: published_ph, type: {FLOAT}, fields: {{data: ph_value}}}}"
-    with site.router(stuck) as router:
+    with site.router(stuck) as router, capture_logs() as logs:
         site.send(numbered(1))
         try:
             assert is_in.wait(20)
@@ -97,6 +97,7 @@ def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
             await_subscriber(router, subscriber)
         finally:
             goes_on.set()
+    assert [line["threads"] for line in logs if "what it uses stays open" in line["event"]] == [["publish"]]
 
 
 def test_python_publishes_where_rcl_is_not_as_expected(

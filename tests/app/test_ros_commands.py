@@ -188,5 +188,5 @@ def test_a_thread_that_is_stuck_at_the_end_is_left_with_its_subscriptions(
         stop = CommandThread.stop
         monkeypatch.setattr(CommandThread, "stop", lambda thread: stop(thread) and False)
         router.__exit__(None, None, None)
-        assert any("stuck, and the router ends without it" in line["event"] for line in logs)
+        assert len([line for line in logs if "stuck, and the router ends without it" in line["event"]]) == 1
         assert [each.raw.take() for each in ros._subscriptions.values()] == [None]  # it is open
