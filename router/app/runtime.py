@@ -100,6 +100,7 @@ class Runtime:
         For the first program, deadmen send their payload of the start here: nothing is received yet, but gateways serve
         clients as soon as they are open.
         """
+        self._close_unfinished()
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
                 check_environment(os.environ)  # before deadmen send, as the start may fail here
@@ -160,6 +161,14 @@ class Runtime:
             last_first.callback(self._close_passed, change, earlier)
             if self._ros is not None and change.topics is not None:
                 self._ros.watch(change.topics)
+
+    def _close_unfinished(self) -> None:
+        """Close what a stuck thread used at earlier reloads, if it goes on by now: it may be opened again."""
+        if self._unfinished and self.wiring is not None and self.datapath.has_passed(self.wiring):
+            with ExitStack() as last_first:
+                for finish in self._unfinished:
+                    last_first.callback(finish)
+                self._unfinished = []
 
     def _close_passed(self, change: Change, earlier: Wiring | None) -> None:
         """Close what all threads have passed, in this reload and in those before."""

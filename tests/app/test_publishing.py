@@ -22,6 +22,7 @@ from router.app import Router
 from router.app.native_datapath import NativeDatapath
 from router.ros import rcl
 from tests.app.conftest import Site, numbered
+from tests.ports import free_port
 from tests.ros.peers import Subscriber, wait_until
 
 FLOAT = "std_msgs/msg/Float32"
@@ -70,9 +71,9 @@ def test_a_message_is_published_while_python_is_held(site: Site, subscriber: Sub
         assert router.total("messages_waiting") == 0
 
 
-def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
-    site: Site, subscriber: Subscriber, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, threading.Event]]:
+    """Publishing natively blocks, which sets the first event, until the second one is set."""
     is_in, goes_on = threading.Event(), threading.Event()
 
     def block(*_: object) -> int:
@@ -86,18 +87,42 @@ def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
     functions = functions._replace(publish=ctypes.cast(blocking, ctypes.c_void_p).value or 0)
     monkeypatch.setattr(rcl, "publish_functions", lambda: functions)
     monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
-    stuck = ROUTES.replace("published_ph,", "published_stuck, qos: {durability: transient_local},")
+    yield is_in, goes_on
+    goes_on.set()
+
+
+KEPT = ROUTES.replace("published_ph,", "published_kept, qos: {durability: transient_local},")
+
+
+def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
+    site: Site, subscriber: Subscriber, stuck: tuple[threading.Event, threading.Event]
+) -> None:
+    is_in, goes_on = stuck
     later = f"{{topic: published_ph, type: {FLOAT}, fields: {{data: ph_value}}}}"
-    with site.router(stuck) as router, capture_logs() as logs:
+    with site.router(KEPT) as router, capture_logs() as logs:
         site.send(numbered(1))
-        try:
-            assert is_in.wait(20)
-            site.write(stuck.replace("}}]", f"}}}}, {later}]"))
-            assert router.reload().ok
-            await_subscriber(router, subscriber)
-        finally:
-            goes_on.set()
+        assert is_in.wait(20)
+        site.write(KEPT.replace("}}]", f"}}}}, {later}]"))
+        assert router.reload().ok
+        await_subscriber(router, subscriber)
+        goes_on.set()
     assert [line["threads"] for line in logs if "what it uses stays open" in line["event"]] == [["publish"]]
+
+
+def test_a_reload_opens_again_what_a_stuck_thread_kept_open(
+    site: Site, stuck: tuple[threading.Event, threading.Event]
+) -> None:
+    is_in, goes_on = stuck
+    with site.router(KEPT) as router:
+        site.send(numbered(1))
+        assert is_in.wait(20)
+        site.write(ROUTES, listen=f'  rover: {{address: "127.0.0.1:{free_port()}"}}')
+        assert router.reload().ok
+        goes_on.set()
+        wait_until(lambda: router.total("messages_published") == 1)
+        site.write(KEPT.replace("Float32", "Float64"))
+        result = router.reload()
+        assert result.ok, result.text
 
 
 def test_python_publishes_where_rcl_is_not_as_expected(
