@@ -36,10 +36,13 @@ class TimerThread:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def add(self, timer: Timer) -> None:
-        """Serve `timer` from now on. Idempotent."""
-        with self._lock:
-            if timer not in self._timers:
-                self._timers.append(timer)
+        """Serve `timer` from now on. Idempotent; for one thread at a time.
+
+        Without the lock, which a timer that is stuck in the middleware keeps: a reload must not wait for that. The
+        thread may go through the list while it grows.
+        """
+        if timer not in self._timers:
+            self._timers.append(timer)
 
     def locked(self, timer: Timer, call: Callable[P, R], /) -> Callable[P, R]:
         """Add `timer`, and return `call`, which uses it, wrapped in the lock, for other threads."""

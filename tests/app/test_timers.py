@@ -87,6 +87,27 @@ def test_what_is_due_at_the_start_is_done(running: Running) -> None:
     assert running.heard() == "bell"
 
 
+def test_a_timer_is_added_while_another_one_is_stuck(running: Running) -> None:
+    is_in, goes_on = threading.Event(), threading.Event()
+
+    class Stuck(Bell):
+        def due(self, now: int) -> None:
+            is_in.set()
+            goes_on.wait(PATIENCE)
+            super().due(now)
+
+    stuck, added = Stuck(running.rung, "stuck"), Bell(running.rung)
+    running.start()
+    running.thread.locked(stuck, stuck.ring_at)(0)
+    assert is_in.wait(PATIENCE)
+    ring = running.thread.locked(added, added.ring_at)
+    assert running.rung.empty()
+    goes_on.set()
+    assert running.heard() == "stuck"
+    ring(0)
+    assert running.heard() == "bell"
+
+
 def test_a_locked_call_that_brings_something_nearer_wakes_the_thread(running: Running) -> None:
     bell = Bell(running.rung)
     ring_at = running.thread.locked(bell, bell.ring_at)
