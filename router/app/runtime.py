@@ -126,6 +126,7 @@ class Runtime:
         """
         earlier = self.wiring
         try:
+            change.wiring.check_gateways(earlier, self._context.timers)
             if self.gateways is not None and change.gateways is not None:
                 self.gateways.retire(change.gateways)
             self.datapath.between(change.wiring, lambda: self._swap(change))

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from router.clock import monotonic_ns
 from router.engine.timers import P, R, Timer
 from router.log import logger
-from router.threads import LEAVING_S, WakeEvent, join_or_leave
+from router.threads import LEAVING_S, StuckError, WakeEvent, join_or_leave
 
 _NEVER = 1 << 63
 _RETRY = 100_000_000
@@ -95,6 +95,12 @@ class TimerThread:
             yield True
         finally:
             self._lock.release()
+
+    def check(self) -> None:
+        """Raise StuckError if a timer is stuck in the middleware: then what is `locked` would wait for it."""
+        with self._locked_unless_stuck() as is_locked:
+            if not is_locked:
+                raise StuckError(f"the timers '{self._thread.name}' are stuck in the middleware: try again")
 
     def release(self, candidates: Sequence[object]) -> None:
         """End and remove those of its timers that are among the candidates, in reverse order.

@@ -168,12 +168,23 @@ class Wiring:
         for pacer in self.pacers.values():
             timers.pacing.locked(pacer, pacer.keep_only)(monotonic_ns(), places)
 
+    def check_gateways(self, earlier: Wiring | None, timers: Timers) -> None:
+        """Raise StuckError if `succeed_gateways` would wait for the middleware."""
+        if self._successions(earlier):
+            timers.inbound_deadman.check()
+
     def succeed_gateways(self, earlier: Wiring | None, timers: Timers) -> None:
         """Have deadmen of gateways with other settings inherit the state of those in `earlier`."""
-        for name, deadman in self.gateway_deadmen.items():
-            before = earlier.gateway_deadmen.get(name) if earlier else None
-            if before is not None and before is not deadman:
-                timers.inbound_deadman.locked(deadman, deadman.replace)(before)
+        for deadman, before in self._successions(earlier):
+            timers.inbound_deadman.locked(deadman, deadman.replace)(before)
+
+    def _successions(self, earlier: Wiring | None) -> list[tuple[Deadman, Deadman]]:
+        """The deadmen of gateways with other settings, each with the one in `earlier`."""
+        pairs = [
+            (deadman, earlier.gateway_deadmen.get(name) if earlier else None)
+            for name, deadman in self.gateway_deadmen.items()
+        ]
+        return [(deadman, before) for deadman, before in pairs if before is not None and before is not deadman]
 
 
 class Closable(Protocol):

@@ -461,6 +461,35 @@ def test_a_deadman_brakes_while_the_middleware_blocks_that_of_a_gateway(
             go_on.set()
 
 
+def test_a_reload_is_refused_while_the_deadman_of_a_gateway_that_it_replaces_is_stuck(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    port = free_port(kind=socket.SOCK_STREAM)
+    with (
+        site.router(PH + operator(port, "10ms")) as router,
+        socket.create_connection(("127.0.0.1", port)) as client,
+    ):
+        is_in, go_on = threading.Event(), threading.Event()
+
+        def blocked(_: bytes) -> None:
+            is_in.set()
+            go_on.wait(20)
+
+        client.sendall(b'{"op": "publish", "topic": "/word", "type": "std_msgs/msg/Bool", "data": {"data": true}}\n')
+        wait_until(lambda: router.total("messages_published") == 1)
+        assert router._runtime._ros is not None
+        monkeypatch.setitem(router._runtime._ros.publish, "/word", blocked)
+        try:
+            assert is_in.wait(20)
+            site.write(PH + operator(port, "20ms"))
+            result = router.reload()
+            assert (result.ok, "stuck" in result.text) == (False, True)
+        finally:
+            go_on.set()
+        assert router.reload().ok
+
+
 def test_a_thread_that_is_stuck_is_waited_for_in_vain_and_nothing_changes(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
