@@ -100,8 +100,10 @@ class RawSubscription:
         this returns, the previous eventfd is no longer used. Raises one of `RCL_ERRORS`.
         """
         callback = None if eventfd is None else _ADD_TO_EVENTFD
-        if _set_callback(self.handle.pointer, callback, eventfd):
-            raise rclpy_implementation.RCLError("the middleware does not tell of new messages")
+        # rmw_fastrtps counts what is there, then begins to listen: only a second call counts what comes in between.
+        for _ in range(1 if eventfd is None else 2):
+            if _set_callback(self.handle.pointer, callback, eventfd):
+                raise rclpy_implementation.RCLError("the middleware does not tell of new messages")
 
     def close(self) -> None:
         """To be called when nothing is announced, and no thread takes from it."""

@@ -75,8 +75,9 @@ class RosPeer:
 
     def receive_on(self, topic: str) -> dict[str, Any]:
         """The next message of a topic. Those of others that came before it are dropped."""
+        deadline = monotonic() + PATIENCE
         while (arrival := self.receive())[0] != topic:
-            pass
+            assert monotonic() < deadline, f"nothing on {topic}"
         return arrival[1]
 
     def nothing_left(self) -> bool:

@@ -32,6 +32,7 @@ from tests.acceptance.gateway_clients import (
     twist,
 )
 from tests.acceptance.payloads import generated
+from tests.acceptance.ros_peer import PATIENCE
 from tests.acceptance.site import RouterProcess, key, site, total, udp, wait_until
 
 SHOWN = """\
@@ -308,7 +309,9 @@ def test_small_messages_share_a_datagram_and_what_none_holds_is_dropped(now: Sce
         for number, topic in enumerate(topics):
             now.keep(topic, "std_msgs/msg/Int32", data=number)
         numbers, shared = set[str](), 0
+        deadline = time.monotonic() + PATIENCE
         while len(numbers) < 20:
+            assert time.monotonic() < deadline, f"no value of {sorted(topics - numbers)}"
             packets = unbatched(client.recv(65535))
             shared += len(packets) > 1
             found = [packet(each) for each in packets]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import select
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from itertools import count
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from std_msgs.msg import String
 
 from router.clock import wall_ns
 from router.errors import StartError
+from router.ros import receiving
 from router.ros.router_node import RouterNode
 from router.ros.topics import DiscoveredPublisher, TopicListener, TopicTap
 from tests.ros.opening import HELLO, STRING, cdr, open_ros, string_topic
@@ -81,6 +83,23 @@ def test_a_publisher_that_leaves_is_not_seen_any_more(ros: RouterNode) -> None:
 
 def test_nobody_publishes_on_an_unknown_topic(ros: RouterNode) -> None:
     assert ros.topics.publishers("/nobody") == []
+
+
+def test_a_message_is_counted_that_comes_while_the_middleware_begins_to_tell_of_them(
+    ros: RouterNode, publisher: Publish, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counts what is there, and listens some microseconds later; here nothing is told of the first time."""
+    publisher(STRING, "--transient-local").publish([cdr("kept")])
+    wait_until(lambda: bool(ros.topics.publishers("/greeting")))
+    set_callback, calls = receiving._set_callback, count(1)
+
+    def too_early(*arguments: object) -> int:
+        return 0 if next(calls) == 1 else int(set_callback(*arguments))
+
+    monkeypatch.setattr(receiving, "_set_callback", too_early)
+    with closing(tapped(ros, keeps=True)) as tap:
+        wait_until(lambda: tap.arrived() == 1)
+        assert tap.take()
 
 
 @pytest.mark.parametrize("options", [(), ("--best-effort",)])
