@@ -100,7 +100,8 @@ class Runtime:
         For the first program, deadmen send their payload of the start here: nothing is received yet, but gateways serve
         clients as soon as they are open.
         """
-        self._close_unfinished()
+        if self._unfinished and self.wiring is not None and self.datapath.has_passed(self.wiring):
+            self._close_unfinished()  # first: it may be opened again
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
                 check_environment(os.environ)  # before deadmen send, as the start may fail here
@@ -163,29 +164,25 @@ class Runtime:
             if self._ros is not None and change.topics is not None:
                 self._ros.watch(change.topics)
 
-    def _close_unfinished(self) -> None:
-        """Close what a stuck thread used at earlier reloads, if it goes on by now: it may be opened again."""
-        if self._unfinished and self.wiring is not None and self.datapath.has_passed(self.wiring):
-            with ExitStack() as last_first:
-                for finish in self._unfinished:
-                    last_first.callback(finish)
-                self._unfinished = []
-
     def _close_passed(self, change: Change, earlier: Wiring | None) -> None:
         """Close what all threads have passed, in this reload and in those before."""
+        self._unfinished.append(lambda: self._close_left(change, earlier))
         with ExitStack() as last_first:
             if self.datapath.has_passed(change.wiring):
                 last_first.callback(self._context.counts.replace, change.wiring.program.counters)
-                for finish in self._unfinished:
-                    last_first.callback(finish)
-                self._unfinished = []
-                last_first.callback(self._close_left, change, earlier)
+                last_first.callback(self._close_unfinished)
             else:
                 last_first.callback(self._context.counts.adopt, change.wiring.program.counters)
-                self._unfinished.append(lambda: self._close_left(change, earlier))
             if self.gateways is not None and change.gateways is not None:
                 last_first.callback(self.gateways.finish, change.gateways)
                 last_first.callback(self._follow_drops, self.gateways, change.gateways)
+
+    def _close_unfinished(self) -> None:
+        """Close what was left at reloads, the newest first. Each is tried once."""
+        with ExitStack() as last_first:
+            for close in self._unfinished:
+                last_first.callback(close)
+            self._unfinished = []
 
     def _close_left(self, change: Change, earlier: Wiring | None) -> None:
         with ExitStack() as last_first:

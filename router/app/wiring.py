@@ -180,11 +180,10 @@ class Wiring:
 
     def _successions(self, earlier: Wiring | None) -> list[tuple[Deadman, Deadman]]:
         """The deadmen of gateways with other settings, each with the one in `earlier`."""
-        pairs = [
-            (deadman, earlier.gateway_deadmen.get(name) if earlier else None)
-            for name, deadman in self.gateway_deadmen.items()
+        before = earlier.gateway_deadmen if earlier else {}
+        return [
+            (each, before[name]) for name, each in self.gateway_deadmen.items() if before.get(name, each) is not each
         ]
-        return [(deadman, before) for deadman, before in pairs if before is not None and before is not deadman]
 
 
 class Closable(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import socket
 import struct
@@ -118,3 +119,21 @@ class Site:
 def site(tmp_path: Path) -> Iterator[Site]:
     with udp("127.0.0.30") as board, udp("127.0.0.1") as basestation:
         yield Site(tmp_path, board, basestation, free_port())
+
+
+@pytest.fixture
+def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, threading.Event]]:
+    """Publishing natively blocks, which sets the first event, until the second one is set."""
+    rcl = pytest.importorskip("router.ros.rcl", reason="needs ROS 2")
+    is_in, goes_on = threading.Event(), threading.Event()
+
+    def block(*_: object) -> int:
+        is_in.set()
+        goes_on.wait(60)
+        return 0
+
+    blocking = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(block)
+    functions = rcl.publish_functions()._replace(publish=ctypes.cast(blocking, ctypes.c_void_p).value)
+    monkeypatch.setattr(rcl, "publish_functions", lambda: functions)
+    yield is_in, goes_on
+    goes_on.set()

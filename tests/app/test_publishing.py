@@ -20,7 +20,6 @@ if os.environ.get("ROUTER_CARRIER") == "python":
 
 from router.app import Router
 from router.app.native_datapath import NativeDatapath
-from router.ros import rcl
 from tests.app.conftest import Site, numbered
 from tests.ports import free_port
 from tests.ros.peers import Subscriber, wait_until
@@ -71,33 +70,14 @@ def test_a_message_is_published_while_python_is_held(site: Site, subscriber: Sub
         assert router.total("messages_waiting") == 0
 
 
-@pytest.fixture
-def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, threading.Event]]:
-    """Publishing natively blocks, which sets the first event, until the second one is set."""
-    is_in, goes_on = threading.Event(), threading.Event()
-
-    def block(*_: object) -> int:
-        is_in.set()
-        goes_on.wait(60)
-        return 0
-
-    blocking = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(block)
-    functions = rcl.publish_functions()
-    assert functions is not None
-    functions = functions._replace(publish=ctypes.cast(blocking, ctypes.c_void_p).value or 0)
-    monkeypatch.setattr(rcl, "publish_functions", lambda: functions)
-    monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
-    yield is_in, goes_on
-    goes_on.set()
-
-
 KEPT = ROUTES.replace("published_ph,", "published_kept, qos: {durability: transient_local},")
 
 
 def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
-    site: Site, subscriber: Subscriber, stuck: tuple[threading.Event, threading.Event]
+    site: Site, subscriber: Subscriber, stuck: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     is_in, goes_on = stuck
+    monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
     later = f"{{topic: published_ph, type: {FLOAT}, fields: {{data: ph_value}}}}"
     with site.router(KEPT) as router, capture_logs() as logs:
         site.send(numbered(1))
@@ -110,9 +90,10 @@ def test_topics_of_a_reload_are_wanted_while_the_thread_is_stuck(
 
 
 def test_a_reload_opens_again_what_a_stuck_thread_kept_open(
-    site: Site, stuck: tuple[threading.Event, threading.Event]
+    site: Site, stuck: tuple[threading.Event, threading.Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     is_in, goes_on = stuck
+    monkeypatch.setattr("router.app.native_datapath._PATIENCE_S", 0.05)
     with site.router(KEPT) as router:
         site.send(numbered(1))
         assert is_in.wait(20)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import socket
 import struct
 import subprocess
@@ -252,18 +251,9 @@ def test_metrics_tell_on_which_topics_a_publisher_is_stuck(site: Site, monkeypat
 
 
 def test_metrics_tell_where_the_native_thread_is_stuck_while_forwarding_goes_on(
-    site: Site, monkeypatch: pytest.MonkeyPatch
+    site: Site, stuck: tuple[threading.Event, threading.Event]
 ) -> None:
-    rcl = pytest.importorskip("router.ros.rcl", reason="needs ROS 2")
-    goes_on = threading.Event()
-
-    def block(*_: object) -> int:
-        goes_on.wait(10)
-        return 0
-
-    blocking = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(block)
-    functions = rcl.publish_functions()._replace(publish=ctypes.cast(blocking, ctypes.c_void_p).value)
-    monkeypatch.setattr(rcl, "publish_functions", lambda: functions)
+    _, goes_on = stuck
     wanted = TOPIC.replace("queue_depth: 10", "qos: {durability: transient_local}")
     with Router(site.program(ROUTE + wanted)) as router:
         if not isinstance(router._runtime.datapath, NativeDatapath):
