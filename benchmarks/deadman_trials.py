@@ -44,7 +44,7 @@ PAUSE = 2.0
 TABLE = """\
 version: 1
 envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
+http: {{address: 127.0.0.1:{metrics}}}
 listen:
   rover: {{address: 127.0.0.5:{listen}, framing: zero_trimmed, receive_buffer: 4MiB}}
 endpoints:
@@ -59,8 +59,7 @@ endpoints:
     ttl: 200ms
     deadman: {{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}, to: [driving_board], repeat: 100ms}}
   drive_motor:
-    source: ros
-    topics: [{{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage, queue_depth: 10}}]
+    source: {{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage, queue_depth: 10}}
     fields: auto
     destinations: [arm_board]
     ttl: 200ms

@@ -49,7 +49,7 @@ AGAIN_SECONDS = 0.005
 TABLE = """\
 version: 1
 extends: {root}/tests/acceptance/quiet.yaml
-metrics: {{address: 127.0.0.1:{metrics}}}
+http: {{address: 127.0.0.1:{metrics}}}
 foxglove: {{address: 127.0.0.1:{foxglove}}}
 listen: {{rover: {{address: 127.0.0.1:{listen}}}}}
 endpoints:

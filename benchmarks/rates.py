@@ -2,7 +2,7 @@
 
     python -m benchmarks.rates --seconds 10
 
-One stream goes to three destinations: to two of them at most 30 times a second (`keep: first` and `keep: latest`), to
+One stream goes to three destinations: to two of them at most 30 times a second (`on_limit: first` and `on_limit: latest`), to
 the third with a budget. Each input rate has a router of its own. Exits 1 if a rate was missed by more than
 1 Hz, or a budget overdrawn, or not used up while there was enough to send. All on the loopback interface.
 """
@@ -36,7 +36,7 @@ BUDGET = 10_000
 TABLE = """\
 version: 1
 envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
+http: {{address: 127.0.0.1:{metrics}}}
 listen:
   rover: {{address: 127.0.0.5:{listen}, framing: zero_trimmed, receive_buffer: 4MiB}}
 endpoints:
@@ -45,13 +45,13 @@ endpoints:
     source: sensor_board
     destinations:
       - {{endpoint: first, max_rate: 30 Hz}}
-      - {{endpoint: latest, max_rate: 30 Hz, keep: latest}}
+      - {{endpoint: latest, max_rate: 30 Hz, on_limit: latest}}
       - link
 """
 WITH_BUDGET = """\
 version: 1
 extends: table.yaml
-endpoints: {link: {budget: 10kB/s}}
+endpoints: {link: {bandwidth: 10kB/s}}
 """
 FIELDS = "accel_x=1.5 accel_y=1.5 accel_z=1.5 gyro_x=1.5 gyro_y=1.5 gyro_z=1.5"
 

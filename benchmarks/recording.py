@@ -42,7 +42,7 @@ CONDITIONS = {
 TABLE = """\
 version: 1
 extends: {base}
-metrics: {{address: "127.0.0.1:${{METRICS_PORT}}"}}
+http: {{address: "127.0.0.1:${{METRICS_PORT}}"}}
 {record}"""
 
 

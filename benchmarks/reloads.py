@@ -37,7 +37,7 @@ COUNTED = slice(3, 7)
 TABLE = """\
 version: 1
 extends: {table}
-metrics: {{address: "127.0.0.1:{metrics}"}}
+http: {{address: "127.0.0.1:{metrics}"}}
 foxglove: {{address: "127.0.0.1:{foxglove}"}}
 record: {{directory: {folder}, last: 1s}}
 gateways: {{dashboard: {{ignore: this is about routes}}}}
@@ -146,7 +146,7 @@ class RunningRouter:
     def __init__(self, process: subprocess.Popen[str], path: Path) -> None:
         table = read(path)
         self._pid = process.pid
-        self._url = f"http://{table.metrics.value if table.metrics else ''}"
+        self._url = f"http://{table.http.value if table.http else ''}"
         self.host, self.port = table.listeners["rover"].address.value
 
     def reload(self) -> None:

@@ -38,7 +38,7 @@ CASES = ("imu_info", "gps_info", "drive_diag", "arm_pos")
 TABLE = """\
 version: 1
 envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
+http: {{address: 127.0.0.1:{metrics}}}
 listen:
   rover: {{address: 127.0.0.5:{listen}, framing: zero_trimmed, receive_buffer: 4MiB}}
 endpoints:

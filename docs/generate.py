@@ -33,7 +33,7 @@ _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 _COUNTERS = """\
 Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route
 and target, accepted = delivered + dropped + filtered + collected + waiting, and what the router holds back: open
-frames, the queue of a budget, what `keep: latest` holds. Delivered is sent or published. With `for_each`, each element
+frames, the queue of a budget, what `on_limit: latest` holds. Delivered is sent or published. With `for_each`, each element
 is a message. What a deadman sends is in its own metrics alone, and its bytes in none."""
 _GATEWAYS = """\
 A [gateway](table.md#gateways) has its name as `listener` and as `route`. What it sends has `clients` as its target, and

@@ -118,7 +118,7 @@ def test_commands_that_move_the_rover_go_stale_and_have_a_deadman(rover: Program
         deadman, ttl = routes[name].deadman, routes[name].ttl
         assert deadman is not None
         assert (deadman.case.value, tuple(endpoint.value for endpoint in deadman.to)) == (case, to)
-        assert [other.value for other in deadman.hands_over_to] == others
+        assert [other.value for other in deadman.disarmed_by] == others
         assert ttl is not None
         assert ttl.value < deadman.timeout.value
 

@@ -25,7 +25,7 @@ TABLE = """\
 version: 1
 extends: {base}
 networks: [127.0.0.0/8]
-metrics: {{address: "127.0.0.1:{metrics}"}}
+http: {{address: "127.0.0.1:{metrics}"}}
 foxglove: {{address: "127.0.0.1:{foxglove}"}}
 record: {{directory: "{recordings}"}}
 listen:
@@ -41,8 +41,7 @@ routes:
     ttl: {ttl}ms
     deadman: {{{deadman}, to: [driving_board]}}
   drive_motor:
-    source: ros
-    topics: [{{topic: {command_topic}, type: comms/msg/DrivingBoardMotorMessage, queue_depth: 10}}]
+    source: {{topic: {command_topic}, type: comms/msg/DrivingBoardMotorMessage, queue_depth: 10}}
     fields: auto
     destinations: [arm_board]
     ttl: {ttl}ms
@@ -58,7 +57,7 @@ gateways:
     discovery_period: 500ms
 """
 
-DEADMAN = f"timeout: {TIMEOUT_MS}ms, repeat: {REPEAT_MS}ms, send: {{manual_brake: {{brake: true}}}}, hands_over_to: []"
+DEADMAN = f"timeout: {TIMEOUT_MS}ms, repeat: {REPEAT_MS}ms, send: {{manual_brake: {{brake: true}}}}, disarmed_by: []"
 
 LISTENER = """\
   spare: {{address: "127.0.0.1:{spare}"}}

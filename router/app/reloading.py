@@ -144,7 +144,7 @@ def _unchangeable(now: RouteTable, then: RouteTable) -> list[Diagnostic]:
     top = SourceSpan(str(then.path))
     settings = {
         "node": (_node(now.node), _node(then.node), then.node.span),
-        "metrics": (now.metrics, then.metrics, then.metrics and then.metrics.span),
+        "http": (now.http, then.http, then.http and then.http.span),
         "record": (now.record, then.record, then.record and then.record.span),
         "foxglove": (now.foxglove, then.foxglove, then.foxglove and then.foxglove.span),
     }

@@ -271,11 +271,11 @@ class Services:
             from router.observe.diagnostics import Diagnostics
 
             opening.callback(Diagnostics(running, *diagnostics).close)
-        if table.metrics is not None:
+        if table.http is not None:
             from router.observe.http import HttpServer
 
             save = self._recorder.save if self._recorder and table.record and table.record.last else None
-            server = HttpServer(table.metrics.value, table.metrics.span, running, save)
+            server = HttpServer(table.http.value, table.http.span, running, save)
             opening.callback(server.close)
             self.http_address = server.address
 

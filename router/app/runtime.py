@@ -279,7 +279,7 @@ def _open_ros(
 def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:
     """The position in the table of each topic, by ROS name."""
     table = program.table
-    spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.topics}
+    spans = {topic.topic.value: topic.topic.span for route in table.routes for topic in route.all_topics}
     for gateway in table.gateways.values():
         for inbound in gateway.inbound:
             spans[resolved(inbound.topic.topic.value, table.node)] = inbound.topic.topic.span
@@ -292,7 +292,7 @@ def _users_of_topics(program: Program) -> Mapping[str, Sequence[str]]:
     """The routes and gateways that name each topic, by ROS name."""
     names: dict[str, list[str]] = {}
     for route in program.table.routes:
-        for topic in route.topics:
+        for topic in route.all_topics:
             names.setdefault(topic.topic.value, []).append(route.name)
     for gateway in program.gateways:
         for name in gateway.inbound:

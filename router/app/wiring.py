@@ -332,12 +332,12 @@ def log_start(route: str, sent_to: Sequence[str]) -> None:
 
 
 def open_pacers(program: Program, pacing: TimerThread, send: Mapping[str, Send], state: State) -> dict[str, Pacer]:
-    """The pacers of endpoints with a budget, by endpoint."""
+    """The pacers of endpoints with a bandwidth, by endpoint."""
     pacers = {}
     for endpoint in program.senders:
-        if endpoint.budget:
-            sending, budget = send[endpoint.name], endpoint.budget
-            pacer = state.keep(("pacer", endpoint.name, budget, sending), partial(Pacer, budget))
+        if endpoint.bandwidth:
+            sending, bandwidth = send[endpoint.name], endpoint.bandwidth
+            pacer = state.keep(("pacer", endpoint.name, bandwidth, sending), partial(Pacer, bandwidth))
             pacing.add(pacer)  # before the timers that pass on to it, as they have to end first
             pacers[endpoint.name] = pacer
     return pacers

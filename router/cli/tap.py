@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Print what a running router receives, before it routes it, one line for each datagram: the fields that are not default.
-The router is asked where the table's 'metrics.address' says, on this computer; it does not wait for this terminal, and
+The router is asked where the table's 'http.address' says, on this computer; it does not wait for this terminal, and
 says how many datagrams were too many for it. With a port, or the name of an endpoint or listener, it is that UDP port
 instead, which must be free: no router then has part in it.
 """

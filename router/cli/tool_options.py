@@ -39,7 +39,7 @@ def load_wire(args: argparse.Namespace) -> tuple[Wire, RouteTable | None]:
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
     """Which running router: that of a table, or at a URL."""
-    about = f"the table that it runs, for its metrics.address (default: {DEFAULT_TABLE})"
+    about = f"the table that it runs, for its http.address (default: {DEFAULT_TABLE})"
     parser.add_argument("table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help=about)
     add_url_option(parser)
 

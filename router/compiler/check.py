@@ -17,7 +17,7 @@ from router.compiler.metrics import Counters
 from router.compiler.network import network_findings
 from router.compiler.program import GatewayPlan, Program
 from router.compiler.routes import check_routes, clash_findings
-from router.compiler.topics import diagnostics_topic, topic_findings
+from router.compiler.topics import diagnostics_topic, topic_findings, with_types
 from router.errors import Diagnostic, Severity, TableError
 from router.table import in_order, load_table
 from router.table.model import RouteTable, Topic
@@ -73,6 +73,7 @@ def check_table(
         schema, envelope = _wire(table, definitions)
     except TableError as error:
         return Checked(path, in_order([*findings, *error.diagnostics, *network_findings(table)]), table)
+    table = with_types(table, envelope.cases, findings)
     lock = LockComparison(schema, envelope) if table.envelope else None
     board_limit = lock.max_size if lock and lock.max_size else envelope.max_size
     lookup = Lookup(table, schema, envelope, definitions, board_limit)

@@ -9,7 +9,7 @@ from router.compiler.expressions import Reads, Typed
 from router.compiler.mapping import Row
 from router.compiler.plan import Record
 from router.errors import SourceSpan
-from router.table.model import Deadman, Destination, Endpoint, Keep, Priority, Route, Topic
+from router.table.model import Deadman, Destination, Endpoint, OnLimit, Priority, Route, Topic
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -51,8 +51,8 @@ class CheckedTarget:
     @property
     def is_deferred(self) -> bool:
         """Whether it may be served later, and by another thread."""
-        has_budget = self.endpoint is not None and self.endpoint.budget is not None
-        return has_budget or self.declared.keep is Keep.LATEST
+        has_bandwidth = self.endpoint is not None and self.endpoint.bandwidth is not None
+        return has_bandwidth or self.declared.on_limit is OnLimit.LATEST
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +88,12 @@ class CheckedCollect:
 class CheckedDeadman:
     """The deadman of a route. `datagram` is the envelope that it sends, with its zeros.
 
-    `hands_over_to` are the names of routes, not the payload cases of the table.
+    `disarmed_by` are the names of routes, not the payload cases of the table.
     """
 
     settings: Deadman
     datagram: bytes
-    hands_over_to: tuple[str, ...]
+    disarmed_by: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from router.compiler.namespace import NAMESPACE
 from router.compiler.plan import Each, Items, Leaf, Plan, Record, Unset
 from router.compiler.source import call
 from router.errors import MappingError, SourceSpan
-from router.table.model import Keep, Route
+from router.table.model import OnLimit, Route
 from router.types.descriptors import message_of
 from router.types.model import Bytes, Float, List, String, Type
 from router.types.protobuf import PayloadCase
@@ -178,10 +178,10 @@ def _want_immediate(target: CheckedTarget) -> None:
     """Raise NeedsPythonError for a target with a condition, and one that may be served later."""
     if target.when is not None:
         raise NeedsPythonError(f"`when: {target.declared.when}` needs it", target.when.span)
-    if target.declared.keep is Keep.LATEST:
-        raise NeedsPythonError("`keep: latest` needs it", target.span)
-    if target.endpoint is not None and target.endpoint.budget is not None:
-        raise NeedsPythonError(f"the budget of '{target.label}' needs it", target.endpoint.span)
+    if target.declared.on_limit is OnLimit.LATEST:
+        raise NeedsPythonError("`on_limit: latest` needs it", target.span)
+    if target.endpoint is not None and target.endpoint.bandwidth is not None:
+        raise NeedsPythonError(f"the bandwidth of '{target.label}' needs it", target.endpoint.span)
 
 
 def _stamp(stamp: Typed | None, reading: _Reading) -> tuple[int, int] | None:

@@ -17,7 +17,7 @@ from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.errors import Code, Diagnostic, MappingError, SourceSpan
-from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, Keep, Route, RouteTable
+from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, OnLimit, Route, RouteTable
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -40,11 +40,11 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
         return None
     for name in deadman.to:
         lookup.recipient(case, name, sources=frozenset())
-    hands_over_to = _successors(lookup, route, deadman)
+    disarmed_by = _successors(lookup, route, deadman)
     datagram = _datagram(lookup, deadman, case)
     if datagram is None:
         return None
-    return CheckedDeadman(deadman, datagram, hands_over_to)
+    return CheckedDeadman(deadman, datagram, disarmed_by)
 
 
 def _want_deadman(lookup: Lookup, route: Route) -> None:
@@ -54,10 +54,7 @@ def _want_deadman(lookup: Lookup, route: Route) -> None:
         endpoint = lookup.table.endpoints.get(name)
         if route.no_deadman is None and endpoint is not None and endpoint.kind is EndpointKind.BOARD:
             message = f"nothing stops '{name}' when '{route.case.value}' stops coming"
-            hint = (
-                f"say `deadman: {{timeout: 500ms, send: {{CASE: {{FIELD: VALUE}}}}, to: [{name}]}}`, "
-                "or `deadman: why it needs none`"
-            )
+            hint = "say `deadman: {timeout: 500ms, send: {CASE: {FIELD: VALUE}}}`, or `deadman: {none: why}`"
             lookup.report(destination.endpoint.span, Code.NO_DEADMAN, message, hint)
             return
 
@@ -90,8 +87,8 @@ def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> No
         return
     for destination in route.destinations:
         endpoint = lookup.table.endpoints.get(destination.endpoint.value)
-        waits_for = "`keep: latest`" if destination.keep is Keep.LATEST else "the endpoint's budget"
-        if destination.keep is Keep.LATEST or (endpoint is not None and endpoint.budget is not None):
+        waits_for = "`on_limit: latest`" if destination.on_limit is OnLimit.LATEST else "the endpoint's bandwidth"
+        if destination.on_limit is OnLimit.LATEST or (endpoint is not None and endpoint.bandwidth is not None):
             message = f"a command that waited for {waits_for} could undo the deadman when it is older than its timeout"
             span = route.ttl.span if route.ttl else destination.endpoint.span
             lookup.report(span, Code.BAD_VALUE, message, "give the route a 'ttl' no longer than the deadman's timeout")
@@ -99,7 +96,7 @@ def _want_no_late_commands(lookup: Lookup, route: Route, deadman: Deadman) -> No
 
 
 def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ...]:
-    """The routes whose commands disarm the deadman; there must be one for each case in `hands_over_to`."""
+    """The routes whose commands disarm the deadman; there must be one for each case in `disarmed_by`."""
     table = lookup.table
     found = [
         each for each in table.routes if any(takes_over(each, to.endpoint.value, route) for to in each.destinations)
@@ -107,7 +104,7 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
     served = {each.case.value for each in found}
     served |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
     are_known = all(to.value in table.endpoints for to in deadman.to)  # else that is the mistake
-    for name in deadman.hands_over_to:
+    for name in deadman.disarmed_by:
         if lookup.case(name) is not None and name.value not in served and are_known:
             to = " or ".join(f"'{to.value}'" for to in deadman.to)
             message = f"no other route sends '{name.value}' to {to}, so it cannot take over"
@@ -169,6 +166,6 @@ def takes_over(route: Route, endpoint: str, other: Route) -> bool:
     return (
         deadman is not None
         and other.name != route.name
-        and route.case.value in [case.value for case in deadman.hands_over_to]
+        and route.case.value in [case.value for case in deadman.disarmed_by]
         and endpoint in [to.value for to in deadman.to]
     )

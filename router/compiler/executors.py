@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from router.compiler.checked import CheckedRoute, CheckedTarget
 from router.errors import SourceSpan
-from router.table.model import Keep
+from router.table.model import OnLimit
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +60,10 @@ def _own_executor(target: CheckedTarget) -> Executor:
     """The executor of a target, without regard to the others of its endpoint."""
     if target.when is not None:
         return Executor(f"`when: {target.declared.when}` needs it", target.when.span)
-    if target.declared.keep is Keep.LATEST:
-        return Executor("`keep: latest` needs it", target.span)
-    if target.endpoint is not None and target.endpoint.budget is not None:
-        return Executor(f"the budget of '{target.label}' needs it", target.endpoint.span)
+    if target.declared.on_limit is OnLimit.LATEST:
+        return Executor("`on_limit: latest` needs it", target.span)
+    if target.endpoint is not None and target.endpoint.bandwidth is not None:
+        return Executor(f"the bandwidth of '{target.label}' needs it", target.endpoint.span)
     return CARRIER
 
 

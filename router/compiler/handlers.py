@@ -20,7 +20,7 @@ from router.compiler.payload import write_envelope
 from router.compiler.program import TargetPlan
 from router.compiler.source import Source, namespace_name
 from router.errors import SourceSpan
-from router.table.model import Keep, Route
+from router.table.model import OnLimit, Route
 from router.types.protobuf import PayloadCase
 
 Deliver = Callable[[str, CheckedTarget], None]
@@ -153,7 +153,7 @@ class HandlerSource:
                 label=target.label,
                 is_topic=target.topic is not None,
                 max_rate=target.declared.max_rate,
-                keep=target.declared.keep,
+                on_limit=target.declared.on_limit,
                 priority=target.priority,
                 is_deferred=target.is_deferred,
                 deadmen=target.deadmen,
@@ -227,7 +227,7 @@ class HandlerSource:
             with self.out.block(f"{word} clock_ns() > expires:", self.route.ttl.span):
                 self._count("messages_dropped", target, "stale")
             word = "elif"
-        if target.declared.max_rate is not None and target.declared.keep is Keep.FIRST:
+        if target.declared.max_rate is not None and target.declared.on_limit is OnLimit.FIRST:
             with self.out.block(f"{word} not limit_{name}(now):", target.span):
                 self._count("messages_dropped", target, "rate_limited")
             word = "elif"

@@ -162,7 +162,7 @@ def compile_handlers(checked: CheckedRoute, table: RouteTable, counters: Counter
     """
     route, case = checked.route, checked.case
     _open(counters, ("route_duration_seconds", "route_last_message_timestamp_seconds"), route.name)
-    for topic in route.topics:
+    for topic in route.all_topics:
         _open_each(counters, "qos_incompatible", route.name, topic.topic.value, last=QOS_POLICIES)
     if not route.is_outbound:
         sources: list[str | None] = [source.value for source in route.sources]

@@ -105,6 +105,9 @@ class Lookup:
         return endpoint
 
     def ros_type(self, topic: Topic) -> MessageType | None:
+        """The message type of a topic, or None with a finding; without one where the topic has no `type`."""
+        if topic.type is None:
+            return None
         name = topic.type.value
         try:
             found = self.definitions.interfaces.get(name)
@@ -113,6 +116,8 @@ class Lookup:
             return None
         if found is None:
             hint = _ros_type_hint(name, self.definitions.interfaces.names())
+            if topic.type.span == topic.topic.span:
+                hint = f"that is what `defaults.package` makes of the payload; say its 'type' ({hint})"
             self.report(topic.type.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name}'", hint)
         return found
 

@@ -46,15 +46,31 @@ class _Branch:
 
 
 def build(
-    fields: FieldMap | None, target: MessageType, scope: Scope, span: SourceSpan, whole: Typed | None = None
+    fields: FieldMap | None,
+    target: MessageType,
+    scope: Scope,
+    span: SourceSpan,
+    whole: Typed | None = None,
+    ros_type: MessageType | None = None,
 ) -> FieldMapping:
     """Map a message of type `target`. `span` is the position of findings that concern no single entry.
 
-    `auto` takes fields of `whole`, or of the source message if that is None.
+    `auto` takes fields of `whole`, or of the source message if that is None. Without `fields` it is `auto`, and every
+    field of `ros_type`, which is source or target, must have one of its name on the other side.
     """
-    builder = _Builder(scope, fields.span if fields else span, "item." if whole else "")
-    given = builder.sort(fields.entries if fields else (), target)
-    automatic = (whole or scope.whole_message(span)) if fields and fields.auto else None
+    if fields is None:
+        outcome = build(FieldMap(span, auto=True, entries=()), target, scope, span, whole)
+        left = _left_out(ros_type, outcome.rows) if ros_type and not outcome.findings else []
+        if left:
+            names = ", ".join(f"'{name}'" for name in left[:_MOST_NAMES]) + ", ..." * (len(left) > _MOST_NAMES)
+            other = scope.message if ros_type == target else target
+            message = f"without 'fields' all of {ros_type} is filled by name, and {other} has no {names}"
+            hint = "map its fields, or say `fields: auto` to leave out what has no counterpart"
+            outcome.findings.append(Diagnostic(span, Code.NOTHING_MAPPED, message, hint))
+        return outcome
+    builder = _Builder(scope, fields.span, "item." if whole else "")
+    given = builder.sort(fields.entries, target)
+    automatic = (whole or scope.whole_message(span)) if fields.auto else None
     plan = builder.record(given, automatic, "")
     outcome = FieldMapping(plan, builder.rows, builder.findings or list(presence_findings(plan)))
     if target.fields and not builder.rows and not outcome.findings:
@@ -63,6 +79,27 @@ def build(
             hint = f"{automatic.kind} and {target} have no field name in common; map the fields by hand"
         outcome.findings.append(Diagnostic(builder.span, Code.NOTHING_MAPPED, f"nothing fills {target}", hint))
     return outcome
+
+
+_MOST_NAMES = 4
+"""Of the fields that a finding lists."""
+
+
+def _left_out(message: MessageType, rows: Sequence[Row]) -> list[str]:
+    """The fields of `message` that rows of an automatic mapping do not name."""
+    named = {row.target for row in rows}
+    return [
+        path for path in _paths(message, "") if not any(path == each or path.startswith(f"{each}.") for each in named)
+    ]
+
+
+def _paths(message: MessageType, prefix: str) -> Iterator[str]:
+    """The paths of all fields that are no messages."""
+    for member in message.fields:
+        if isinstance(member.type, MessageType) and member.type.fields:
+            yield from _paths(member.type, f"{prefix}{member.name}.")
+        else:
+            yield prefix + member.name
 
 
 class _Builder:

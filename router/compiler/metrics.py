@@ -102,7 +102,7 @@ DROP_REASONS: Mapping[str, str] = {
     "non_finite": "NaN or infinity where an integer or a time is wanted",
     "stale": "older than `ttl`",
     "rate_limited": "more often than `max_rate`",
-    "queue_full": "the endpoint's `budget` was short, or a thread was behind, for longer than the queue lasts",
+    "queue_full": "the endpoint's `bandwidth` was short, or a thread was behind, for longer than the queue lasts",
     "send_buffer_full": "the kernel's send buffer was full",
     "send_error": "the network refused it; `Connection refused`: nobody listens there",
     "publish_error": "the ROS middleware refused it",

@@ -48,8 +48,8 @@ def _held(table: RouteTable) -> Iterator[_Held]:
     for listener in table.listeners.values():
         interface = listener.interface
         yield _Held(f"listener '{listener.name}'", listener.address, is_udp=True, interface=interface)
-    if table.metrics is not None:
-        yield _Held("the metrics", table.metrics)
+    if table.http is not None:
+        yield _Held("'http'", table.http)
     if table.foxglove is not None:
         yield _Held("'foxglove'", table.foxglove)
     for gateway in table.gateways.values():

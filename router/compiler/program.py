@@ -14,7 +14,7 @@ from router.compiler.commands import Commands
 from router.compiler.executors import Executors
 from router.compiler.lowering import LoweredRoute
 from router.compiler.metrics import Counters
-from router.table.model import Endpoint, Gateway, Inbound, Keep, Listener, Priority, RouteTable
+from router.table.model import Endpoint, Gateway, Inbound, Listener, OnLimit, Priority, RouteTable
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
@@ -65,8 +65,8 @@ class TopicPlan:
 class TargetPlan:
     """A target of a generated function: `label` in metrics, `identifier` in the names that the function calls.
 
-    `is_deferred` says that it may be served later and by another thread: it has `keep: latest`, or its
-    endpoint has a budget. `deadmen` are the routes whose deadmen each command to it feeds (its own route's) or disarms.
+    `is_deferred` says that it may be served later and by another thread: it has `on_limit: latest`, or its
+    endpoint has a bandwidth. `deadmen` are the routes whose deadmen each command to it feeds (its own route's) or disarms.
     It holds no positions of the table, since the engine keeps state by it from one table to the next.
     """
 
@@ -74,7 +74,7 @@ class TargetPlan:
     label: str
     is_topic: bool
     max_rate: float | None
-    keep: Keep = Keep.FIRST
+    on_limit: OnLimit = OnLimit.FIRST
     priority: Priority = Priority.TELEMETRY
     is_deferred: bool = False
     deadmen: tuple[str, ...] = ()

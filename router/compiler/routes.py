@@ -17,7 +17,6 @@ from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
 from router.table.model import (
     ANY,
-    ROS,
     Collect,
     Destination,
     Endpoint,
@@ -72,22 +71,30 @@ def _route(lookup: Lookup, route: Route) -> CheckedRoute | None:
         return CheckedRoute(route, case)
     _sources(lookup, route)
     if not route.destinations and not route.topics:
-        message, hint = f"'{route.name}' goes nowhere", "name destinations or topics, or say `ignore: reason`"
+        places = "destinations" if route.is_outbound else "destinations or topics"
+        message, hint = f"'{route.name}' goes nowhere", f"name {places}, or say `ignore: reason`"
         lookup.report(route.span, Code.NO_TARGET, message, hint)
-    for topic in route.topics:
-        found = (topic_name_finding(topic), *qos_findings(topic, publishes=not route.is_outbound))
+    for topic in route.all_topics:
+        found = (topic_name_finding(topic), *qos_findings(topic, publishes=topic in route.topics))
         lookup.findings += [finding for finding in found if finding]
     checked = (check_outbound if route.is_outbound else check_inbound)(lookup, route, case)
     return replace(checked, deadman=check_deadman(lookup, route))
 
 
 def _sources(lookup: Lookup, route: Route) -> None:
+    seen: set[str] = set()
     for source in route.sources:
-        if source.value not in (ANY, ROS):
-            lookup.endpoint(source, (ANY, ROS))
+        if source.value in seen:
+            lookup.report(source.span, Code.BAD_VALUE, f"'{source.value}' is a source twice", "name it once")
+        seen.add(source.value)
+        if source.value != ANY:
+            lookup.endpoint(source, (ANY,))
         elif len(route.sources) > 1:
-            message, hint = f"'{source.value}' stands alone", "name endpoints, or it, not both"
+            message, hint = f"'{ANY}' stands alone", "name endpoints, or it, not both"
             lookup.report(source.span, Code.BAD_VALUE, message, hint)
+    if route.sources and route.source_topics:
+        message = "a route takes messages from endpoints or from topics, not from both"
+        lookup.report(route.source_topics[0].span, Code.BAD_VALUE, message, "make it a list of two routes")
 
 
 def destinations(lookup: Lookup, route: Route, case: PayloadCase) -> list[tuple[Destination, Endpoint | None]]:
@@ -126,6 +133,9 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
 def _forward(
     lookup: Lookup, route: Route, case: PayloadCase, destination: Destination, endpoint: Endpoint | None
 ) -> CheckedTarget:
+    if destination.fields is not None:
+        message, hint = "a datagram is forwarded unchanged", "'fields' is for messages that come from a topic"
+        lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
     reads = ParsedReads()
     when = lookup.when(destination.when, lookup.scope(case.type, reads))
     return CheckedTarget(
@@ -144,7 +154,7 @@ def _publish(
     reads = ParsedReads()
     scope = lookup.scope(case.type, reads, ros_type, names)
     when = lookup.when(topic.when, scope)
-    mapping = build(topic.fields, ros_type, scope, topic.topic.span)
+    mapping = build(topic.fields, ros_type, scope, topic.topic.span, ros_type=ros_type)
     lookup.findings += mapping.findings
     return CheckedTarget(topic, type=ros_type, reads=reads, when=when, plan=mapping.plan, rows=tuple(mapping.rows))
 
@@ -179,17 +189,11 @@ HEADER = "std_msgs/msg/Header"
 
 def check_outbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRoute:
     """Check the topics that feed a route from ROS, and what each destination gets of them."""
-    if not route.topics:
-        message = f"'{route.name}' comes from ROS, but from no topic"
-        lookup.report(route.span, Code.NO_TARGET, message, "name it under 'topics'")
-    if route.topics and not route.destinations:
-        message = f"'{route.name}' goes to no destination"
-        lookup.report(route.span, Code.NO_TARGET, message, "name it under 'destinations'")
     found = destinations(lookup, route, case)
     subscriptions = []
-    for topic in route.topics:
+    for topic in route.source_topics:
         name = topic.topic.value
-        if next(other for other in route.topics if other.topic.value == name) is not topic:
+        if next(other for other in route.source_topics if other.topic.value == name) is not topic:
             lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{name}' is a topic twice", "name it once")
         ros_type = lookup.ros_type(topic)
         if ros_type is not None and (checked := _subscription(lookup, route, case, topic, ros_type, found)):
@@ -215,9 +219,10 @@ def _subscription(
     targets = []
     for destination, endpoint in found:
         condition = lookup.when(destination.when, scope)
-        fields = destination.fields or route.fields or topic.fields  # the last are misplaced, but meant
+        fields = destination.fields or route.fields
         whole = scope.variable("item", route.span) if for_each else None
-        mapping = build(fields, case.type, scope, destination.span if own else route.span, whole)
+        span = destination.span if own else route.span
+        mapping = build(fields, case.type, scope, span, whole, _element_type(for_each) if for_each else ros_type)
         lookup.findings += mapping.findings
         target = CheckedTarget(
             destination,
@@ -230,6 +235,12 @@ def _subscription(
         )
         targets.append(target)
     return CheckedSubscription(topic, ros_type, reads, when, for_each, stamp, tuple(targets))
+
+
+def _element_type(elements: Typed) -> MessageType | None:
+    """The message type of the elements of `for_each`, None if they are no messages."""
+    element = elements.kind.element if isinstance(elements.kind, ListKind) else None
+    return element.type if isinstance(element, MessageKind) else None
 
 
 def _stamp(scope: Scope, span: SourceSpan) -> Typed | None:
@@ -280,7 +291,7 @@ def clash_findings(table: RouteTable) -> Iterator[Diagnostic]:
 def _origins(route: Route, table: RouteTable) -> dict[str, Located[str]]:
     """The sources of a route: topics by absolute name, which begins with `/`, or endpoints."""
     if route.is_outbound:
-        return {resolved(topic.topic.value, table.node): topic.topic for topic in route.topics}
+        return {resolved(topic.topic.value, table.node): topic.topic for topic in route.source_topics}
     return {source.value: source for source in route.sources}
 
 

@@ -10,6 +10,7 @@ from itertools import product
 from router.compiler.program import QosPlan
 from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.model import InboundDeadman, NodeSettings, Route, RouteTable, Topic
+from router.types.protobuf import PayloadCase
 
 DEFAULT_DEPTH = 10
 LONGEST_NAME = 247
@@ -34,7 +35,34 @@ def diagnostics_topic(node: NodeSettings) -> Topic | None:
     if node.diagnostics is None:
         return None
     span = node.diagnostics
-    return Topic(Located(DIAGNOSTICS, span), Located(DIAGNOSTICS_TYPE, span), span)
+    return Topic(topic=Located(DIAGNOSTICS, span), span=span, type=Located(DIAGNOSTICS_TYPE, span))
+
+
+def with_types(table: RouteTable, cases: Mapping[str, PayloadCase], findings: list[Diagnostic]) -> RouteTable:
+    """The table with a type for each topic of a route whose payload case exists, or a finding for it.
+
+    Without `type` it is the message of `defaults.package` that has the name of the payload's protobuf message.
+    """
+
+    def typed(topic: Topic, case: PayloadCase) -> Topic:
+        name = case.type.name.rpartition(".")[2]
+        if topic.type is not None:
+            return topic
+        if table.package is not None:
+            return replace(topic, type=Located(f"{table.package.value}/msg/{name}", topic.topic.span))
+        message = f"the topic '{topic.topic.value}' lacks the key 'type'"
+        hint = f"say it, or `defaults: {{package: PACKAGE}}`, which makes it PACKAGE/msg/{name}"
+        findings.append(Diagnostic(topic.topic.span, Code.MISSING_KEY, message, hint))
+        return topic
+
+    def route_with_types(route: Route) -> Route:
+        case = cases.get(route.case.value)
+        if case is None:
+            return route
+        topics = tuple(typed(topic, case) for topic in route.topics)
+        return replace(route, topics=topics, source_topics=tuple(typed(topic, case) for topic in route.source_topics))
+
+    return replace(table, routes=tuple(map(route_with_types, table.routes)))
 
 
 def topic_name_finding(topic: Topic) -> Diagnostic | None:
@@ -137,8 +165,8 @@ def _uses(table: RouteTable, routes: Sequence[Route]) -> Mapping[str, Sequence[_
 
 def _all_uses(table: RouteTable, routes: Sequence[Route]) -> Iterator[_Use]:
     for route in routes:
-        for topic in route.topics:
-            yield _Use(topic, f"route '{route.name}'", not route.is_outbound, qos_of(topic), route)
+        for topic in route.all_topics:
+            yield _Use(topic, f"route '{route.name}'", topic in route.topics, qos_of(topic), route)
     for gateway in table.gateways.values():
         for inbound in gateway.inbound:
             owner = f"gateway '{gateway.name}'"
@@ -174,7 +202,7 @@ def _struggles(name: str, use: _Use, others: Sequence[_Use]) -> Iterator[Diagnos
 
 
 def _disagreement(name: str, first: _Use, use: _Use) -> Diagnostic | None:
-    if use.topic.type.value != first.topic.type.value:
+    if use.topic.type and first.topic.type and use.topic.type.value != first.topic.type.value:
         message = f"topic '{name}' has the type {first.topic.type.value} in {first.owner}"
         hint = f"a topic has one type; see {first.topic.type.span}"
         return Diagnostic(use.topic.type.span, Code.TOPIC_TYPE_CLASH, message, hint)

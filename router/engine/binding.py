@@ -15,7 +15,7 @@ from router.engine.delivery import MAPPING_FAILURES, Deliver, FrameOutcome, Outc
 from router.engine.freshness import Freshness
 from router.engine.pacing import Latest, Pacer, RateLimit
 from router.engine.timers import Locked
-from router.table.model import Keep
+from router.table.model import OnLimit
 
 T = TypeVar("T")
 
@@ -74,7 +74,7 @@ class EngineContext:
     message that has a `ttl` or deadmen (see engine.deadman). `publish` takes CDR bytes, by topic, and may raise
     `publish_errors`. `wanted`, by topic, is a flag that its owner keeps up to date: whether anybody subscribes.
     `report` is called for losses only. `counts` belong to the thread that calls the handlers. `pacers` are those of
-    the endpoints with a budget, in the group `pacing` like messages that wait for endpoints; `holding` has those that
+    endpoints with a bandwidth, in the group `pacing` like messages that wait for endpoints; `holding` has those that
     wait for topics. Frames are collected in the group `collecting`.
     """
 
@@ -134,7 +134,7 @@ def _target_names(target: TargetPlan, handler: Handler, counters: Counters, cont
         names[f"send_{name}"] = (
             context.command(target.label, route, target.deadmen) if is_command else context.send[target.label]
         )
-    if target.max_rate is not None and target.keep is Keep.FIRST:
+    if target.max_rate is not None and target.on_limit is OnLimit.FIRST:
         rate = target.max_rate
         names[f"limit_{name}"] = context.state.keep(("limit", *place), lambda: RateLimit(rate)).may_pass
     return names
@@ -173,7 +173,7 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
     else:
         destination = context.send[target.label]
         deliver = immediately(context.command(target.label, route, target.deadmen), outcome)
-    if target.keep is Keep.LATEST and target.max_rate is not None:
+    if target.on_limit is OnLimit.LATEST and target.max_rate is not None:
         rate = target.max_rate
         latest = context.state.keep(("latest", *place, destination), lambda: Latest(rate, deliver, outcome))
         return locked(latest, latest.offer)

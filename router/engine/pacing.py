@@ -1,4 +1,4 @@
-"""`max_rate`, `keep: latest` and `budget`: which messages pass, which wait and which are dropped."""
+"""`max_rate`, `on_limit: latest` and `bandwidth`: which messages pass, which wait and which are dropped."""
 
 from __future__ import annotations
 

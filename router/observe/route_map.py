@@ -94,10 +94,8 @@ def _case(route: Route) -> Node:
 def _sources(route: Route, table: RouteTable) -> Iterator[Node]:
     if route.ignore is not None:
         return
-    if route.is_outbound:
-        for topic in route.topics:
-            yield Node(f"from:{topic.topic.value}", 0, NodeKind.TOPIC, topic.topic.value, topic.type.value)
-        return
+    for topic in route.source_topics:
+        yield Node(f"from:{topic.topic.value}", 0, NodeKind.TOPIC, topic.topic.value, topic.type_name)
     for source in route.sources:
         if source.value == ANY:
             yield Node(f"from:@{ANY}", 0, NodeKind.ANYONE, "any sender")
@@ -108,8 +106,8 @@ def _sources(route: Route, table: RouteTable) -> Iterator[Node]:
 def _targets(route: Route, table: RouteTable) -> Iterator[Node]:
     for destination in route.destinations:
         yield _endpoint(table.endpoints[destination.endpoint.value], "to", 2)
-    for topic in () if route.is_outbound else route.topics:
-        yield Node(f"to:{topic.topic.value}", 2, NodeKind.TOPIC, topic.topic.value, topic.type.value)
+    for topic in route.topics:
+        yield Node(f"to:{topic.topic.value}", 2, NodeKind.TOPIC, topic.topic.value, topic.type_name)
 
 
 def _endpoint(endpoint: Endpoint, side: str, column: int) -> Node:
@@ -121,22 +119,20 @@ def _edges_of(route: Route) -> Iterator[Edge]:
     case = f"case:{route.case.value}"
     if route.ignore is not None:
         return
-    if route.is_outbound:
-        for topic in route.topics:
-            yield Edge(f"from:{topic.topic.value}", case, route.name, topic.topic.value, _condition(topic))
-    else:
-        for source in (source.value for source in route.sources):
-            yield Edge(f"from:@{source}", case, route.name, source)
+    for topic in route.source_topics:
+        yield Edge(f"from:{topic.topic.value}", case, route.name, topic.topic.value, _condition(topic))
+    for source in (source.value for source in route.sources):
+        yield Edge(f"from:@{source}", case, route.name, source)
     for destination in route.destinations:
         name = destination.endpoint.value
         yield Edge(case, f"to:@{name}", route.name, name, _condition(destination))
-    for topic in () if route.is_outbound else route.topics:
+    for topic in route.topics:
         name = topic.topic.value
         yield Edge(case, f"to:{name}", route.name, name, _condition(topic))
 
 
 def _condition(target: Destination | Topic) -> str:
-    return ", ".join(" ".join(words.split()) for key, words in phrases(target).items() if key != "keep")
+    return ", ".join(" ".join(words.split()) for key, words in phrases(target).items() if key != "on_limit")
 
 
 def _gateway_nodes(gateway: Gateway, table: RouteTable) -> Iterator[Node]:
@@ -150,7 +146,7 @@ def _gateway_nodes(gateway: Gateway, table: RouteTable) -> Iterator[Node]:
     for inbound in gateway.inbound:
         yield Node(f"clients:{_key(gateway)}", 0, NodeKind.CLIENTS, f"clients of {gateway.name}", str(place))
         name = resolved(inbound.topic.topic.value, table.node)
-        yield Node(f"to:{name}", 2, NodeKind.TOPIC, name, inbound.topic.type.value)
+        yield Node(f"to:{name}", 2, NodeKind.TOPIC, name, inbound.topic.type_name)
 
 
 def _gateway_edges(gateway: Gateway, table: RouteTable) -> Iterator[Edge]:

@@ -190,7 +190,7 @@ class RecordingDirectory:
             raise StartError(f"{settings.span}: may not write to {settings.directory}; give `record` another directory")
         self.path = settings.directory.resolve()
         self._stem = stem
-        self._keep = settings.keep
+        self._keep = settings.retention
 
     def new(self, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
         """Create a file. Equal names, as where the clock begins anew at each start, get numbers. Raises OSError."""
@@ -248,7 +248,7 @@ class ContinuousWriter:
         about: Callable[[], Mapping[str, str]],
     ) -> None:
         self.datagrams = self.bytes = self.lost = 0
-        self._max_size = min(settings.max_size, settings.keep)
+        self._max_size = min(settings.max_size, settings.retention)
         self._max_age = settings.max_age
         self._directory = directory
         self._channels = channels

@@ -18,7 +18,7 @@ from router.errors import SourceSpan
 from router.rehearsal.comparing import Outcome
 from router.rehearsal.rehearsal import Dropped, Event, Filtered, Published, Received, Rejected, Sent
 from router.rehearsal.steps import Expected
-from router.table.model import ANY, ROS
+from router.table.model import ANY
 
 KINDS = ("route", "target", "rejection")
 
@@ -91,13 +91,13 @@ def _items(checked: Checked, program: Program) -> Iterator[tuple[Key, Item]]:
         yield ("route", name), Item("route", route.route.span, f"no test has a message for the route {name}")
     for route in routes:
         yield from _targets(route)
-    if any(source.value not in {ANY, ROS} for route in routes for source in route.route.sources):
+    if any(source.value != ANY for route in routes for source in route.route.sources):
         for listener in program.table.listeners.values():
             gap = f"no test has a datagram at {listener.name} from a sender that its route does not take it from"
             yield ("source_mismatch", listener.name), Item("rejection", listener.span, gap)
     for endpoint in program.table.endpoints.values():
-        if endpoint.budget is not None:
-            gap = f"no test exceeds the budget of {endpoint.name}"
+        if endpoint.bandwidth is not None:
+            gap = f"no test exceeds the bandwidth of {endpoint.name}"
             yield ("queue_full", endpoint.name), Item("rejection", endpoint.span, gap)
     for route in routes:
         yield from _rejections(route)

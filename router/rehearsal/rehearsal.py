@@ -174,7 +174,7 @@ class Rehearsal:
             plan.route: Deadman(plan, program.counters, counts, send, self._report, self._deadman_changed)
             for plan in program.deadmen
         }
-        pacers = {to.name: Pacer(to.budget) for to in program.senders if to.budget}
+        pacers = {to.name: Pacer(to.bandwidth) for to in program.senders if to.bandwidth}
         self._timers += pacers.values()  # before what hands on to them
         group = TimerGroup(counts, self._locked)
         return EngineContext(

@@ -12,6 +12,7 @@ from router.table.build import build_table
 from router.table.extends import load_chain
 from router.table.model import RouteTable
 from router.table.schema import check_shape
+from router.table.shorthand import written_out
 from router.table.source import Source
 
 
@@ -26,7 +27,7 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
     table = None
     try:
         root = load_chain(path, os.environ if environ is None else environ, sources, findings)
-        shaped = check_shape(root, findings)
+        shaped = written_out(check_shape(root, findings))
         table = build_table(shaped, sources, findings)
         if table is not None and table.networks is not None:
             findings.extend(outside_findings(shaped, table.networks, [source.file for source in sources]))
@@ -50,7 +51,7 @@ def in_order(findings: Iterable[Diagnostic]) -> list[Diagnostic]:
 
 def summary(table: RouteTable) -> str:
     """`26 payload cases, 31 topics, 8 endpoints, 1 gateway`, without what there is none of."""
-    topics = sum(len(route.topics) for route in table.routes)
+    topics = sum(len(route.all_topics) for route in table.routes)
     cases = {route.case.value for route in table.routes}
     counts = {
         "payload case": len(cases),

@@ -106,7 +106,7 @@ def _bad_host(host: str) -> BadAddressError:
 
 
 ADDRESSES: tuple[Path, ...] = (
-    ("metrics", "address"),
+    ("http", "address"),
     ("foxglove", "address"),
     ("listen", "*", "address"),
     ("endpoints", "*", "address"),

@@ -101,14 +101,14 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     if (envelope is None or routes is None) and not _has_gateways_only(root):
         return None
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
-    findings.extend(_misplaced_keys(root))
     return RouteTable(
         path=sources[0].path,
         files=tuple(source.path for source in sources),
         sha256=hashlib.sha256(b"".join(source.data for source in sources)).hexdigest(),
         envelope=envelope,
         node=builder.one(root, "node", _node) or NodeSettings(),
-        metrics=builder.one(root, "metrics", _address),
+        package=builder.one(root, "defaults", _package),
+        http=builder.one(root, "http", _address),
         listeners=builder.each(root, "listen", _named(Listener)),
         endpoints=builder.each(root, "endpoints", _named(Endpoint)),
         routes=_with_names(builder.each(root, "routes", _case, salvage=valid_part).values()),
@@ -252,6 +252,10 @@ def _address(entry: Entry) -> Located[Address]:
     return Located(parsed(parse_local, written), written.span)
 
 
+def _package(entry: Entry) -> Located[str] | None:
+    return optional_text(mapping(entry.value), "package")
+
+
 def _record(entry: Entry) -> RecordSettings:
     return structure(RecordSettings, mapping(entry.value), span=entry.key.span)
 
@@ -285,9 +289,28 @@ def _case(entry: Entry) -> tuple[Route, ...]:
 
 def _route(case: ScalarNode, node: Node, span: SourceSpan) -> Route:
     settings = mapping(node)
-    deadman = settings.get("deadman")
-    reason = deadman.text if isinstance(deadman, ScalarNode) else None
-    return structure(Route, settings, name=case.text, span=span, case=Located(case.text, case.span), no_deadman=reason)
+    sources = _members(settings.get("source"))
+    route = structure(
+        Route,
+        settings,
+        name=case.text,
+        span=span,
+        case=Located(case.text, case.span),
+        sources=tuple(located(each) for each in sources if isinstance(each, ScalarNode)),
+        source_topics=tuple(_topic(each, _item_span(each)) for each in sources if isinstance(each, MappingNode)),
+        deadman=None,
+    )
+    entry = settings.entries.get("deadman")
+    if entry is None:
+        return route
+    if reason := optional_text(mapping(entry.value), "none"):
+        return replace(route, no_deadman=reason.value)
+    return replace(route, deadman=_deadman(entry, tuple(each.endpoint for each in route.destinations)))
+
+
+def _members(node: Node | None) -> Sequence[Node]:
+    """The items of a list, or the one thing that stands in its place."""
+    return node.items if isinstance(node, SequenceNode) else (node,) if node else ()
 
 
 def _with_names(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
@@ -300,7 +323,11 @@ def _with_names(cases: Iterable[tuple[Route, ...]]) -> tuple[Route, ...]:
     found: list[Route] = []
     for routes in cases:
         for route in routes:
-            name = route.name if len(routes) == 1 else _free(f"{route.name}_from_{route.sources[0].value}", taken)
+            name = (
+                route.name
+                if len(routes) == 1
+                else _free(f"{route.name}_from_{route.sources[0].value if route.sources else ROS}", taken)
+            )
             taken.add(name)
             found.append(replace(route, name=name))
     return tuple(found)
@@ -315,51 +342,34 @@ def _free(name: str, taken: set[str]) -> str:
     return free
 
 
-def _misplaced_keys(root: MappingNode) -> Iterator[Diagnostic]:
-    """Keys that have no place in a route from ROS, or in one from elsewhere."""
-    routes = root.get("routes")
-    for entry in routes.entries.values() if isinstance(routes, MappingNode) else ():
-        for route in _mappings(entry.value):
-            with_ros = ROS in map(to_data, _members(route.get("source")))
-            yield from _misplaced(Route, route, with_ros)
-            for model, key in ((Destination, "destinations"), (Topic, "topics")):
-                for part in _mappings(route.get(key)):
-                    yield from _misplaced(model, part, with_ros)
-
-
-def _misplaced(model: type, settings: MappingNode, with_ros: bool) -> Iterator[Diagnostic]:
-    for key in keys_of(model):
-        entry, rule = settings.entries.get(key.name), key.misplaced
-        if entry is None or rule is None or rule.with_ros != with_ros or rule.model not in (None, model.__name__):
-            continue
-        if is_valid(entry.value):
-            span = entry.value.span if isinstance(entry.value, ScalarNode) else entry.key.span
-            message, hint = rule.message.format(key=key.name), rule.hint.format(key=key.name)
-            yield Diagnostic(span, Code.UNKNOWN_KEY, message, hint)
-
-
-def _members(node: Node | None) -> Sequence[Node]:
-    """The items of a list, or the one thing that stands in its place."""
-    return node.items if isinstance(node, SequenceNode) else (node,) if node else ()
-
-
-def _mappings(node: Node | None) -> Iterator[MappingNode]:
-    return (member for member in _members(node) if isinstance(member, MappingNode))
-
-
 def _destination(node: Node, span: SourceSpan) -> Destination:
     if isinstance(node, ScalarNode):
         return Destination(located(node), node.span)
     return structure(Destination, mapping(node), span=span)
 
 
-def _deadman(node: Node, span: SourceSpan) -> Deadman | None:
-    """None for a text, which is the reason why there is none."""
-    if isinstance(node, ScalarNode):
-        return None
-    settings = mapping(node)
+def _topic(node: Node, span: SourceSpan) -> Topic:
+    return structure(Topic, mapping(node), span=span)
+
+
+def _deadman(entry: Entry, destinations: tuple[Located[str], ...]) -> Deadman:
+    """The deadman of a route with these destinations, which get its payload unless it says `to`."""
+    settings = _with_timeout(entry)
     [payload] = mapping(settings.get("send")).entries.values()
-    return structure(Deadman, settings, span=span, case=located(payload.key), fields=_constants(payload))
+    own = {} if settings.get("to") else {"to": destinations}
+    return structure(
+        Deadman, settings, span=entry.key.span, case=located(payload.key), fields=_constants(payload), **own
+    )
+
+
+def _with_timeout(deadman: Entry) -> MappingNode:
+    """The settings of a deadman. Its timeout is a key that there must be, here or in the table's defaults."""
+    settings = mapping(deadman.value)
+    if settings.get("timeout") is None:
+        hint = "say it here, or for all deadmen: `defaults: {deadman: {timeout: 500ms}}`"
+        what = "'deadman' lacks the key 'timeout'"
+        raise InvalidValueError(Diagnostic(deadman.key.span, Code.MISSING_KEY, what, hint))
+    return settings
 
 
 def _expression(node: Node, _: SourceSpan) -> Expression:
@@ -474,21 +484,22 @@ def _rates(node: Node | None) -> Iterator[TopicRate]:
 
 def _inbound(node: Node, span: SourceSpan) -> Inbound:
     settings = mapping(node)
-    return structure(Inbound, settings, span=span, topic=structure(Topic, settings, span=span))
+    entry = settings.entries.get("deadman")
+    deadman = _inbound_deadman(entry) if entry else None
+    return structure(Inbound, settings, span=span, topic=_topic(node, span), deadman=deadman)
 
 
-def _inbound_deadman(node: Node, span: SourceSpan) -> InboundDeadman:
-    settings = mapping(node)
-    return structure(InboundDeadman, settings, span=span, fields=_constants(settings.entries["send"]))
+def _inbound_deadman(entry: Entry) -> InboundDeadman:
+    settings = _with_timeout(entry)
+    return structure(InboundDeadman, settings, span=entry.key.span, fields=_constants(settings.entries["send"]))
 
 
 _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
-    Deadman: _deadman,
     Destination: _destination,
     Expression: _expression,
     FieldMap: _fields,
     Inbound: _inbound,
-    InboundDeadman: _inbound_deadman,
+    Topic: _topic,
     TopicPattern: _pattern,
     ZenohConfig: _zenoh_config,
 }

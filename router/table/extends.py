@@ -1,8 +1,9 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
-Mappings merge key by key, everything else replaces. Three mappings replace as well: a route or gateway that one of the
-two files ignores, the payload that a deadman sends, and the transport of a gateway. Every node keeps the span of the
-file where it was written.
+Mappings merge key by key, everything else replaces. These mappings replace as well: a route or gateway that one of the
+two files ignores, a route that takes topics where the other takes datagrams, a deadman that one of them says there is none of, the payload that a deadman sends, and the transport
+of a gateway. `topic` and `topics` of a route replace each other. Every node keeps the span of the file where it was
+written.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from router.errors import Code, Diagnostic, TableError, nearest, shown_path
 from router.table.compose import compose
-from router.table.nodes import Entry, MappingNode, Node, ScalarNode
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
 from router.table.source import Source, read_source
 
@@ -22,6 +23,10 @@ KEY = "extends"
 IGNORE = "ignore"
 _DEPTH = len(("routes", "case"))
 """At which routes and gateways stand."""
+_WORDS_FOR_NONE: Mapping[Steps, str] = {(): IGNORE, ("deadman",): "none"}
+"""How a route or gateway, or a part of it, says that there is none."""
+_ALTERNATIVES = {"topic": "topics", "topics": "topic"}
+"""Keys of a route that exclude each other."""
 _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
 """What of a route or gateway has one key, which says what kind it is."""
 
@@ -56,7 +61,10 @@ def load_chain(
 def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode:
     """`over` laid upon `base`, which stand at the path `here`."""
     entries = dict(base.entries)
+    is_route = here[:1] == ("routes",) and len(here) == _DEPTH
     for key, entry in over.entries.items():
+        if is_route and key in _ALTERNATIVES:
+            entries.pop(_ALTERNATIVES[key], None)
         below, above, path = entries[key].value if key in entries else None, entry.value, (*here, key)
         if isinstance(below, MappingNode) and isinstance(above, MappingNode) and not _replaces(above, below, path):
             entries[key] = Entry(entry.key, merge(below, above, path))
@@ -66,12 +74,21 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
-    """Nothing to merge: a route or gateway that one of the two ignores; two payloads; two transports."""
+    """Nothing to merge: what one of the two says there is none of; other kinds of source, payload or transport."""
     if path[0] not in _OF_ONE_KIND:
         return False
     if path[_DEPTH:] == _OF_ONE_KIND[path[0]]:
         return over.entries.keys() != base.entries.keys()
-    return len(path) == _DEPTH and (IGNORE in over.entries) != (IGNORE in base.entries)
+    word = _WORDS_FOR_NONE.get(path[_DEPTH:]) if len(path) >= _DEPTH else None
+    if word is not None and (word in over.entries) != (word in base.entries):
+        return True
+    return len(path) == _DEPTH and "source" in over.entries and _takes_topics(over) != _takes_topics(base)
+
+
+def _takes_topics(route: MappingNode) -> bool:
+    source = route.get("source")
+    sources = source.items if isinstance(source, SequenceNode) else (source,)
+    return any(isinstance(each, MappingNode) for each in sources)
 
 
 def _root_mapping(root: Node) -> MappingNode:

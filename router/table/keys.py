@@ -4,7 +4,7 @@ The field's name, type and default are those of the key. Marks in `Annotated` sa
 
     max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
 
-A `Quantity` parses and shows a number with a unit. `Named`, `Words` and `Misplaced` are below. `build` reads objects by
+A `Quantity` parses and shows a number with a unit. `Named` and `Words` are below. `build` reads objects by
 these declarations, `flat` and `phrases` show them.
 """
 
@@ -37,19 +37,6 @@ class Words:
 
 
 @dataclass(frozen=True, slots=True)
-class Misplaced:
-    """The finding for the key in a route from ROS (`with_ros`), or in any other route.
-
-    With a `model`, only for the class of this name. `{key}` in the texts is the name of the key.
-    """
-
-    with_ros: bool
-    message: str
-    hint: str
-    model: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Key:
     """A key as its field declares it. `type` is that of the value, of one item where it `is_list`."""
 
@@ -60,7 +47,6 @@ class Key:
     is_located: bool
     quantity: Quantity | None
     words: Words | None
-    misplaced: Misplaced | None
     default: Any
 
     def text(self, value: Any) -> str:
@@ -112,7 +98,6 @@ def _key(field: Field[Any], hint: Any) -> Key:
         is_located=is_located,
         quantity=marks.get(Quantity),
         words=marks.get(Words),
-        misplaced=marks.get(Misplaced),
         default=None if field.default is MISSING else field.default,
     )
 

@@ -15,7 +15,7 @@ from typing import Annotated
 
 from router.errors import Located, SourceSpan
 from router.table.addresses import LOCAL, REMOTE, Address
-from router.table.keys import Misplaced, Named, Words
+from router.table.keys import Named, Words
 from router.table.nodes import TextPlace
 from router.table.units import (
     COALESCE,
@@ -63,14 +63,14 @@ class EndpointKind(enum.Enum):
 
 
 class Priority(enum.Enum):
-    """Who goes first when an endpoint's budget is short; in this order."""
+    """Who goes first when an endpoint's bandwidth is short; in this order."""
 
     COMMAND = "command"
     TELEMETRY = "telemetry"
     BULK = "bulk"
 
 
-class Keep(enum.Enum):
+class OnLimit(enum.Enum):
     """Which of the messages that `max_rate` holds back is sent after all: none, or the latest as soon as it may."""
 
     FIRST = "first"
@@ -122,7 +122,7 @@ class Listener:
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """`span` is the endpoint's name in the table. `budget` is in bytes per second, None for no limit.
+    """`span` is the endpoint's name in the table. `bandwidth` is in bytes per second, None for no limit.
 
     Silent for longer than `stale_after` (ns) it is stale; None means that it never is. With a `listener`, only what
     that one receives can be from it.
@@ -134,7 +134,7 @@ class Endpoint:
     kind: EndpointKind
     source_port: Located[int] | None = None
     trim_trailing_zeros: bool = False
-    budget: Annotated[int | None, DATA_RATE] = None
+    bandwidth: Annotated[int | None, DATA_RATE] = None
     stale_after: Annotated[int | None, PATIENCE] = 5_000_000_000
     listener: Located[str] | None = None
 
@@ -150,9 +150,9 @@ class RecordSettings:
     directory: Path
     continuous: bool = True
     last: Annotated[int | None, DURATION] = None
-    max_size: Annotated[int, DISK_SIZE] = 256 << 20
-    max_age: Annotated[int, DURATION] = 600_000_000_000
-    keep: Annotated[int, DISK_SIZE] = 4 << 30
+    max_size: Annotated[int, DISK_SIZE, Named("rotate_after.size")] = 256 << 20
+    max_age: Annotated[int, DURATION, Named("rotate_after.age")] = 600_000_000_000
+    retention: Annotated[int, DISK_SIZE] = 4 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,59 +220,41 @@ class Qos:
     liveliness_lease_duration: Annotated[Located[int] | None, DURATION] = None
 
 
-OF_TARGETS = Misplaced(
-    with_ros=True,
-    model="Topic",
-    message="with `source: ros` it is destinations that take a '{key}'",
-    hint="move it to {{endpoint: NAME, {key}: ...}}",
-)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetKeys:
-    """The keys that destinations and topics have in common. `max_rate` is in Hz.
-
-    A key of this kind that limits what is sent is marked OF_TARGETS: the topics of `source: ros` are no targets.
-    """
+    """The keys that destinations and topics have in common. `max_rate` is in Hz."""
 
     when: Annotated[Expression | None, Words("when {}")] = None
-    max_rate: Annotated[float | None, RATE, Words("at most {}"), OF_TARGETS] = None
-    keep: Annotated[Keep, Words("keeping the {}", beside="max_rate")] = Keep.FIRST
+    max_rate: Annotated[float | None, RATE, Words("at most {}")] = None
+    on_limit: Annotated[OnLimit, Words("keeping the {}", beside="max_rate")] = OnLimit.FIRST
 
 
 @dataclass(frozen=True, slots=True)
 class Destination(TargetKeys):
-    """A destination endpoint of a route."""
+    """A destination endpoint of a route. `fields` is for routes that take messages from topics."""
 
     endpoint: Located[str]
     span: SourceSpan
-    fields: Annotated[
-        FieldMap | None,
-        Misplaced(
-            with_ros=False,
-            message="a datagram is forwarded unchanged",
-            hint="'fields' of a destination belongs to `source: ros`",
-        ),
-    ] = None
+    fields: FieldMap | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Topic(TargetKeys):
-    """A ROS topic of a route: published for a UDP source, subscribed to for `source: ros`."""
+    """A ROS topic of a route: one that is published, or one that messages come from.
+
+    The `type` of a route's topic may be missing in the table, not in a checked one (see `compiler.check`).
+    """
 
     topic: Located[str]
-    type: Located[str]
     span: SourceSpan
+    type: Located[str] | None = None
     queue_depth: Located[int] | None = None
     qos: Qos | None = None
-    fields: Annotated[
-        FieldMap | None,
-        Misplaced(
-            with_ros=True,
-            message="with `source: ros` the fields to fill are the payload's",
-            hint="move 'fields' up to the route",
-        ),
-    ] = None
+    fields: FieldMap | None = None
+
+    @property
+    def type_name(self) -> str:
+        return self.type.value if self.type else ""
 
 
 AT_START = Quantity(parse=lambda word: word == "send", show=lambda sends: "send" if sends else "silent")
@@ -293,7 +275,7 @@ class DeadmanKeys:
 class Deadman(DeadmanKeys):
     """What is sent in place of commands that stopped coming: the payload `case` with `fields`, to `to`.
 
-    `span` is the key `deadman`. `hands_over_to` are payload cases. `at_start` says whether it is sent when the router
+    `span` is the key `deadman`. `disarmed_by` are payload cases. `at_start` says whether it is sent when the router
     starts as well.
     """
 
@@ -301,7 +283,7 @@ class Deadman(DeadmanKeys):
     case: Located[str]
     fields: FieldMap
     to: tuple[Located[str], ...]
-    hands_over_to: tuple[Located[str], ...] = ()
+    disarmed_by: tuple[Located[str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,6 +299,7 @@ class Collect:
 
 ANY = "any"
 ROS = "ros"
+"""What metrics name as the source of messages that come from topics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,25 +308,20 @@ class Route:
 
     `span` is the payload case in the table, of a route in a list its first key.
     `name` tells the routes of a table apart, in metrics and log: the payload case, or where a case has
-    several routes `imu_info_from_ros`. `ignore` holds the reason of a case that goes nowhere. `sources` are endpoint
-    names, or just `any`, or just `ros`. `fields` and `for_each` belong to `source: ros`, `collect` to others.
-    `ttl` in ns. `no_deadman` is the reason why a command route has none.
+    several routes `imu_info_from_ros`. `ignore` holds the reason of a case that goes nowhere. Messages come from
+    `sources`, which are endpoint names or just `any`, or from `source_topics`. `fields` and `for_each` are for the
+    latter, `topics`, which are published, and `collect` for the former. `ttl` in ns. `no_deadman` is the reason why
+    a command route has none.
     """
 
     name: str
     span: SourceSpan
     case: Located[str]
     sources: Annotated[tuple[Located[str], ...], Named("source")] = ()
+    source_topics: Annotated[tuple[Topic, ...], Named("source")] = ()
     destinations: tuple[Destination, ...] = ()
     topics: tuple[Topic, ...] = ()
-    fields: Annotated[
-        FieldMap | None,
-        Misplaced(
-            with_ros=False,
-            message="'fields' of a route belongs to `source: ros`",
-            hint="a topic has its own 'fields'",
-        ),
-    ] = None
+    fields: FieldMap | None = None
     ignore: str | None = None
     ttl: Annotated[Located[int] | None, DURATION, Words("dropped when older than {}")] = None
     deadman: Deadman | None = None
@@ -354,11 +332,17 @@ class Route:
 
     @property
     def is_outbound(self) -> bool:
-        return any(source.value == ROS for source in self.sources)
+        """Whether its messages come from ROS."""
+        return bool(self.source_topics)
+
+    @property
+    def all_topics(self) -> tuple[Topic, ...]:
+        """The topics that it publishes on or takes messages from."""
+        return (*self.topics, *self.source_topics)
 
     @property
     def endpoint_names(self) -> tuple[str, ...]:
-        """What it names as sources and destinations, `any` and `ros` among them."""
+        """What it names as sources and destinations, `any` among them."""
         return (
             *(source.value for source in self.sources),
             *(destination.endpoint.value for destination in self.destinations),
@@ -529,7 +513,7 @@ class RouteTable:
     sha256: str
     envelope: EnvelopeSettings | None
     node: NodeSettings
-    metrics: Located[Address] | None
+    http: Located[Address] | None
     listeners: Mapping[str, Listener]
     endpoints: Mapping[str, Endpoint]
     routes: tuple[Route, ...]
@@ -541,3 +525,4 @@ class RouteTable:
     foxglove: Located[Address] | None = None
     reload_on_change: bool = False
     networks: Networks | None = None
+    package: Located[str] | None = None

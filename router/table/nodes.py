@@ -190,15 +190,29 @@ def _child(node: Node, step: str | int) -> Node:
 
 
 _INDISPENSABLE = frozenset(
-    {"source", "ignore", "topic", "type", "endpoint", "timeout", "send", "to", "by", "count", "order", "transport"}
+    {
+        "source",
+        "ignore",
+        "for_each",
+        "topic",
+        "type",
+        "endpoint",
+        "timeout",
+        "send",
+        "to",
+        "by",
+        "count",
+        "order",
+        "transport",
+    }
 )
 """Keys without which a route, a topic, a destination, a deadman, a collect or a gateway has no meaning."""
 
-_SUFFICIENT = ({"source"}, {"ignore"}, {"topic", "type"}, {"endpoint"}, {"transport"})
+_SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
 """Sets of keys each of which gives a mapping a meaning, whatever else it lacks or has too much."""
 
-_USES_NAMES_OF = {"for_each": ("fields", "destinations", "topics"), "collect": ("topics",)}
-"""Where a route's expressions use names (`item`, `items`) that there are only with this key."""
+_USES_NAMES_OF = {"collect": ("topics",)}
+"""Where a route's expressions use names (`items`) that there are only with this key."""
 
 
 def valid_part(entry: Entry) -> Entry | None:

@@ -177,7 +177,8 @@ def _owners(name: str, path: Path) -> str:
     Others that are called as what stands at `path` (deadmen are of two kinds) would make no hint.
     """
     definitions = table_schema()["definitions"]
-    owners = [owner for owner, schema in definitions.items() if _has(schema, name) and owner not in path[-1:]]
+    others = {*path[-1:], "defaults"}
+    owners = [owner for owner, schema in definitions.items() if _has(schema, name) and owner not in others]
     return f"that is a key of: {', '.join(owners)}" if owners else ""
 
 

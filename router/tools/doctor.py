@@ -88,14 +88,14 @@ def _table(checked: Checked) -> Iterator[CheckResult]:
 
 
 def _running(program: Program, running: Health | None) -> Iterator[CheckResult]:
-    if program.table.metrics is None:
+    if program.table.http is None:
         yield warning(
             "router",
-            "the table has no `metrics.address`: a running router cannot be asked",
-            "add `metrics: {address: 127.0.0.1:9108}`",
+            "the table has no `http.address`: a running router cannot be asked",
+            "add `http: {address: 127.0.0.1:9108}`",
         )
     elif running is None:
-        what = f"none answers at {program.table.metrics.value}: stale endpoints, QoS and drops were not looked at"
+        what = f"none answers at {program.table.http.value}: stale endpoints, QoS and drops were not looked at"
         yield fine("router", what)
     else:
         yield from running.findings()
@@ -184,9 +184,9 @@ class Health:
 
 
 def health(program: Program) -> Health | None:
-    """The health of the running router. None if none answers, or the table has no `metrics.address`."""
+    """The health of the running router. None if none answers, or the table has no `http.address`."""
     table = program.table
-    if table.metrics is None:
+    if table.http is None:
         return None
     try:
         return Health(table, metrics(url_of(table)))

@@ -110,11 +110,12 @@ def recordings(program: Program) -> Iterator[CheckResult]:
         return
     kept = sum(recording_sizes(directory, program.table.path.stem).values())
     free = shutil.disk_usage(there).free
-    if settings.continuous and kept + free < settings.keep:
+    if settings.continuous and kept + free < settings.retention:
         yield warning(
             "recordings",
-            f"the disk with {directory} has room for {(kept + free) >> 20} MiB, `keep` says {settings.keep >> 20}",
-            "a smaller `keep`: the oldest files go before the disk is full",
+            f"the disk with {directory} has room for {(kept + free) >> 20} MiB, "
+            f"`retention` says {settings.retention >> 20}",
+            "a smaller `retention`: the oldest files go before the disk is full",
         )
     else:
         yield fine("recordings", f"{directory}, with {free >> 20} MiB free")
@@ -209,7 +210,7 @@ def interfaces(program: Program) -> Iterator[CheckResult]:
 
 
 def _pages(program: Program) -> tuple[tuple[Located[Address] | None, str], ...]:
-    return (program.table.metrics, "metrics.address"), (program.table.foxglove, "foxglove.address")
+    return (program.table.http, "http.address"), (program.table.foxglove, "foxglove.address")
 
 
 def _gateways(program: Program) -> Iterator[tuple[str, Address, str]]:

@@ -56,7 +56,7 @@ def explained_route(checked: CheckedRoute, everything: Checked, executed_by: Exe
     if route.ignore is not None:
         yield f"  ignored: {route.ignore}"
         return
-    yield f"  source: {', '.join(_source(source.value, table) for source in route.sources)}"
+    yield f"  source: {', '.join(_source(source.value, table) for source in route.sources) or ROS}"
     yield from _settings(checked)
     for served in checked.targets:
         yield ""
@@ -99,14 +99,14 @@ def _settings(checked: CheckedRoute) -> Iterator[str]:
             f"{duration(settings.timeout.value)}, again every {duration(settings.repeat.value)}, "
             f"{_at_start(settings.at_start)}"
         )
-        if deadman.hands_over_to:
-            yield f"    disarmed by commands of {', '.join(deadman.hands_over_to)}"
+        if deadman.disarmed_by:
+            yield f"    disarmed by commands of {', '.join(deadman.disarmed_by)}"
     if route.no_deadman is not None:
         yield f"  no deadman: {route.no_deadman}"
 
 
 def _source(name: str, table: RouteTable) -> str:
-    if name in (ANY, ROS):
+    if name == ANY:
         return name
     endpoint = table.endpoints[name]
     port = f":{endpoint.source_port.value}" if endpoint.source_port else ""
@@ -118,8 +118,8 @@ def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: st
     endpoint = table.endpoints[served.label]
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
     yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}  ({served.span})"
-    if endpoint.budget is not None:
-        yield f"    {served.priority.value} within a budget of {endpoint.budget} bytes/s"
+    if endpoint.bandwidth is not None:
+        yield f"    {served.priority.value} within a bandwidth of {endpoint.bandwidth} bytes/s"
     if others := [other for other in served.deadmen if other != route.name]:
         yield f"    disarms the deadman of {', '.join(others)}"
     yield from _served(served)
@@ -133,7 +133,7 @@ def _executor(executor: Executor | None) -> Iterator[str]:
 
 
 def _topic(served: CheckedTarget, topic: Topic) -> Iterator[str]:
-    yield f"  topic {served.label}: {topic.type.value}  ({served.span})"
+    yield f"  topic {served.label}: {topic.type_name}  ({served.span})"
     yield _quality(topic)
     if served.plan is not None:
         size, exact = message_size(served.plan)
@@ -296,9 +296,9 @@ Topics = Mapping[str, str]
 
 def known_topics(table: RouteTable) -> Topics:
     """The topics that routes and gateways of the table publish or subscribe to."""
-    topics = [topic for route in table.routes for topic in route.topics]
+    topics = [topic for route in table.routes for topic in route.all_topics]
     topics += [inbound.topic for gateway in table.gateways.values() for inbound in gateway.inbound]
-    return {resolved(topic.topic.value, table.node): topic.type.value for topic in topics}
+    return {resolved(topic.topic.value, table.node): topic.type_name for topic in topics}
 
 
 def seen_topics(table: RouteTable, seconds: float) -> Topics:
@@ -355,7 +355,7 @@ def _parts(checked: Checked) -> dict[str, list[str]]:
         "node": {"name": table.node.name, "namespace": table.node.namespace},
         "node.diagnostics": table.node.diagnostics is not None,
         "reload.on_change": table.reload_on_change,
-        "metrics.address": table.metrics,
+        "http.address": table.http,
         "foxglove.address": table.foxglove,
         "record": table.record,
     }

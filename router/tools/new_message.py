@@ -226,7 +226,7 @@ def _check_names(name: str, case: str, site: Site) -> None:
         raise UsageError(
             f"{site.envelope.name} has a payload case '{case}' already, number {number}; take another name"
         )
-    topics = {topic.topic.value: route.name for route in site.table.routes for topic in route.topics}
+    topics = {topic.topic.value: route.name for route in site.table.routes for topic in route.all_topics}
     if case in topics:
         raise UsageError(f"the route {topics[case]} has a topic '{case}' already; take another name")
 

@@ -33,9 +33,9 @@ class Answer(NamedTuple):
 
 def url_of(table: RouteTable) -> str:
     """Return where the router that runs a table answers. Raises UsageError where it serves no HTTP."""
-    if table.metrics is None:
-        raise UsageError(f"{table.path} has no 'metrics.address', without which a running router cannot be asked")
-    return f"http://{reachable(table.metrics.value)}"
+    if table.http is None:
+        raise UsageError(f"{table.path} has no 'http.address', without which a running router cannot be asked")
+    return f"http://{reachable(table.http.value)}"
 
 
 def post(url: str, path: str, patience: float = PATIENCE) -> Answer:

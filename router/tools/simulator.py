@@ -74,7 +74,7 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
 def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iterator[Stream]:
     """The streams of the table's UDP sources, in the order of the table. Raises UsageError for an unknown name."""
     for route in table.routes:
-        if route.is_outbound:
+        if not route.sources:
             continue
         case = wire.case(route.case.value)
         rate = RATES.get(case.name, USUAL_RATE) * rate_scale

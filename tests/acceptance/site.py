@@ -28,7 +28,7 @@ ROOT = Path(__file__).parent.parent.parent
 ROVER = """\
 version: 1
 extends: {root}/tests/acceptance/patient.yaml
-metrics:
+http:
   address: 127.0.0.1:{metrics}
 listen:
   rover:
@@ -40,7 +40,7 @@ endpoints:
 BARE = """\
 version: 1
 envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
+http: {{address: 127.0.0.1:{metrics}}}
 listen: {{rover: {{address: 127.0.0.5:{listen}}}}}
 endpoints:
 {endpoints}

@@ -18,7 +18,7 @@ from tests.tables import PROTOS
 
 ONLY = """\
 version: 1
-metrics: {address: 127.0.0.1:METRICS}
+http: {address: 127.0.0.1:METRICS}
 foxglove: {address: 127.0.0.1:FOXGLOVE}
 record: {directory: recordings, last: 10s}
 node: {diagnostics: true}

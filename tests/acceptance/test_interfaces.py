@@ -31,7 +31,7 @@ from tests.namespaces import Computer, cable
 TABLE = """\
 version: 1
 envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:9108}}
+http: {{address: 127.0.0.1:9108}}
 listen:
   lan: {{address: 0.0.0.0:5000, interface: lan0}}
   radio: {{address: 0.0.0.0:5000, interface: radio0}}

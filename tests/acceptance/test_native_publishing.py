@@ -113,7 +113,7 @@ routes:
     topics:
       - {{{{topic: beside_a, {_FLOAT}}}}}
       - {{{{topic: beside_b, {_FLOAT}, {IMU_IN_PYTHON}}}}}
-      - {{{{topic: beside_latest, {_FLOAT}, keep: latest, max_rate: 1000 Hz}}}}
+      - {{{{topic: beside_latest, {_FLOAT}, on_limit: latest, max_rate: 1000 Hz}}}}
       - {{{{topic: beside_shared, {_FLOAT}}}}}
       - {{{{topic: beside_kept, {_FLOAT}, qos: {{{{durability: transient_local, depth: 5}}}}}}}}
   gps_info:

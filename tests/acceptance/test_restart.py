@@ -45,7 +45,7 @@ routes:
     destinations: [driving_board]
     ttl: 1s
     deadman: {{timeout: 1h, send: {{manual_brake: {{brake: true}}}}, to: [driving_board]}}
-  manual_arm: {{source: basestation, destinations: [driving_board], deadman: never stale}}
+  manual_arm: {{source: basestation, destinations: [driving_board], deadman: {{none: never stale}}}}
 """
 
 

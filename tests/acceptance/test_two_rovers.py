@@ -27,7 +27,7 @@ TABLE = """\
 version: 1
 envelope: {{protos: {root}/protos, message: PBEnvelope, oneof: payload}}
 node: {{diagnostics: true}}
-metrics: {{address: "127.0.0.1:${{METRICS}}"}}
+http: {{address: "127.0.0.1:${{METRICS}}"}}
 listen:
   rover: {{address: "127.0.0.5:${{LISTEN}}"}}
 endpoints:
@@ -40,11 +40,10 @@ routes:
       - {{topic: imu_data, type: comms/msg/ImuSensorInformation, fields: auto}}
       - {{topic: /heading, type: std_msgs/msg/Float32, fields: {{data: accel_x}}}}
   drive_motor:
-    source: ros
-    topics: [{{topic: drive, type: comms/msg/DrivingBoardMotorMessage}}]
+    source: {{topic: drive, type: comms/msg/DrivingBoardMotorMessage}}
     fields: auto
     destinations: [driving_board]
-    deadman: a test of names alone
+    deadman: {none: a test of names alone}
 gateways:
   page:
     transport: {{websocket: "127.0.0.1:${{PAGE}}"}}

@@ -44,8 +44,7 @@ TOPIC = """\
 """
 FROM_ROS = """\
   rock_measure_result:
-    source: ros
-    topics: [{topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}]
+    source: {topic: rock_measure_result, type: comms/msg/BasestationRockMeasureResult, queue_depth: 10}
     fields: {auto: true, width_cm: "width_cm + 0"}   # which needs Python
     destinations: [basestation]
 """
@@ -390,9 +389,7 @@ def client_count(router: Router) -> int:
 
 
 def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    held = (
-        "  ph_info: {{source: sensor_board, destinations: [{{endpoint: basestation, keep: latest, max_rate: {}}}]}}\n"
-    )
+    held = "  ph_info: {{source: sensor_board, destinations: [{{endpoint: basestation, on_limit: latest, max_rate: {}}}]}}\n"
     with site.router(held.format(0.001)) as router:
         site.send(*map(numbered, range(2)))
         wait_until(lambda: router.total("datagrams_received") >= 2)
@@ -410,7 +407,7 @@ def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, mo
 
 
 def test_what_waits_for_a_budget_is_counted_when_its_route_goes(site: Site) -> None:
-    board = f'  slow: {{address: "127.0.0.1:{site.basestation.getsockname()[1]}", kind: tool, budget: 1 kB/s}}\n'
+    board = f'  slow: {{address: "127.0.0.1:{site.basestation.getsockname()[1]}", kind: tool, bandwidth: 1 kB/s}}\n'
     others = "  pump_info: {source: sensor_board, destinations: [slow]}\n"
     slow = PH.replace("basestation", "slow") + others
     with Router(site.program(slow, board)) as router:

@@ -35,8 +35,7 @@ def drive(
 ) -> str:
     return f"""\
   drive_motor:
-    source: ros
-    topics: [{{topic: drive_motor, type: {TYPE}, queue_depth: {depth}}}]
+    source: {{topic: drive_motor, type: {TYPE}, queue_depth: {depth}}}
     fields: {fields}
     destinations: [{{endpoint: basestation{more}}}]
     ttl: 30s

@@ -46,7 +46,7 @@ TURNS = """\
     source: sensor_board
     destinations: [basestation]
     deadman:
-      {timeout: 20ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 10ms, hands_over_to: [ph_info]}
+      {timeout: 20ms, send: {manual_brake: {brake: true}}, to: [basestation], repeat: 10ms, disarmed_by: [ph_info]}
 """
 TOPIC = """\
     topics:
@@ -214,7 +214,7 @@ def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(
 def test_metrics_are_served_while_it_runs(site: Site) -> None:
     with udp("127.0.0.1") as unused:
         address = f"127.0.0.1:{unused.getsockname()[1]}"
-    with Router(site.program(ROUTE + f'metrics: {{address: "{address}"}}\n')) as router:
+    with Router(site.program(ROUTE + f'http: {{address: "{address}"}}\n')) as router:
         site.send(PH, b"\x00\x01")
         assert site.basestation.recv(1000) == PH
         while router.totals()["datagrams_received"] < 2:
@@ -337,7 +337,7 @@ def test_start_and_stop_are_logged_with_what_runs_and_what_was_done(site: Site) 
 
 def test_what_cannot_be_opened_is_told_with_its_line_and_leaves_nothing_open(site: Site) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        program = site.program(ROUTE + f'metrics: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}\n')
+        program = site.program(ROUTE + f'http: {{address: "127.0.0.1:{taken.getsockname()[1]}"}}\n')
         with pytest.raises(StartError, match=r"table.yaml:12:\d+: metrics cannot be served"), Router(program):
             pass
     with Router(program):  # the listener's port is free again

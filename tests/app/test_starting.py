@@ -165,7 +165,7 @@ def test_a_port_in_use_is_told_and_ends_with_78(table: Path, monkeypatch: pytest
 
 def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
     metrics = free_port(kind=socket.SOCK_STREAM)
-    table.write_text(f'metrics: {{address: "127.0.0.1:{metrics}"}}\n' + table.read_text())
+    table.write_text(f'http: {{address: "127.0.0.1:{metrics}"}}\n' + table.read_text())
     process = start(MODULE, "run", table)
     wait_for_start(process)
     good = table.read_text()

@@ -14,7 +14,7 @@ from router.compiler.commands import MOST_SLOTS, Command, lower
 from router.compiler.expressions import Scope
 from router.compiler.mapping import build
 from router.engine.delivery import MAPPING_FAILURES
-from router.table.model import FieldMap, Keep
+from router.table.model import FieldMap, OnLimit
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 from tests.compiler.compiling import SPAN
@@ -39,7 +39,7 @@ def lowered(wire: Wire, case: PayloadCase, fields: FieldMap, source: MessageType
     mapping = build(fields, case.type, Scope(source, tuple(schema.enums.values()), (), reads), SPAN)
     assert mapping.findings == []
     declared = cast(
-        "Any", SimpleNamespace(keep=Keep.FIRST, when=None, span=SPAN, endpoint=SimpleNamespace(value="board"))
+        "Any", SimpleNamespace(on_limit=OnLimit.FIRST, when=None, span=SPAN, endpoint=SimpleNamespace(value="board"))
     )
     target = CheckedTarget(declared, plan=mapping.plan, rows=tuple(mapping.rows))
     topic = cast("Any", SimpleNamespace(span=SPAN))

@@ -22,30 +22,26 @@ from tests.engine.rig import Rig, program
 
 ROUTES = """\
   drive_motor:
-    source: ros
-    topics: [{topic: drive, type: comms/msg/DrivingBoardMotorMessage}]
+    source: {topic: drive, type: comms/msg/DrivingBoardMotorMessage}
     fields: auto
     destinations: [driving_board, {endpoint: recorder, max_rate: 0.001 Hz}]
     ttl: 200ms
     deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], repeat: 100ms,
-              hands_over_to: [arm_target]}
+              disarmed_by: [arm_target]}
   arm_target:
-    source: ros
-    topics: [{topic: arm, type: comms/msg/ArmBoardTargetMovement}]
+    source: {topic: arm, type: comms/msg/ArmBoardTargetMovement}
     fields: auto
     destinations: [driving_board]
-    deadman: a target is sent once
+    deadman: {none: a target is sent once}
   arm_ctrl:
-    source: ros
-    topics: [{topic: arm, type: comms/msg/ArmBoardTargetMovement}]
+    source: {topic: arm, type: comms/msg/ArmBoardTargetMovement}
     fields: {control_base: target_x}
     destinations: [driving_board]
-    deadman: for tests
+    deadman: {none: for tests}
 """
 STAMPED = """\
   drive_motor:
-    source: ros
-    topics: [{topic: drive, type: geometry_msgs/msg/TwistStamped}]
+    source: {topic: drive, type: geometry_msgs/msg/TwistStamped}
     fields: {distance_to_go: float32(twist.linear.x), turning_radius: float32(twist.angular.z)}
     destinations: [driving_board]
     ttl: 200ms
@@ -356,7 +352,7 @@ def test_a_topic_is_taken_by_one_executor(tmp_path: Path) -> None:
          "`when: turning_radius > 0` needs it"),
         ("[driving_board, {", "[{endpoint: driving_board, when: turning_radius > 0}, {",
          "`when: turning_radius > 0` needs it"),
-        ("max_rate: 0.001 Hz}", "max_rate: 0.001 Hz, keep: latest}", "`keep: latest` needs it"),
+        ("max_rate: 0.001 Hz}", "max_rate: 0.001 Hz, on_limit: latest}", "`on_limit: latest` needs it"),
     ],
 )  # fmt: skip
 def test_what_may_be_sent_later_or_not_at_all_needs_python(
@@ -371,8 +367,7 @@ def test_what_may_be_sent_later_or_not_at_all_needs_python(
 def test_messages_without_freshness_are_not_urgent(tmp_path: Path) -> None:
     routes = """\
   rover_localization:
-    source: ros
-    topics: [{topic: where, type: comms/msg/BasestationRoverLocalization}]
+    source: {topic: where, type: comms/msg/BasestationRoverLocalization}
     fields: auto
     destinations: [basestation]
 """

@@ -42,8 +42,7 @@ routes:
 """
 ROUTES = """\
   drive_motor:
-    source: ros
-    topics: [{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage, queue_depth: 1000}]
+    source: {topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage, queue_depth: 1000}
     fields: auto
     destinations: [driving_board]
     ttl: 30s

@@ -39,7 +39,7 @@ HERE = Path(__file__).parent
 WHOLE_HEAD = HEAD.replace(
     "routes:\n",
     """\
-  paced: {address: 192.168.0.70:9000, kind: tool, budget: 2kB/s}
+  paced: {address: 192.168.0.70:9000, kind: tool, bandwidth: 2kB/s}
   refused: {address: 192.168.0.80:9000, kind: tool}
   picky: {address: 192.168.0.81:9000, kind: tool, listener: exact}
   arm_board: {address: 192.168.0.223:8, kind: board, trim_trailing_zeros: true}
@@ -66,8 +66,8 @@ WHOLE = f"""\
     topics: [{{topic: unwanted_too, {_FLOAT}hdop}}}}]
   ph_info:
     source: any
-    destinations: [{{endpoint: recorder, max_rate: 10 Hz, keep: latest}}]
-    topics: [{{topic: ph, {_FLOAT}1 / ph_value}}, max_rate: 10 Hz, keep: latest}}]
+    destinations: [{{endpoint: recorder, max_rate: 10 Hz, on_limit: latest}}]
+    topics: [{{topic: ph, {_FLOAT}1 / ph_value}}, max_rate: 10 Hz, on_limit: latest}}]
     ttl: 400ms
   drive_diag: {{source: any, destinations: [{{endpoint: basestation, max_rate: 12 Hz}}, arm_board]}}
   arm_diag: {{ignore: nobody wants it}}
@@ -75,7 +75,7 @@ WHOLE = f"""\
     source: [basestation, left_tool]
     destinations: [driving_board, recorder]
     ttl: 200ms
-    deadman: {{{_BRAKE}, to: [driving_board, recorder], repeat: 70ms, hands_over_to: [manual_arm]}}
+    deadman: {{{_BRAKE}, to: [driving_board, recorder], repeat: 70ms, disarmed_by: [manual_arm]}}
   manual_arm:
     source: [basestation]
     destinations: [driving_board, refused]

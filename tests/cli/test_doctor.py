@@ -21,7 +21,7 @@ def table(tmp_path: Path) -> Path:
     metrics, foxglove = free_port(kind=socket.SOCK_STREAM), free_port(kind=socket.SOCK_STREAM)
     path.write_text(
         f"extends: {ROOT}/tests/acceptance/quiet.yaml\n"
-        f"metrics: {{address: 127.0.0.1:{metrics}}}\n"
+        f"http: {{address: 127.0.0.1:{metrics}}}\n"
         f"foxglove: {{address: 127.0.0.1:{foxglove}}}\n"
         f"record: {{directory: {tmp_path}, last: 60s}}\n"
         f"listen: {{rover: {{address: 127.0.0.1:{free_port()}}}}}\n"

@@ -103,7 +103,7 @@ routes:
     topics: [{topic: c, type: std_msgs/msg/String, fields: {data: str(value)}}]
   newest:
     source: board
-    topics: [{topic: d, type: std_msgs/msg/Float32, max_rate: 5 Hz, keep: latest, fields: {data: value}}]
+    topics: [{topic: d, type: std_msgs/msg/Float32, max_rate: 5 Hz, on_limit: latest, fields: {data: value}}]
   frame:
     source: board
     collect: {by: part, count: 2, order: part, timeout: 50ms}
@@ -144,7 +144,7 @@ def test_who_publishes_on_a_topic_is_told_and_what_needs_python(
         ("a", "the carrier"),
         ("b", "the carrier"),
         ("c", "Python: `data: str(value)` needs it: only Python writes a float as text  (table.yaml:14:67)"),
-        ("d", "Python: `keep: latest` needs it  (table.yaml:17:15)"),
+        ("d", "Python: `on_limit: latest` needs it  (table.yaml:17:15)"),
         ("e", "Python: `collect` needs it  (table.yaml:20:5)"),
         ("c", "Python: it shares 'c' with decimal, which needs Python  (table.yaml:14:15)"),
         ("f", "Python: `values: words` needs it: it reads a map  (table.yaml:27:86)"),
@@ -177,7 +177,7 @@ def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_ele
 
 
 def test_a_hand_over_is_told_on_both_sides(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    says = "deadman: {timeout: 500ms, send: {arm_ctrl: {}}, to: [laptop], hands_over_to: [imu_info]}"
+    says = "deadman: {timeout: 500ms, send: {arm_ctrl: {}}, to: [laptop], disarmed_by: [imu_info]}"
     with table.open("a") as more:
         more.write(f"  arm_ctrl:\n    source: basestation\n    destinations: [laptop]\n    {says}\n")
     assert (

@@ -27,10 +27,10 @@ def test_one_warning_for_each_route_that_commands_boards(check_text: CheckText) 
     routes:
       manual_drive: {source: base, destinations: [board, other]}
       manual_brake:
-        {source: ros, topics: [{topic: a, type: std_msgs/msg/Bool}], fields: {brake: data}, destinations: [board]}
+        {source: {topic: a, type: std_msgs/msg/Bool}, fields: {brake: data}, destinations: [board]}
       manual_arm: {source: board, destinations: [base]}
       arm_ctrl: {ignore: not part of this test}
-      arm_target: {source: base, destinations: [board], deadman: the board knows when it is there}
+      arm_target: {source: base, destinations: [board], deadman: {none: the board knows when it is there}}
     """
     endpoints = (
         "{board: {address: 127.0.0.2:8, kind: board}, other: {address: 127.0.0.4:8, kind: board},"
@@ -66,14 +66,13 @@ routes:
   manual_drive:
     source: base
     destinations: [board]
-    deadman: {{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}, to: [{to}], hands_over_to: [{cases}]}}
+    deadman: {{timeout: 500ms, send: {{manual_brake: {{brake: true}}}}, to: [{to}], disarmed_by: [{cases}]}}
   drive_motor:
-    source: ros
-    topics: [{{topic: drive, type: comms/msg/DrivingBoardMotorMessage}}]
+    source: {{topic: drive, type: comms/msg/DrivingBoardMotorMessage}}
     fields: auto
     destinations: [tool, board]
-    deadman: it stops by itself
-  manual_brake: {{source: base, destinations: [tool], deadman: it stops by itself}}
+    deadman: {{none: it stops by itself}}
+  manual_brake: {{source: base, destinations: [tool], deadman: {{none: it stops by itself}}}}
   arm_ctrl: {{ignore: not part of this test}}
 """
 THREE = (
@@ -88,7 +87,7 @@ def test_hand_over_concerns_what_goes_to_the_endpoints_of_the_deadman(check_text
     routes = {checked.route.name: checked for checked in checked.routes}
     deadman, (feed,) = routes["manual_drive"].deadman, routes["drive_motor"].subscriptions
     assert deadman is not None
-    assert deadman.hands_over_to == ("drive_motor",)
+    assert deadman.disarmed_by == ("drive_motor",)
     assert [served.deadmen for served in routes["manual_drive"].targets] == [("manual_drive",)]
     assert {served.label: served.deadmen for served in feed.targets} == {
         "tool": (),
@@ -160,10 +159,10 @@ def test_a_deadman_floods_nobody(check_text: CheckText, repeat: str, accepted: b
 @pytest.mark.parametrize(
     ("destination", "ttl", "accepted"),
     [
-        ("{endpoint: board, max_rate: 10 Hz, keep: latest}", None, False),
-        ("{endpoint: board, max_rate: 10 Hz, keep: latest}", "501ms", False),
-        ("{endpoint: board, max_rate: 10 Hz, keep: latest}", "500ms", True),
-        ("{endpoint: board, max_rate: 10 Hz, keep: first}", None, True),
+        ("{endpoint: board, max_rate: 10 Hz, on_limit: latest}", None, False),
+        ("{endpoint: board, max_rate: 10 Hz, on_limit: latest}", "501ms", False),
+        ("{endpoint: board, max_rate: 10 Hz, on_limit: latest}", "500ms", True),
+        ("{endpoint: board, max_rate: 10 Hz, on_limit: first}", None, True),
         ("paced", None, False),
         ("paced", "200ms", True),
     ],
@@ -174,7 +173,7 @@ def test_no_command_waits_until_after_the_deadman_has_tripped(
     route = ROUTE.format(destinations=destination, deadman=BRAKE) + (f"    ttl: {ttl}\n" if ttl else "")
     endpoints = (
         "{board: {address: 127.0.0.2:8, kind: board}, base: {address: 127.0.0.3:9000, kind: basestation},"
-        " paced: {address: 127.0.0.4:8, kind: board, budget: 10kB/s}}"
+        " paced: {address: 127.0.0.4:8, kind: board, bandwidth: 10kB/s}}"
     )
     found = check_text(route, endpoints=endpoints).diagnostics
     codes = [finding.code for finding in found if finding.code is not Code.UNCOVERED_PAYLOAD_CASE]

@@ -12,7 +12,7 @@ ENDPOINTS = """{
   board: {address: 127.0.0.2:8, kind: board},
   base: {address: 127.0.0.3:9000, kind: basestation},
   tool: {address: 127.0.0.4:9000, kind: tool, trim_trailing_zeros: true},
-  slow: {address: 127.0.0.5:9000, kind: tool, budget: 10kB/s}}"""
+  slow: {address: 127.0.0.5:9000, kind: tool, bandwidth: 10kB/s}}"""
 
 
 def told(check_text: CheckText, routes: str) -> dict[str, str]:
@@ -45,7 +45,7 @@ def test_what_is_forwarded_unchanged_is_carried(check_text: CheckText) -> None:
     ("destination", "reason"),
     [
         ("{endpoint: base, when: accel_x > 1}", "`when: accel_x > 1` needs it at line 10"),
-        ("{endpoint: base, max_rate: 5 Hz, keep: latest}", "`keep: latest` needs it at line 10"),
+        ("{endpoint: base, max_rate: 5 Hz, on_limit: latest}", "`on_limit: latest` needs it at line 10"),
     ],
 )
 def test_one_that_needs_python_has_all_others_of_its_endpoint_go_there(
@@ -67,7 +67,7 @@ def test_one_that_needs_python_has_all_others_of_its_endpoint_go_there(
 
 def test_a_budget_needs_python(check_text: CheckText) -> None:
     routes = "routes: {ph_info: {source: board, destinations: [slow]}}"
-    assert told(check_text, routes) == {"ph_info > slow": "the budget of 'slow' needs it at line 5"}
+    assert told(check_text, routes) == {"ph_info > slow": "the bandwidth of 'slow' needs it at line 5"}
 
 
 def test_routes_from_ros_and_ignored_ones_have_no_part_in_it(check_text: CheckText) -> None:
@@ -75,9 +75,8 @@ def test_routes_from_ros_and_ignored_ones_have_no_part_in_it(check_text: CheckTe
         routes:
           ph_info: {ignore: nobody wants it}
           imu_info:
-            source: ros
+            source: {topic: imu, type: std_msgs/msg/Float32}
             destinations: [{endpoint: tool, when: data > 1}]
-            topics: [{topic: imu, type: std_msgs/msg/Float32}]
             fields: {accel_x: data}
           gps_info: {source: board, destinations: [tool]}
     """
@@ -124,12 +123,12 @@ def test_all_routes_of_a_topic_have_one_executor_and_other_topics_of_them_their_
               - {topic: b, type: std_msgs/msg/Float32, fields: {data: accel_x}}
           ph_info:
             source: board
-            topics: [{topic: a, type: std_msgs/msg/Float32, fields: {data: ph_value}, max_rate: 1 Hz, keep: latest}]
+            topics: [{topic: a, type: std_msgs/msg/Float32, fields: {data: ph_value}, max_rate: 1 Hz, on_limit: latest}]
     """
     assert published(check_text, routes) == {
         "imu_info > a": "it shares 'a' with ph_info, which needs Python at line 14",
         "imu_info > b": "",
-        "ph_info > a": "`keep: latest` needs it at line 14",
+        "ph_info > a": "`on_limit: latest` needs it at line 14",
     }
 
 
@@ -140,7 +139,7 @@ def test_a_route_has_what_is_lowered_of_it(check_text: CheckText) -> None:
             source: board
             topics:
               - {topic: a, type: std_msgs/msg/Float32, fields: {data: accel_x}}
-              - {topic: b, type: std_msgs/msg/Float32, fields: {data: accel_x}, max_rate: 1 Hz, keep: latest}
+              - {topic: b, type: std_msgs/msg/Float32, fields: {data: accel_x}, max_rate: 1 Hz, on_limit: latest}
           ph_info: {source: board, destinations: [base]}
     """
     program = check_text(routes).program

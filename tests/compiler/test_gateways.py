@@ -33,7 +33,7 @@ NO_ROUTES = "routes: {}"
 PUBLISHES = (
     "routes: {ph_info: {source: board, topics: [{topic: %s, type: std_msgs/msg/Float32, fields: {data: ph_value}}]}}"
 )
-SUBSCRIBES = """routes: {ph_info: {source: ros, topics: [{topic: %s, type: std_msgs/msg/Float32}],
+SUBSCRIBES = """routes: {ph_info: {source: {topic: %s, type: std_msgs/msg/Float32},
   fields: {ph_value: data}, destinations: [base]}}"""
 
 BRAKES = SUBSCRIBES.replace("source:", "deadman: {timeout: 1s, send: {ph_info: {}}, to: [base]}, source:")
@@ -107,7 +107,7 @@ def test_a_bad_pattern_is_blamed(check_text: CheckText, settings: str, wrong: st
     ],
 )
 def test_each_has_an_address_of_its_own(check_text: CheckText, gateways: str, clashes: int) -> None:
-    routes = "metrics: {address: 127.0.0.1:9108}\nroutes: {}"
+    routes = "http: {address: 127.0.0.1:9108}\nroutes: {}"
     assert codes(check_text, gateways, routes) == [Code.ADDRESS_CLASH] * clashes
 
 

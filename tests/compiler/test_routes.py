@@ -10,7 +10,7 @@ from router.compiler import Checked
 from router.compiler.checked import CheckedSubscription, CheckedTarget
 from router.compiler.plan import Leaf, Record
 from router.errors import Code, Diagnostic, Severity
-from router.table.model import Keep, Priority
+from router.table.model import OnLimit, Priority
 from tests.compiler.conftest import CheckText
 
 ROUTE = """
@@ -71,9 +71,8 @@ def test_frames_are_named_by_whole_values_and_ordered_by_integers(
 OBJECTS = """
 routes:
   detected_object:
-    source: ros
+    source: {{topic: a, type: comms/msg/DetectedObjectArray, when: {when}}}
     for_each: detections
-    topics: [{{topic: a, type: comms/msg/DetectedObjectArray, when: {when}}}]
     fields: {fields}
     destinations: [{{endpoint: base, when: {to_when}}}]
 """
@@ -126,9 +125,8 @@ def test_names_of_for_each_win_over_fields_which_the_message_still_reaches(check
     routes = """
     routes:
       detected_object:
-        source: ros
+        source: {topic: a, type: comms/msg/BasestationDetectedObject}
         for_each: "[bbox]"
-        topics: [{topic: a, type: comms/msg/BasestationDetectedObject}]
         fields: {index: index, id: message.index}
         destinations: [base]
     """
@@ -156,8 +154,7 @@ def test_for_each_takes_a_list_and_what_depends_on_it_is_no_finding(
 STAMPED = """
 routes:
   rover_localization:
-    source: ros{ttl}
-    topics: [{{topic: a, type: {type}}}]
+    source: {{topic: a, type: {type}}}{ttl}
     fields: {{x: 1}}
     destinations: [base]
 """
@@ -182,11 +179,10 @@ def test_each_topic_feeds_each_destination(check_text: CheckText) -> None:
     routes = """
     routes:
       rover_localization:
-        source: ros
-        topics: [{topic: a, type: geometry_msgs/msg/Point32}, {topic: b, type: geometry_msgs/msg/Vector3}]
+        source: [{topic: a, type: geometry_msgs/msg/Point32}, {topic: b, type: geometry_msgs/msg/Vector3}]
         fields: {x: float32(x)}
         destinations: [base, {endpoint: board, fields: {y: float32(y)}}]
-        deadman: not part of this test
+        deadman: {none: not part of this test}
     """
     checked = check_text(routes)
     assert errors(checked) == []
@@ -200,24 +196,23 @@ def test_each_topic_feeds_each_destination(check_text: CheckText) -> None:
 
 BOARD_AND_BASE = (
     "{board: {address: 127.0.0.2:8, kind: board, trim_trailing_zeros: true},"
-    " base: {address: 127.0.0.3:9000, kind: basestation, budget: 1kB/s},"
+    " base: {address: 127.0.0.3:9000, kind: basestation, bandwidth: 1kB/s},"
     " tool: {address: 127.0.0.4:9000, kind: tool}}"
 )
 INBOUND = """
 routes:
   manual_brake:
     source: tool{priority}
-    destinations: [board, {{endpoint: base, max_rate: 5 Hz, keep: latest}}]
-    deadman: not part of this test
+    destinations: [board, {{endpoint: base, max_rate: 5 Hz, on_limit: latest}}]
+    deadman: {{none: not part of this test}}
 """
 OUTBOUND = """
 routes:
   manual_brake:
-    source: ros{priority}
-    topics: [{{topic: a, type: std_msgs/msg/Bool}}]
+    source: {{topic: a, type: std_msgs/msg/Bool}}{priority}
     fields: {{brake: data}}
-    destinations: [board, {{endpoint: base, max_rate: 5 Hz, keep: latest}}]
-    deadman: not part of this test
+    destinations: [board, {{endpoint: base, max_rate: 5 Hz, on_limit: latest}}]
+    deadman: {{none: not part of this test}}
 """
 
 
@@ -239,10 +234,10 @@ def test_target_has_what_its_endpoint_and_its_destination_say(check_text: CheckT
     board, base = targets(check_text, routes)
     assert board.endpoint is not None
     assert (board.endpoint.trim_trailing_zeros, board.is_deferred) == (True, False)
-    assert (board.declared.max_rate, board.declared.keep) == (None, Keep.FIRST)
+    assert (board.declared.max_rate, board.declared.on_limit) == (None, OnLimit.FIRST)
     assert base.endpoint is not None
-    assert (base.endpoint.trim_trailing_zeros, base.endpoint.budget, base.is_deferred) == (False, 1000, True)
-    assert (base.declared.max_rate, base.declared.keep) == (5, Keep.LATEST)
+    assert (base.endpoint.trim_trailing_zeros, base.endpoint.bandwidth, base.is_deferred) == (False, 1000, True)
+    assert (base.declared.max_rate, base.declared.on_limit) == (5, OnLimit.LATEST)
 
 
 def test_payload_is_made_for_ros_and_forwarded_from_udp(check_text: CheckText) -> None:
@@ -257,7 +252,7 @@ TOOLS = (
     " three: {address: 127.0.0.4:8, kind: tool}}"
 )
 HOST = "{source: %s, destinations: [three]}"
-TOPIC = "{source: ros, topics: [{topic: %s, type: std_msgs/msg/Float32}], fields: {ph_value: data}, destinations: [%s]}"
+TOPIC = "{source: {topic: %s, type: std_msgs/msg/Float32}, fields: {ph_value: data}, destinations: [%s]}"
 PUBLISHED = "{source: %s, topics: [{topic: %s, type: std_msgs/msg/Float32, fields: {data: ph_value}}]}"
 
 

@@ -104,8 +104,7 @@ routes:
     source: board
     topics: [{{topic: a, type: comms/msg/ArmBoardTargetMovement, {first}, fields: {{}}}}]
   arm_target:
-    source: ros
-    topics: [{{topic: /a, type: comms/msg/ArmBoardTargetMovement, {second}}}]
+    source: {{topic: /a, type: comms/msg/ArmBoardTargetMovement, {second}}}
     fields: auto
     destinations: [board]
 """

@@ -54,10 +54,10 @@ def test_the_entry_point_is_a_program_that_bash_can_read() -> None:
 def test_health_is_asked_where_the_rovers_table_serves_it() -> None:
     table = check_table(ROUTES / "rover.yaml").table
     assert table is not None
-    assert table.metrics is not None
+    assert table.http is not None
     host, _, port = SCRAPED.rpartition(":")
-    assert table.metrics.value.host in (host, "0.0.0.0")
-    assert table.metrics.value.port == int(port)
+    assert table.http.value.host in (host, "0.0.0.0")
+    assert table.http.value.port == int(port)
     assert f"ROUTER_METRICS={SCRAPED}\n" in DOCKERFILE
     [command] = re.findall(r"^ +CMD (\[.+\])$", DOCKERFILE, re.MULTILINE)
     interpreter, option, code = yaml.safe_load(command)

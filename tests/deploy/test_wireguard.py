@@ -27,7 +27,7 @@ STATION, ROVER = ("10.77.0.10", 9000), ("10.77.0.1", 5000)
 TABLE = """\
 version: 1
 envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:9108}}
+http: {{address: 127.0.0.1:9108}}
 listen:
   rover: {{address: 0.0.0.0:5000, interface: lan0}}
   radio: {{address: 0.0.0.0:5000, interface: wg0}}

@@ -145,7 +145,7 @@ class Rig:
         self.timers: list[Timer] = []
         group = TimerGroup(self.counts, self._locked)
         send = {plan.name: self._sender(plan.name) for plan in made.senders}
-        pacers = {plan.name: Pacer(plan.budget) for plan in made.senders if plan.budget}
+        pacers = {plan.name: Pacer(plan.bandwidth) for plan in made.senders if plan.bandwidth}
         deadmen = {
             plan.route: Deadman(plan, made.counters, self.counts, send, self.reports.append, self._changed)
             for plan in made.deadmen

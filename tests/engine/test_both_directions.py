@@ -20,8 +20,7 @@ HOUR = 3600 * SECOND
 
 ROUTES = """\
   drive_motor:
-    source: ros
-    topics:
+    source:
       - {topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}
       - {topic: backup, type: comms/msg/DrivingBoardMotorMessage, when: turning_radius > 0}
     fields: auto
@@ -31,15 +30,13 @@ ROUTES = """\
     ttl: 200ms
     deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board, recorder], repeat: 100ms}
   rover_localization:
-    source: ros
-    topics: [{topic: pose, type: geometry_msgs/msg/PointStamped}]
+    source: {topic: pose, type: geometry_msgs/msg/PointStamped}
     fields: {x: float32(point.x), y: float32(point.y)}
     destinations: [basestation]
     ttl: 200ms
   detected_object:
-    - source: ros
+    - source: {topic: detections, type: comms/msg/DetectedObjectArray}
       for_each: detections
-      topics: [{topic: detections, type: comms/msg/DetectedObjectArray}]
       fields: {auto: true, frame_id: frame_id, total_count: count, index: index}
       destinations: [{endpoint: basestation, when: item.confidence > 0.5}]
     - source: basestation
@@ -54,18 +51,18 @@ ROUTES = """\
     - source: basestation
       destinations: [driving_board]
       ttl: 200ms
-      deadman: "a test of ages alone"
+      deadman: {none: "a test of ages alone"}
     - source: sensor_board
       destinations: [recorder]
   imu_info:
     source: sensor_board
-    destinations: [{endpoint: recorder, max_rate: 10 Hz, keep: latest}]
-    topics: [{topic: accel, type: std_msgs/msg/Float32, fields: {data: accel_x}, max_rate: 10 Hz, keep: latest}]
+    destinations: [{endpoint: recorder, max_rate: 10 Hz, on_limit: latest}]
+    topics: [{topic: accel, type: std_msgs/msg/Float32, fields: {data: accel_x}, max_rate: 10 Hz, on_limit: latest}]
   ph_info:
     source: sensor_board
     destinations: [slow]
 """
-HEAD_MORE = "  slow: {address: 192.168.0.70:9000, kind: tool, budget: 1kB/s}\nroutes:\n"
+HEAD_MORE = "  slow: {address: 192.168.0.70:9000, kind: tool, bandwidth: 1kB/s}\nroutes:\n"
 
 
 @pytest.fixture(scope="module")

@@ -22,17 +22,16 @@ ROUTES = """\
     ttl: 200ms
     deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], HANDS_OVER}
   drive_motor:
-    source: ros
-    topics: [{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}]
+    source: {topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}
     fields: auto
     destinations: [{endpoint: driving_board, when: distance_to_go < 100}, recorder]
     ttl: 200ms
-    deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], hands_over_to: [manual_drive]}
+    deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [driving_board], disarmed_by: [manual_drive]}
   manual_brake:
-    - {source: basestation, destinations: [driving_board], deadman: "it is what stops the rover"}
+    - {source: basestation, destinations: [driving_board], deadman: {none: "it is what stops the rover"}}
     - {source: sensor_board, destinations: [recorder]}
 """
-BOTH = "hands_over_to: [drive_motor, manual_brake]"
+BOTH = "disarmed_by: [drive_motor, manual_brake]"
 TURN = enveloped(manual_drive={"turn": 5})
 FAR = 1000.0
 """Farther than the driving board is sent: such a command goes to the recorder alone."""

@@ -1,4 +1,4 @@
-"""Commands that wait for a budget or for `keep: latest`: a deadman is told of them when they leave, not before."""
+"""Commands that wait for a budget or for `on_limit: latest`: a deadman is told of them when they leave, not before."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, Rig, program
 from tests.engine.test_both_directions import BRAKE, MS, SECOND, enveloped
 from tests.engine.wire import LEN, framed, tag, varint
 
-HEAD_MORE = HEAD.replace("routes:", "  far_board: {address: 192.168.0.70:8, kind: board, budget: 10kB/s}\nroutes:")
+HEAD_MORE = HEAD.replace("routes:", "  far_board: {address: 192.168.0.70:8, kind: board, bandwidth: 10kB/s}\nroutes:")
 TURN = enveloped(manual_drive={"turn": 5})
 DEADMAN = "deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [far_board]"
 PACED = f"""\
@@ -19,14 +19,14 @@ PACED = f"""\
     - source: basestation
       destinations: [far_board]
       ttl: 200ms
-      {DEADMAN}, hands_over_to: [pump_info]}}
-  ph_info: {{source: sensor_board, destinations: [far_board], priority: bulk, deadman: no command at all}}
-  pump_info: {{source: sensor_board, destinations: [far_board], ttl: 200ms, deadman: large commands of another source}}
+      {DEADMAN}, disarmed_by: [pump_info]}}
+  ph_info: {{source: sensor_board, destinations: [far_board], priority: bulk, deadman: {{none: no command at all}}}}
+  pump_info: {{source: sensor_board, destinations: [far_board], ttl: 200ms, deadman: {{none: large commands of another source}}}}
 """
 HELD = f"""\
   manual_drive:
     source: basestation
-    destinations: [{{endpoint: far_board, max_rate: 3 Hz, keep: latest}}]
+    destinations: [{{endpoint: far_board, max_rate: 3 Hz, on_limit: latest}}]
     ttl: 400ms
     {DEADMAN}}}
 """
@@ -76,7 +76,7 @@ def test_commands_beside_more_bulk_than_the_budget_are_neither_late_nor_stale(ri
 
 def test_it_trips_when_all_commands_are_dropped(tmp_path: Path) -> None:
     """Another source's command takes the commands' part of the budget for almost three seconds."""
-    table = PACED.replace(", hands_over_to: [pump_info]", "")
+    table = PACED.replace(", disarmed_by: [pump_info]", "")
     rig = Rig(program(tmp_path, table, HEAD_MORE.replace("10kB/s", "5kB/s")))
     drives(rig, SECOND)
     rig.receive(large(number_of(rig, "pump_info"), 16_000), SENSOR_BOARD)

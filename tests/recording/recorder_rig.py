@@ -150,7 +150,7 @@ def settings(directory: Path, **changed: Any) -> RecordSettings:
         "last": None,
         "max_size": 256 << 20,
         "max_age": 600 * 10**9,
-        "keep": 4 << 30,
+        "retention": 4 << 30,
         **changed,
     }
     return RecordSettings(SPAN, directory, **told)

@@ -39,6 +39,6 @@ def test_the_keys_of_the_table_have_the_defaults_that_are_shown(tmp_path: Path) 
         assert checked.table.record is not None
         found.append(checked.table.record)
     shown, default = found
-    assert (shown.max_size, shown.max_age, shown.keep) == (default.max_size, default.max_age, default.keep)
+    assert (shown.max_size, shown.max_age, shown.retention) == (default.max_size, default.max_age, default.retention)
     assert shown.continuous
     assert shown.directory.resolve() == tmp_path.parent / "recordings"

@@ -138,7 +138,7 @@ def test_the_oldest_recordings_go_and_files_of_others_stay(tmp_path: Path) -> No
     (tmp_path / "other_20200101T000000.000000Z.mcap").write_bytes(bytes(100_000))
     old = tmp_path / "rover_20200101T000000.000000Z_deadman-drive_motor.mcap"
     old.write_bytes(bytes(10_000))
-    with running_recorder(tmp_path, max_size=25_000, keep=60_000) as (made, mirror):
+    with running_recorder(tmp_path, max_size=25_000, retention=60_000) as (made, mirror):
         for _ in range(8):
             show(made, mirror, now(os.urandom(10_000)))
     ours = [path for path in files(tmp_path) if path.stat().st_size < 100_000]

@@ -135,7 +135,7 @@ def test_losses_are_told_with_their_reason(tmp_path: Path, capsys: pytest.Captur
 
 def test_what_comes_later_is_not_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A destination with a budget gets the same, at other times."""
-    late = FORWARD.replace("[basestation]", "[{endpoint: basestation, max_rate: 100 Hz, keep: latest}]")
+    late = FORWARD.replace("[basestation]", "[{endpoint: basestation, max_rate: 100 Hz, on_limit: latest}]")
     found = Compared(tmp_path, FORWARD, late, capsys)
     row = found.row("imu_info", "basestation")
     assert row["moved"] == 1  # the third, when the first was 10 ms ago
@@ -165,7 +165,7 @@ def test_rows_add_up_whatever_comes(steps: list[tuple[int, int]], data: st.DataO
     forms = [
         FORWARD,
         FORWARD.replace("[basestation]", "[{endpoint: basestation, max_rate: 50 Hz}]"),
-        FORWARD.replace("[basestation]", "[{endpoint: basestation, max_rate: 50 Hz, keep: latest}]"),
+        FORWARD.replace("[basestation]", "[{endpoint: basestation, max_rate: 50 Hz, on_limit: latest}]"),
         FORWARD.replace("[basestation]", "[{endpoint: basestation, when: accel_x > 1}, recorder]"),
     ]
     old, new = (data.draw(st.sampled_from(forms)) for _ in range(2))

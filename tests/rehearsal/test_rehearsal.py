@@ -111,7 +111,7 @@ def test_condition_that_withholds_is_told(tmp_path: Path) -> None:
 
 
 def test_what_waits_for_its_rate_is_sent_later(tmp_path: Path) -> None:
-    to = "{endpoint: basestation, max_rate: 10 Hz, keep: latest}"
+    to = "{endpoint: basestation, max_rate: 10 Hz, on_limit: latest}"
     made = rehearsal(tmp_path, f"  imu_info: {{source: sensor_board, destinations: [{to}]}}\n")
     first, second, third = (datagram("imu_info", f"accel_x={x}") for x in (1, 2, 3))
     for data in (first, second, third):
@@ -124,7 +124,7 @@ def test_what_waits_for_its_rate_is_sent_later(tmp_path: Path) -> None:
 
 
 def test_budget_holds_back_and_sends_when_it_is_paid(tmp_path: Path) -> None:
-    head = HEAD.replace("kind: basestation}", "kind: basestation, budget: 1kB/s}")
+    head = HEAD.replace("kind: basestation}", "kind: basestation, bandwidth: 1kB/s}")
     made = rehearsal(tmp_path, "  imu_info: {source: sensor_board, destinations: [basestation]}\n", head)
     for number in range(1, 21):
         made.datagram("trimmed", SENSOR_BOARD, datagram("imu_info", f"accel_x={number}"))
@@ -153,11 +153,10 @@ def test_frame_that_stays_incomplete_is_dropped_when_its_time_is_up(tmp_path: Pa
 def test_ros_message_that_cannot_be_read_is_dropped_with_the_error(tmp_path: Path) -> None:
     routes = """
   drive_motor:
-    source: ros
-    topics: [{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}]
+    source: {topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}
     fields: auto
     destinations: [driving_board]
-    deadman: not in this test
+    deadman: {none: not in this test}
 """
     made = rehearsal(tmp_path, routes)
     made.ros("drive_motor", b"\0\1\0\0")

@@ -33,8 +33,7 @@ imu_info:
 """
 DRIVE = """
 drive_motor:
-  source: ros
-  topics: [{topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}]
+  source: {topic: drive_motor, type: comms/msg/DrivingBoardMotorMessage}
   fields: auto
   destinations: [driving_board]
   ttl: 200ms
@@ -169,7 +168,9 @@ def test_bytes_are_given_and_expected_as_hex(tmp_path: Path) -> None:
 
 
 def test_a_datagram_arrives_where_its_sender_is_believed_unless_said(tmp_path: Path) -> None:
-    drive = "\nmanual_drive: {source: basestation, destinations: [driving_board], deadman: not part of this test}\n"
+    drive = (
+        "\nmanual_drive: {source: basestation, destinations: [driving_board], deadman: {none: not part of this test}}\n"
+    )
     tests = """
         believed:
           given: {case: manual_drive, from: basestation}
@@ -659,7 +660,7 @@ def test_limits_have_to_be_reached(tmp_path: Path) -> None:
 
 
 def test_a_budget_has_to_be_exceeded(tmp_path: Path) -> None:
-    head = HEAD.replace("kind: basestation}", "kind: basestation, budget: 1kB/s}")
+    head = HEAD.replace("kind: basestation}", "kind: basestation, bandwidth: 1kB/s}")
     routes = "imu_info: {source: any, destinations: [basestation]}"
     within = f"a: {{given: {given('{}')}, expect: {{sent: basestation}}}}\n"
     assert gaps(tmp_path, routes, within, head) == [("rejection", "basestation")]

@@ -16,12 +16,12 @@ GOOD = """\
 version: 1
 envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
 node: {name: rover_router, namespace: /}
-metrics: {address: 127.0.0.1:9108}
+http: {address: 127.0.0.1:9108}
 listen:
   rover: {address: 0.0.0.0:5000, framing: exact, receive_buffer: 64kB}
 endpoints:
   sensor_board: {address: 192.168.0.30:8, kind: board, source_port: 9}
-  basestation: {address: "${BASESTATION:-192.168.0.10:9000}", kind: tool, trim_trailing_zeros: true, budget: 500kB/s}
+  basestation: {address: "${BASESTATION:-192.168.0.10:9000}", kind: tool, trim_trailing_zeros: true, bandwidth: 500kB/s}
 routes:
   imu_info:
     source: sensor_board
@@ -42,29 +42,27 @@ routes:
           linear_acceleration: {x: accel_x, y: 9.81}
           orientation_covariance: [-1, 0, accel_y]
   arm_target:
-    source: ros
-    topics: [{topic: arm_target, type: comms/msg/ArmBoardTargetMovement}]
+    source: {topic: arm_target, type: comms/msg/ArmBoardTargetMovement}
     fields: auto
     destinations: [basestation]
   ph_info: {ignore: nobody needs it}
   manual_drive:
     source: basestation
-    destinations: [{endpoint: sensor_board, max_rate: 20 Hz, keep: latest}]
+    destinations: [{endpoint: sensor_board, max_rate: 20 Hz, on_limit: latest}]
     priority: command
     ttl: 200ms
     deadman: {timeout: 300 ms, send: {manual_brake: {brake: true, by.who: "'router'"}}, to: [sensor_board, basestation],
-      hands_over_to: [arm_target]}
+      disarmed_by: [arm_target]}
   detected_object:
-    - source: ros
+    - source: {topic: detected_objects, type: comms/msg/DetectedObjectArray}
       for_each: detections
-      topics: [{topic: detected_objects, type: comms/msg/DetectedObjectArray}]
       fields: {auto: true, total_count: count}
       destinations: [basestation]
-      deadman: nothing moves because of it
+      deadman: {none: nothing moves because of it}
     - source: [basestation, sensor_board]
       collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
       topics: [{topic: objects, type: comms/msg/DetectedObjectArray, fields: {detections: items}}]
-    - {source: ros, topics: [{topic: it, type: comms/msg/DetectedObject}], fields: auto, destinations: [basestation]}
+    - {source: {topic: it, type: comms/msg/DetectedObject}, fields: auto, destinations: [basestation]}
 """
 
 SMALL = """\
@@ -128,10 +126,12 @@ def parts(folder: Path, text: str) -> tuple[RouteTable, list[Diagnostic]]:
 def shown(part: object) -> dict[str, str]:
     """Every setting of a part of a table, and of the parts in its lists, by key and index."""
     settings = flat(part)
-    for key in [key for key in ("destinations", "topics", "inbound") if hasattr(part, key)]:
-        settings.pop(key, None)
+    for key in [key for key in ("destinations", "source_topics", "topics", "inbound") if hasattr(part, key)]:
+        name_of_key = "source" if key == "source_topics" else key
+        if getattr(part, key):
+            settings.pop(name_of_key, None)
         for index, member in enumerate(getattr(part, key)):
-            settings |= {f"{key}.{index}.{name}": value for name, value in flat(member).items()}
+            settings |= {f"{name_of_key}.{index}.{name}": value for name, value in flat(member).items()}
     return settings
 
 

@@ -63,7 +63,7 @@ LOCAL = """\
 version: 1
 envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
 networks: [127.0.0.0/8]
-metrics: {address: 127.0.0.1:9108}
+http: {address: 127.0.0.1:9108}
 foxglove: {address: 127.0.0.1:8766}
 listen: {rover: {address: 127.0.0.1:5000}}
 endpoints: {board: {address: 127.0.0.30:8, kind: board}}

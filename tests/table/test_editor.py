@@ -22,7 +22,7 @@ listen:
   rover: {address: 0.0.0.0:5000, framing: zero_trimmed, receive_buffer: "${BUFFER:-4MiB}", coalesce: 500us}
 endpoints:
   sensor_board: {address: "${SENSOR:-192.168.0.30:8}", kind: board}
-  basestation: {address: 192.168.0.10:9000, kind: basestation, budget: 500kB/s}
+  basestation: {address: 192.168.0.10:9000, kind: basestation, bandwidth: 500kB/s}
 routes:
   imu_info:
     source: [sensor_board]
@@ -39,20 +39,19 @@ routes:
   ph_info: {ignore: nobody needs it}
   manual_drive:
     source: basestation
-    destinations: [{endpoint: driving_board, max_rate: 20 Hz, keep: latest}]
+    destinations: [{endpoint: driving_board, max_rate: 20 Hz, on_limit: latest}]
     priority: command
     ttl: 200ms
     deadman: {timeout: 400ms, send: {manual_brake: {}}, to: [driving_board], repeat: 50ms,
-      hands_over_to: [drive_motor]}
+      disarmed_by: [drive_motor]}
   detected_object:
-    - source: ros
+    - source: {topic: detected_objects, type: comms/msg/DetectedObjectArray}
       for_each: detections
-      topics: [{topic: detected_objects, type: comms/msg/DetectedObjectArray}]
       fields: {auto: true, index: index}
       destinations: [basestation]
     - source: basestation
       collect: {by: frame_id, count: total_count, order: index, timeout: 1s}
-      deadman: nothing moves because of it
+      deadman: {none: nothing moves because of it}
 """
 GATEWAYS = """\
 # yaml-language-server: $schema=../schemas/route-table.schema.json
@@ -90,8 +89,8 @@ version: 1
 extends: rover.yaml
 networks: [127.0.0.0/8, "${NETWORK:-10.0.0.0/8}"]
 envelope: {message: OtherEnvelope}
-metrics: {}
-record: {keep: 1GiB}
+http: {}
+record: {retention: 1GiB}
 endpoints:
   sensor_board: {address: 127.0.0.30:25008}
   camera: {kind: tool}
@@ -102,7 +101,7 @@ routes:
   detected_object: {collect: {timeout: 2s}}
   ph_info: {ignore: nobody needs it}
   manual_brake:
-    - {source: ros, topics: [{topic: brake, type: std_msgs/msg/Bool, fields: auto}]}
+    - {source: {topic: brake, type: std_msgs/msg/Bool}, fields: auto}
     - {source: [sensor_board], deadman: {timeout: 200ms, send: {manual_brake: {}}, to: [driving_board]}}
 gateways:
   page: {publish_period: each}
@@ -119,7 +118,7 @@ COMPLETE_PARTS = {
     "envelope": "envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}\n",
     "listen": "listen: {rover: {address: 0.0.0.0:5000}}\n",
     "routes": "routes: {}\n",
-    "metrics": "metrics: {address: 127.0.0.1:9108}\n",
+    "http": "http: {address: 127.0.0.1:9108}\n",
     "record": "record: {directory: ../recordings}\n",
     "foxglove": "foxglove: {address: 127.0.0.1:8766}\n",
     "endpoints": "endpoints: {}\n",
@@ -165,8 +164,8 @@ def test_gateways_alone_need_nothing_beside_them_and_routes_do(editor: LanguageS
     [
         *(("", key) for key in ("version", "envelope", "listen", "routes")),
         ("envelope: {protos: ../protos, message: PBEnvelope}", "oneof"),
-        ("metrics: {}", "address"),
-        ("record: {keep: 1GiB}", "directory"),
+        ("http: {}", "address"),
+        ("record: {retention: 1GiB}", "directory"),
         ("foxglove: {}", "address"),
         ("listen: {rover: {framing: exact}}", "address"),
         ("endpoints: {sensor_board: {address: 127.0.0.1:8}}", "kind"),
@@ -199,12 +198,12 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
         (GOOD, "zero_trimmed", "zero_trimed", "zero_trimed", 'Valid values: "zero_trimmed", "exact"'),
         (GOOD, "500ms", "500 millis", "500 millis", "must be a duration above zero with its unit"),
         (GOOD, "    source: [sensor_board]\n", "", "imu_info", 'Missing property "source"'),
-        (GOOD, "ignore: nobody", "source: ros, ignore: nobody", "source: ros", "has no place beside 'ignore'"),
-        (GOOD, "max_rate: 20 Hz, ", "", "keep: latest", "has its place beside 'max_rate' only"),
+        (GOOD, "ignore: nobody", "source: any, ignore: nobody", "source: any", "has no place beside 'ignore'"),
+        (GOOD, "max_rate: 20 Hz, ", "", "on_limit: latest", "has its place beside 'max_rate' only"),
         (GOOD, "{manual_brake: {}}", "{manual_brake: {}, arm_ctrl: {}}", "send", "more properties than limit of 1"),
-        (GOOD, "nothing moves because of it", "500ms", "deadman: 500ms", "a sentence that says why none is needed"),
-        (GOOD, "collect: {", "for_each: x\n      collect: {", "for_each: x", "its place beside 'source: ros' only"),
-        (GOOD, "for_each: detections", "collect: {}", "collect: {}", "it has no place beside 'source: ros'"),
+        (GOOD, "{none: nothing moves because of it}", "500ms", "deadman: 500ms", "{none: why} where there is none"),
+        (GOOD, "collect: {", "for_each: x\n      collect: {", "for_each: x", "its place only beside a topic"),
+        (GOOD, "for_each: detections", "collect: {}", "collect: {}", "it has no place beside a topic"),
         (GOOD, "    - source: basestation\n      collect", "    - collect", "- collect", 'Missing property "source"'),
         (GATEWAYS, "tcp: 0.0.0.0:8600", "tpc: 0.0.0.0:8600", "tpc", "must be one of udp, tcp"),
         (GATEWAYS, "json_lines", "gateway_v2", "format: gateway_v2\n    max", "must be 'gateway_v1' or 'json_lines'"),
@@ -216,8 +215,8 @@ def test_what_is_missing_is_told_unless_the_table_extends_another(
         (PART, "receive_buffer:", "receive_bufer:", "receive_bufer", "Property receive_bufer is not allowed."),
         (PART, "[127.0.0.0/8", "[localhost", "networks", "must be an IPv4 network"),
         # Lists are not merged, so what stands in one has to be complete.
-        (PART, ", to: [driving_board]", "", "deadman: {timeout: 200ms", 'Missing property "to"'),
-        (PART, "type: std_msgs/msg/Bool, ", "", "topics", 'Missing property "type"'),
+        (PART, ", send: {manual_brake: {}}", "", "deadman: {timeout: 200ms", 'Missing property "send"'),
+        (PART, "topic: brake, ", "", "type: std_msgs/msg/Bool", 'Missing property "topic"'),
         (PART, "source: [sensor_board]", "ttl: 1s", "- {ttl", 'Missing property "source"'),
     ],
 )  # fmt: skip
@@ -237,7 +236,7 @@ def test_a_mistake_is_underlined_where_it_is(
             "version": ("Version", "version of the route-table language"),
             "protos": ("Proto folder", "relative to this file"),
             "framing": ("Framing", "remove trailing zero bytes"),
-            "source: [": ("Source", "'any' for whoever does"),
+            "source: [": ("Source", "'any' is whoever does"),
             "when": ("When", "boolean expression"),
             "deadline": ("Deadline", "longest time between two messages"),
             "auto: true": ("Auto", "Fields of the same name"),
@@ -278,10 +277,10 @@ ENDPOINT = {"address", "source_port", "trim_trailing_zeros"}
         (PART.replace("listen:", "  arm_board:\n    kind: board\n    @\nlisten:"), ENDPOINT),
         (GOOD + "  gps_info:\n    @\n", {"source", "destinations", "topics", "ignore"}),
         (GOOD + "      @\n", {"ttl", "topics", "priority"}),
-        (GOOD + "    - source: ros\n      @\n", {"ttl", "topics", "priority"}),
+        (GOOD + "    - source: {topic: it}\n      @\n", {"ttl", "topics", "priority"}),
         (
             GOOD + "  manual_arm:\n    source: basestation\n    deadman:\n      @\n",
-            {"timeout", "send", "to", "repeat", "hands_over_to"},
+            {"timeout", "send", "to", "repeat", "disarmed_by"},
         ),
         (
             GOOD.replace("{profile: sensor_data, deadline: 500ms}", "\n          reliability: @"),

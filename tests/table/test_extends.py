@@ -46,7 +46,7 @@ def test_a_list_of_routes_replaces_and_is_replaced_whole(base: Path) -> None:
     text = """\
 extends: base.yaml
 routes:
-  imu_info: [{source: sensor_board, destinations: [basestation]}, {source: ros, topics: [], fields: auto}]
+  imu_info: [{source: sensor_board, destinations: [basestation]}, {source: {topic: imu}, fields: auto}]
   detected_object: {source: any, destinations: [basestation]}
   ph_info: [{source: any, destinations: [basestation]}]
 """
@@ -75,7 +75,7 @@ def test_a_deadman_merges_but_for_the_payload_of_another_case(
 
 
 def test_a_reason_takes_the_place_of_a_deadman(base: Path) -> None:
-    table = good(base, "extends: base.yaml\nroutes:\n  manual_drive: {deadman: no wheels here}\n")
+    table = good(base, "extends: base.yaml\nroutes:\n  manual_drive: {deadman: {none: no wheels here}}\n")
     assert not any(route.deadman for route in table.routes)
 
 

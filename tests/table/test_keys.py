@@ -10,7 +10,7 @@ from router.table import model
 from router.table.build import structure
 from router.table.compose import compose
 from router.table.keys import Words, flat, keys_of, phrases
-from router.table.model import Destination, Keep
+from router.table.model import Destination, OnLimit
 from router.table.nodes import MappingNode
 from router.table.schema import table_schema
 from router.table.source import read_source
@@ -23,9 +23,9 @@ UNITS = ("duration", "size", "disk_size", "data_rate", "period", "max_rate")
 
 def test_every_number_with_a_unit_is_shown_with_it() -> None:
     models = [part for part in vars(model).values() if is_dataclass(part) and isinstance(part, type)]
-    shown = {key.name for part in models for key in keys_of(part) if key.quantity is not None}
+    shown = {key.name.rpartition(".")[2] for part in models for key in keys_of(part) if key.quantity is not None}
     in_schema = {path[-1] for path, definition in references(table_schema()) if definition in UNITS}
-    assert in_schema >= {"ttl", "keep", "budget", "publish_period", "max_rate", "receive_buffer"}
+    assert in_schema >= {"ttl", "retention", "bandwidth", "publish_period", "max_rate", "receive_buffer"}
     assert in_schema - shown == set()
 
 
@@ -42,6 +42,6 @@ def test_a_field_of_the_model_is_all_that_a_key_needs_to_be_read_and_shown(tmp_p
     settings = compose(read_source(path), {}, [])
     assert isinstance(settings, MappingNode)
     found = structure(Delayed, settings, span=settings.span)
-    assert (found.delay, found.max_rate, found.keep) == (1_500_000_000, 20.0, Keep.FIRST)
-    assert flat(found) == {"max_rate": "20 Hz", "keep": "first", "endpoint": "arm", "delay": "1.5 s"}
-    assert phrases(found) == {"max_rate": "at most 20 Hz", "keep": "keeping the first", "delay": "1.5 s later"}
+    assert (found.delay, found.max_rate, found.on_limit) == (1_500_000_000, 20.0, OnLimit.FIRST)
+    assert flat(found) == {"max_rate": "20 Hz", "on_limit": "first", "endpoint": "arm", "delay": "1.5 s"}
+    assert phrases(found) == {"max_rate": "at most 20 Hz", "on_limit": "keeping the first", "delay": "1.5 s later"}

@@ -26,8 +26,8 @@ def route(table: RouteTable, name: str) -> Route:
 
 
 def test_listeners_endpoints_and_settings_are_typed(table: RouteTable) -> None:
-    assert table.metrics
-    assert table.metrics.value == Address("127.0.0.1", 9108)
+    assert table.http
+    assert table.http.value == Address("127.0.0.1", 9108)
     assert flat(table.node) == {"name": "rover_router", "namespace": "/"}
     assert flat(table.listeners["rover"]) == {
         "name": "rover", "address": "0.0.0.0:5000", "framing": "exact", "receive_buffer": "64 kB", "coalesce": "1 ms",
@@ -38,7 +38,7 @@ def test_listeners_endpoints_and_settings_are_typed(table: RouteTable) -> None:
     }  # fmt: skip
     assert flat(table.endpoints["basestation"]) == {
         "name": "basestation", "address": "192.168.0.10:9000", "kind": "tool", "trim_trailing_zeros": "true",
-        "budget": "500 kB/s", "stale_after": "5 s",
+        "bandwidth": "500 kB/s", "stale_after": "5 s",
     }  # fmt: skip
 
 
@@ -49,59 +49,57 @@ def test_routes_are_typed(table: RouteTable) -> None:
 ROUTES = {
     "imu_info": {
         "name": "imu_info", "case": "imu_info", "source": "sensor_board", "destinations.0.endpoint": "basestation",
-        "destinations.0.keep": "first", "destinations.1.endpoint": "basestation", "destinations.1.when": "accel_x > 1",
-        "destinations.1.max_rate": "30 Hz", "destinations.1.keep": "first", "topics.0.topic": "imu_data",
-        "topics.0.type": "comms/msg/ImuSensorInformation", "topics.0.queue_depth": "10", "topics.0.keep": "first",
+        "destinations.0.on_limit": "first", "destinations.1.endpoint": "basestation", "destinations.1.when": "accel_x > 1",
+        "destinations.1.max_rate": "30 Hz", "destinations.1.on_limit": "first", "topics.0.topic": "imu_data",
+        "topics.0.type": "comms/msg/ImuSensorInformation", "topics.0.queue_depth": "10", "topics.0.on_limit": "first",
         "topics.0.fields": "{auto}", "topics.1.topic": "imu/data_raw", "topics.1.type": "sensor_msgs/msg/Imu",
         "topics.1.qos.profile": "sensor_data", "topics.1.qos.depth": "5", "topics.1.qos.deadline": "500 ms",
-        "topics.1.max_rate": "0.5 Hz", "topics.1.keep": "first",
+        "topics.1.max_rate": "0.5 Hz", "topics.1.on_limit": "first",
         "topics.1.fields": "{auto, header.stamp: received_at, header.frame_id: 'imu_link', "
         "linear_acceleration.x: accel_x, linear_acceleration.y: 9.81, orientation_covariance: [-1, 0, accel_y]}",
     },
     "arm_target": {
-        "name": "arm_target", "case": "arm_target", "source": "ros", "topics.0.topic": "arm_target",
-        "topics.0.type": "comms/msg/ArmBoardTargetMovement", "topics.0.keep": "first", "fields": "{auto}",
-        "destinations.0.endpoint": "basestation", "destinations.0.keep": "first",
+        "name": "arm_target", "case": "arm_target", "source.0.topic": "arm_target",
+        "source.0.type": "comms/msg/ArmBoardTargetMovement", "source.0.on_limit": "first", "fields": "{auto}",
+        "destinations.0.endpoint": "basestation", "destinations.0.on_limit": "first",
     },
     "ph_info": {
         "name": "ph_info", "case": "ph_info", "ignore": "nobody needs it",
     },
     "manual_drive": {
         "name": "manual_drive", "case": "manual_drive", "source": "basestation",
-        "destinations.0.endpoint": "sensor_board", "destinations.0.max_rate": "20 Hz", "destinations.0.keep": "latest",
+        "destinations.0.endpoint": "sensor_board", "destinations.0.max_rate": "20 Hz", "destinations.0.on_limit": "latest",
         "priority": "command", "ttl": "200 ms", "deadman.timeout": "300 ms", "deadman.repeat": "100 ms",
         "deadman.at_start": "send", "deadman.case": "manual_brake",
         "deadman.fields": "{brake: true, by.who: 'router'}", "deadman.to": "sensor_board, basestation",
-        "deadman.hands_over_to": "arm_target",
+        "deadman.disarmed_by": "arm_target",
     },
     "detected_object_from_ros": {
-        "name": "detected_object_from_ros", "case": "detected_object", "source": "ros", "for_each": "detections",
-        "topics.0.topic": "detected_objects", "topics.0.type": "comms/msg/DetectedObjectArray",
-        "topics.0.keep": "first", "fields": "{auto, total_count: count}", "destinations.0.endpoint": "basestation",
-        "destinations.0.keep": "first", "no_deadman": "nothing moves because of it",
+        "name": "detected_object_from_ros", "case": "detected_object", "for_each": "detections",
+        "source.0.topic": "detected_objects", "source.0.type": "comms/msg/DetectedObjectArray",
+        "source.0.on_limit": "first", "fields": "{auto, total_count: count}", "destinations.0.endpoint": "basestation",
+        "destinations.0.on_limit": "first", "no_deadman": "nothing moves because of it",
     },
     "detected_object_from_basestation": {
         "name": "detected_object_from_basestation", "case": "detected_object", "source": "basestation, sensor_board",
         "collect.by": "frame_id", "collect.count": "total_count", "collect.order": "index", "collect.timeout": "1 s",
-        "topics.0.topic": "objects", "topics.0.type": "comms/msg/DetectedObjectArray", "topics.0.keep": "first",
+        "topics.0.topic": "objects", "topics.0.type": "comms/msg/DetectedObjectArray", "topics.0.on_limit": "first",
         "topics.0.fields": "{detections: items}",
     },
     "detected_object_from_ros_2": {
-        "name": "detected_object_from_ros_2", "case": "detected_object", "source": "ros", "topics.0.topic": "it",
-        "topics.0.type": "comms/msg/DetectedObject", "topics.0.keep": "first", "fields": "{auto}",
-        "destinations.0.endpoint": "basestation", "destinations.0.keep": "first",
+        "name": "detected_object_from_ros_2", "case": "detected_object", "source.0.topic": "it",
+        "source.0.type": "comms/msg/DetectedObject", "source.0.on_limit": "first", "fields": "{auto}",
+        "destinations.0.endpoint": "basestation", "destinations.0.on_limit": "first",
     },
 }  # fmt: skip
 
 
 def test_a_payload_of_defaults_and_a_repeat_of_its_own_are_taken(tmp_path: Path) -> None:
     text = GOOD.replace("{brake: true, by.who: \"'router'\"}", "{}")
-    text = text.replace("300 ms, send", "300 ms, repeat: 20ms, send").replace(
-        ",\n      hands_over_to: [arm_target]", ""
-    )
+    text = text.replace("300 ms, send", "300 ms, repeat: 20ms, send").replace(",\n      disarmed_by: [arm_target]", "")
     deadman = route(good(tmp_path, text), "manual_drive").deadman
     assert deadman
-    assert (deadman.repeat.value, deadman.fields.entries, deadman.hands_over_to) == (20_000_000, (), ())
+    assert (deadman.repeat.value, deadman.fields.entries, deadman.disarmed_by) == (20_000_000, (), ())
 
 
 def test_names_of_routes_differ_whatever_cases_are_called(tmp_path: Path) -> None:
@@ -154,7 +152,7 @@ def test_the_hash_is_over_all_files_in_order(tmp_path: Path) -> None:
 
 def test_what_is_left_out_has_defaults(tmp_path: Path) -> None:
     table = good(tmp_path, f"{SMALL}endpoints: {{arm: {{address: 10.0.0.1:8, kind: board}}}}\n")
-    assert (flat(table.node), table.metrics) == ({"name": "rover_router", "namespace": "/"}, None)
+    assert (flat(table.node), table.http) == ({"name": "rover_router", "namespace": "/"}, None)
     assert flat(table.listeners["rover"]) == {
         "name": "rover", "address": "0.0.0.0:5000", "framing": "zero_trimmed", "receive_buffer": "4 MiB",
         "coalesce": "1 ms",
@@ -168,7 +166,8 @@ def test_a_recording_needs_a_directory_alone(tmp_path: Path) -> None:
     assert record
     assert record.directory.resolve() == tmp_path.parent.resolve() / "recordings"
     assert flat(replace(record, directory=Path("there"))) == {
-        "directory": "there", "continuous": "true", "max_size": "256 MiB", "max_age": "10 min", "keep": "4 GiB",
+        "directory": "there", "continuous": "true", "rotate_after.size": "256 MiB",
+        "rotate_after.age": "10 min", "retention": "4 GiB",
     }  # fmt: skip
 
 
@@ -179,7 +178,8 @@ def test_what_is_said_beside_routing_is_typed(tmp_path: Path) -> None:
         "endpoints:\n"
         "  arm: {address: 10.0.0.1:8, kind: board, stale_after: 500ms}\n"
         "  tool: {address: 10.0.0.2:8, kind: tool, stale_after: never}\n"
-        "record: {directory: /data, continuous: false, last: 60s, max_size: 1.5GB, max_age: 1h, keep: 20GiB}\n",
+        "record: {directory: /data, continuous: false, last: 60s, retention: 20GiB,\n"
+        "  rotate_after: {size: 1.5GB, age: 1h}}\n",
     )
     assert table.node.diagnostics
     assert table.node.diagnostics.line == 5
@@ -189,8 +189,9 @@ def test_what_is_said_beside_routing_is_typed(tmp_path: Path) -> None:
     assert [table.endpoints[name].stale_after for name in ("arm", "tool")] == [500_000_000, None]
     assert table.record
     assert flat(table.record) == {
-        "directory": "/data", "continuous": "false", "last": "1 min", "max_size": "1500 MB", "max_age": "1 h",
-        "keep": "20 GiB",
+        "directory": "/data", "continuous": "false", "last": "1 min",
+        "rotate_after.size": "1500 MB", "rotate_after.age": "1 h",
+        "retention": "20 GiB",
     }  # fmt: skip
 
 
@@ -273,14 +274,13 @@ def test_of_several_routes_the_valid_ones_and_the_valid_parts_are_left(tmp_path:
     assert len(findings) == 2
     assert table.broken == {"routes/detected_object"}
     routes = [route for route in table.routes if route.case.value == "detected_object"]
-    assert [(len(route.topics), len(route.destinations)) for route in routes] == [(1, 0), (1, 1)]
+    assert [(len(route.all_topics), len(route.destinations)) for route in routes] == [(1, 0), (1, 1)]
 
 
 def test_expressions_are_left_out_with_what_gives_them_their_names(tmp_path: Path) -> None:
     text = GOOD.replace("order: index, ", "").replace("for_each: detections", "for_each: 5")
     table, findings = parts(tmp_path, text)
     assert len(findings) == 2
-    each = route(table, "detected_object_from_ros")
-    assert (each.for_each, each.fields, each.destinations, each.topics) == (None, None, (), ())
+    assert [topic.topic.value for topic in route(table, "detected_object_from_ros").source_topics] == ["it"]
     together = route(table, "detected_object_from_basestation")
     assert (together.collect, together.topics) == (None, ())

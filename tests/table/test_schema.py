@@ -71,7 +71,7 @@ MODELS: list[tuple[str, type, set[str]]] = [
     ("destination", Destination, set()),
     ("topic", Topic, set()),
     ("qos", Qos, set()),
-    ("route", Route, {"case", "no_deadman"}),
+    ("route", Route, {"case", "no_deadman", "source_topics"}),
     ("deadman", Deadman, {"case", "fields"}),
     ("collect", Collect, set()),
     ("gateway", Gateway, {"address", "zenoh"}),
@@ -80,7 +80,7 @@ MODELS: list[tuple[str, type, set[str]]] = [
     ("inbound_deadman", InboundDeadman, set()),
 ]
 """Definitions, the classes that declare their keys, and which of the fields are no keys of their own."""
-WITHIN = {("deadman", "send"), ("gateway", "ignore")}
+WITHIN = {("deadman", "send"), ("deadman", "none"), ("gateway", "ignore"), ("route", "topic")}
 """Keys that are read with the mapping that they stand in."""
 
 
@@ -110,7 +110,9 @@ def test_documented_defaults_are_those_of_the_model() -> None:
         (NodeSettings, top["node"]["properties"]),
     ]:
         for key in keys_of(model):
-            documented = resolved(known.get(key.name, {})).get("default")
+            outer, _, inner = key.name.partition(".")
+            declared = resolved(known.get(outer, {}))
+            documented = resolved(declared.get("properties", {}).get(inner, {}) if inner else declared).get("default")
             if documented not in (None, [], {}) and key.default is not None:
                 assert key.text(key.default).replace(" ", "").lower() == str(documented).lower(), (model, key.name)
                 compared += 1

@@ -39,7 +39,7 @@ ROOT = Path(__file__).parent.parent.parent
 TABLE = """\
 version: 1
 envelope: {{protos: {root}/tests/rover/protos, message: PBEnvelope, oneof: payload}}
-metrics: {{address: 127.0.0.1:{metrics}}}
+http: {{address: 127.0.0.1:{metrics}}}
 listen: {{rover: {{address: "127.0.0.1:{listen}", receive_buffer: {buffer}}}}}
 endpoints:
   sensor_board: {{address: "127.0.0.30:8", kind: board, stale_after: 5s}}
@@ -249,7 +249,7 @@ def test_a_buffer_beyond_the_kernels_limit_is_a_warning(
 
 
 def recorded(table: Path, folder: Path, keep: str) -> Program:
-    table.write_text(f"{table.read_text()}record: {{directory: {folder}, keep: {keep}}}\n")
+    table.write_text(f"{table.read_text()}record: {{directory: {folder}, retention: {keep}}}\n")
     return compiled(table)
 
 
@@ -351,9 +351,9 @@ def test_who_answers_a_ping() -> None:
 @contextmanager
 def serving(program: Program, *samples: str) -> Iterator[None]:
     """A router that runs the program's table, and has these metrics."""
-    assert program.table.metrics is not None
+    assert program.table.http is not None
     build = f'router_build_info{{table_sha256="{program.table.sha256}"}} 1'
-    with answering("\n".join([build, *samples, ""]), program.table.metrics.value):
+    with answering("\n".join([build, *samples, ""]), program.table.http.value):
         yield
 
 
@@ -371,7 +371,7 @@ def diagnosis(table: Path, *samples: str) -> list[CheckResult]:
 
 @pytest.mark.parametrize("text", ["<html>hello</html>", "", 'node_cpu{cpu="0"} 1\n', 'router_kernel_drops{a="b"} 1\n'])
 def test_another_program_at_the_routers_address_has_its_port(table: Path, text: str) -> None:
-    address = compiled(table).table.metrics
+    address = compiled(table).table.http
     assert address is not None
     with answering(text, address.value):
         [problem] = texts(list(examine(table, {})), Grade.PROBLEM)

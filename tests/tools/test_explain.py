@@ -18,7 +18,7 @@ SIM = ROUTES / "sim.yaml"
 OLD = f"""\
 version: 1
 extends: {ROVER}
-metrics: {{address: 127.0.0.1:9108}}
+http: {{address: 127.0.0.1:9108}}
 foxglove: {{address: 127.0.0.1:8766}}
 node: {{diagnostics: false}}
 """
@@ -60,17 +60,17 @@ def told(folder: Path, more: str, old: str = OLD) -> list[str]:
         ("", []),
         (
             (
-                "metrics: {address: 127.0.0.1:9999}\nreload: {on_change: true}\nnode: {diagnostics: true}\n"
+                "http: {address: 127.0.0.1:9999}\nreload: {on_change: true}\nnode: {diagnostics: true}\n"
                 "foxglove: {address: 127.0.0.1:8767}"
             ),
             [
                 "table: -node.diagnostics: false",
                 "table: -reload.on_change: false",
-                "table: -metrics.address: 127.0.0.1:9108",
+                "table: -http.address: 127.0.0.1:9108",
                 "table: -foxglove.address: 127.0.0.1:8766",
                 "table: +node.diagnostics: true",
                 "table: +reload.on_change: true",
-                "table: +metrics.address: 127.0.0.1:9999",
+                "table: +http.address: 127.0.0.1:9999",
                 "table: +foxglove.address: 127.0.0.1:8767",
             ],
         ),

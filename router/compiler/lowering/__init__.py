@@ -30,7 +30,7 @@ from router.compiler.lowering.operations import (
 )
 from router.compiler.lowering.values import INT64, Integer, NeedsPython, Text
 from router.errors import SourceSpan
-from router.table.model import Keep
+from router.table.model import OnLimit
 from router.types.protobuf import Envelope
 
 _MOST_OPERATIONS = 0xFFFF - 2  # an `enum place` has 16 bits
@@ -101,8 +101,8 @@ def _own_executor(checked: CheckedRoute, target: CheckedTarget, envelope: Envelo
     """The executor of a target, without regard to others of its topic."""
     if checked.collect is not None:
         return Executor("`collect` needs it", checked.collect.span)
-    if target.declared.keep is Keep.LATEST:
-        return Executor("`keep: latest` needs it", target.span)
+    if target.declared.on_limit is OnLimit.LATEST:
+        return Executor("`on_limit: latest` needs it", target.span)
     try:
         lower(checked, [target], envelope)
     except Unlowered as reason:

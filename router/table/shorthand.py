@@ -1,0 +1,124 @@
+"""Write out what a table says in short, so that the rest of the router meets one form of everything.
+
+| short | written out |
+|---|---|
+| `topic: imu_data` in a route | `topics: [{topic: imu_data}]` |
+| a topic by its name, `topics: [imu_data]` | `topics: [{topic: imu_data}]` |
+| `qos: sensor_data` | `qos: {profile: sensor_data}` |
+| a key of `defaults` | that key wherever it applies and is missing |
+
+What is written out keeps the position of what was written, of a default that in `defaults`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+from router.errors import SourceSpan
+from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode, TextPlace, is_valid
+
+Entries = Mapping[str, Entry]
+NodeT = TypeVar("NodeT", bound=Node)
+
+
+def written_out(root: MappingNode) -> MappingNode:
+    """The table without short forms. What does not fit the schema is marked broken in it."""
+    group = root.get("defaults")
+    defaults = _valid_entries(group) if isinstance(group, MappingNode) else {}
+    in_long = _Shorthand(defaults)
+    root = _changed(root, "routes", lambda routes: _each_value(routes, lambda case: _one_or_each(case, in_long.route)))
+    return _changed(root, "gateways", lambda gateways: _each_value(gateways, in_long.gateway))
+
+
+class _Shorthand:
+    """The long forms of parts of a table with these defaults."""
+
+    def __init__(self, defaults: Entries) -> None:
+        self._of_routes = {key: entry for key, entry in defaults.items() if key == "ttl"}
+        self._queue_depth = {key: entry for key, entry in defaults.items() if key == "queue_depth"}
+        self._qos = {key: replace(entry, value=_qos(entry.value)) for key, entry in defaults.items() if key == "qos"}
+        deadman = defaults.get("deadman")
+        self._of_deadmen = deadman.value.entries if deadman and isinstance(deadman.value, MappingNode) else {}
+
+    def route(self, node: Node) -> Node:
+        if not isinstance(node, MappingNode) or "ignore" in node.entries:
+            return node
+        topic = node.entries.get("topic")
+        if topic is not None:
+            others = {key: entry for key, entry in node.entries.items() if key != "topic"}
+            node = replace(node, entries={**others, "topics": topic})
+        node = _changed(node, "topics", lambda topics: _one_or_each(topics, lambda each: self._topic(_named(each))))
+        node = _changed(node, "source", lambda source: _one_or_each(source, self._topic))
+        return _with(_changed(node, "deadman", self._deadman), self._of_routes)
+
+    def gateway(self, node: Node) -> Node:
+        return _changed(node, "inbound", lambda inbound: _one_or_each(inbound, self._inbound))
+
+    def _inbound(self, node: Node) -> Node:
+        return _changed(self._topic(node), "deadman", self._deadman)
+
+    def _topic(self, node: Node) -> Node:
+        """A mapping with 'topic'. A profile has a depth of its own, which a default for the queue does not change."""
+        if not isinstance(node, MappingNode):
+            return node
+        if "qos" in node.entries:
+            return _changed(node, "qos", _qos)
+        if "queue_depth" not in node.entries:
+            return _with(node, {**self._queue_depth, **self._qos})
+        return _with(node, {key: replace(entry, value=_without_depth(entry.value)) for key, entry in self._qos.items()})
+
+    def _deadman(self, node: Node) -> Node:
+        return node if isinstance(node, MappingNode) and "none" in node.entries else _with(node, self._of_deadmen)
+
+
+def _named(node: Node) -> Node:
+    """A topic that may be its name alone, as a mapping."""
+    return _alone("topic", node) if isinstance(node, ScalarNode) else node
+
+
+def _qos(node: Node) -> Node:
+    return _alone("profile", node) if isinstance(node, ScalarNode) else node
+
+
+def _without_depth(qos: Node) -> Node:
+    if not isinstance(qos, MappingNode):
+        return qos
+    return replace(qos, entries={key: entry for key, entry in qos.entries.items() if key != "depth"})
+
+
+def _alone(key: str, node: ScalarNode) -> MappingNode:
+    return MappingNode(node.span, {key: Entry(_key(key, node.span), node)}, node.broken)
+
+
+def _key(text: str, span: SourceSpan) -> ScalarNode:
+    return ScalarNode(span, text, text, TextPlace(span))
+
+
+def _with(node: Node, defaults: Entries) -> Node:
+    """The node, if it is a mapping, with the entries of `defaults` that it lacks."""
+    return replace(node, entries={**defaults, **node.entries}) if isinstance(node, MappingNode) and defaults else node
+
+
+def _changed(node: NodeT, key: str, change: Callable[[Node], Node]) -> NodeT:
+    """The node, if it is a mapping, with what stands under one key changed."""
+    if not isinstance(node, MappingNode) or key not in node.entries:
+        return node
+    entry = node.entries[key]
+    return replace(node, entries={**node.entries, key: replace(entry, value=change(entry.value))})
+
+
+def _each_value(node: Node, change: Callable[[Node], Node]) -> Node:
+    if not isinstance(node, MappingNode):
+        return node
+    entries = {key: replace(entry, value=change(entry.value)) for key, entry in node.entries.items()}
+    return replace(node, entries=entries)
+
+
+def _one_or_each(node: Node, change: Callable[[Node], Node]) -> Node:
+    return replace(node, items=tuple(map(change, node.items))) if isinstance(node, SequenceNode) else change(node)
+
+
+def _valid_entries(node: MappingNode) -> Entries:
+    return {key: entry for key, entry in node.entries.items() if is_valid(entry.key) and is_valid(entry.value)}
