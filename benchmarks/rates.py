@@ -1,10 +1,11 @@
-"""What `max_rate` and `budget` let through over ten seconds, at several input rates.
+"""What `max_rate` and `bandwidth` let through over ten seconds, at several input rates.
 
     python -m benchmarks.rates --seconds 10
 
-One stream goes to three destinations: to two of them at most 30 times a second (`on_limit: first` and `on_limit: latest`), to
-the third with a budget. Each input rate has a router of its own. Exits 1 if a rate was missed by more than
-1 Hz, or a budget overdrawn, or not used up while there was enough to send. All on the loopback interface.
+One stream goes to three destinations: to two of them at most 30 times a second (`on_limit: first` and
+`on_limit: latest`), to the third with a bandwidth. Each input rate has a router of its own.
+Exits 1 if a rate was missed by more than 1 Hz, or a bandwidth overdrawn, or not used up while there was enough to send.
+All on the loopback interface.
 """
 
 from __future__ import annotations

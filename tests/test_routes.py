@@ -70,18 +70,18 @@ def rover() -> Program:
 
 def depths(table: RouteTable) -> dict[str, tuple[str, int | None]]:
     return {
-        topic.topic.value: (topic.type.value, topic.queue_depth.value if topic.queue_depth else None)
+        topic.topic.value: (topic.type_name, topic.queue_depth.value if topic.queue_depth else None)
         for route in table.routes
-        for topic in route.topics
+        for topic in route.all_topics
     }
 
 
 def flow(route: Route) -> tuple[set[str], set[str], bool]:
     """Sources, destinations, and whether ROS hears of it."""
     return (
-        {source.value for source in route.sources},
+        {source.value for source in route.sources} or {"ros"},
         {destination.endpoint.value for destination in route.destinations},
-        bool(route.topics) and not route.is_outbound,
+        bool(route.topics),
     )
 
 
@@ -100,7 +100,7 @@ def test_rover_table_keeps_the_existing_topics_and_names_the_others_after_their_
     topics = depths(rover.table)
     assert topics.items() >= EXISTING_TOPICS.items()
     for route in rover.table.routes:
-        plain = [topic.topic.value for topic in route.topics if topic.type.value.startswith("comms/")]
+        plain = [topic.topic.value for topic in route.all_topics if topic.type_name.startswith("comms/")]
         assert len(plain) == 1
         named = route.case.value + "s" * (route.for_each is not None)
         assert plain[0] == named or plain[0] in EXISTING_TOPICS

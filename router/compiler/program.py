@@ -66,8 +66,8 @@ class TargetPlan:
     """A target of a generated function: `label` in metrics, `identifier` in the names that the function calls.
 
     `is_deferred` says that it may be served later and by another thread: it has `on_limit: latest`, or its
-    endpoint has a bandwidth. `deadmen` are the routes whose deadmen each command to it feeds (its own route's) or disarms.
-    It holds no positions of the table, since the engine keeps state by it from one table to the next.
+    endpoint has a bandwidth. `deadmen` are the routes whose deadmen each command to it feeds (its own route's) or
+    disarms. It holds no positions of the table, since the engine keeps state by it from one table to the next.
     """
 
     identifier: str

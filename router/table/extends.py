@@ -1,9 +1,9 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
 Mappings merge key by key, everything else replaces. These mappings replace as well: a route or gateway that one of the
-two files ignores, a route that takes topics where the other takes datagrams, a deadman that one of them says there is none of, the payload that a deadman sends, and the transport
-of a gateway. `topic` and `topics` of a route replace each other. Every node keeps the span of the file where it was
-written.
+two files ignores, a route from topics one from endpoints, a deadman that one of the files says there is none of, the
+payload that a deadman sends, and the transport of a gateway. `topic` and `topics` of a route replace each other. Every
+node keeps the span of the file where it was written.
 """
 
 from __future__ import annotations

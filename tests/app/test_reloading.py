@@ -389,7 +389,8 @@ def client_count(router: Router) -> int:
 
 
 def test_what_was_held_back_goes_before_what_comes_after_a_reload(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    held = "  ph_info: {{source: sensor_board, destinations: [{{endpoint: basestation, on_limit: latest, max_rate: {}}}]}}\n"
+    to = "{{endpoint: basestation, on_limit: latest, max_rate: {}}}"
+    held = f"  ph_info: {{{{source: sensor_board, destinations: [{to}]}}}}\n"
     with site.router(held.format(0.001)) as router:
         site.send(*map(numbered, range(2)))
         wait_until(lambda: router.total("datagrams_received") >= 2)

@@ -16,7 +16,11 @@ SPAN = SourceSpan("table.yaml")
 
 def topic(name: str = "a", depth: int | None = None, qos: Qos | None = None) -> Topic:
     return Topic(
-        Located(name, SPAN), Located("std_msgs/msg/Bool", SPAN), SPAN, Located(depth, SPAN) if depth else None, qos
+        topic=Located(name, SPAN),
+        span=SPAN,
+        type=Located("std_msgs/msg/Bool", SPAN),
+        queue_depth=Located(depth, SPAN) if depth else None,
+        qos=qos,
     )
 
 

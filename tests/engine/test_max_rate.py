@@ -1,4 +1,4 @@
-"""`max_rate` is right on average, without bursts, and forgives jitter; `on_limit: latest` delivers the newest in time."""
+"""`max_rate` is right on average, without bursts, and forgives jitter; `on_limit: latest` sends the newest in time."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ MS = 1_000_000
 class Link:
     """A pacer and what it sent: when, and which datagram. Each is a target of its own, so its fate is known."""
 
-    def __init__(self, bandwidth: int) -> None:
+    def __init__(self, budget: int) -> None:
         self.now = 0
         self.sent: list[tuple[int, int]] = []
         self.bytes_sent = 0
@@ -63,7 +63,7 @@ class Link:
 # ---- the rate
 
 
-def measured(bandwidth: int, size: int, hertz: float, priority: Priority, late: int) -> int:
+def measured(budget: int, size: int, hertz: float, priority: Priority, late: int) -> int:
     """The bytes that were sent in 10 s."""
     sent = 0
 
@@ -96,7 +96,7 @@ def measured(bandwidth: int, size: int, hertz: float, priority: Priority, late: 
     ],
 )
 def test_over_ten_seconds_the_budget_is_kept_and_used_up(
-    bandwidth: int, size: int, load: float, priority: Priority
+    budget: int, size: int, load: float, priority: Priority
 ) -> None:
     hertz = budget * load / size
     sent = measured(budget, size, hertz, priority, late=0)
@@ -237,7 +237,7 @@ class Waiting(NamedTuple):
 
 
 @given(st.integers(1000, 200_000), st.lists(offers, max_size=40))
-def test_the_rules_hold_at_every_step(bandwidth: int, messages: list[tuple[int, int, int | None, int]]) -> None:
+def test_the_rules_hold_at_every_step(budget: int, messages: list[tuple[int, int, int | None, int]]) -> None:
     link, waiting = Link(budget), list[Waiting]()
     for rank, size, fresh_for, pause in messages:
         expires = None if fresh_for is None else link.now + fresh_for
@@ -254,7 +254,7 @@ def test_the_rules_hold_at_every_step(bandwidth: int, messages: list[tuple[int, 
 
 @given(st.integers(1000, 200_000), st.lists(offers, max_size=40))
 def test_a_command_never_waits_for_anything_but_commands(
-    bandwidth: int, messages: list[tuple[int, int, int | None, int]]
+    budget: int, messages: list[tuple[int, int, int | None, int]]
 ) -> None:
     """`overdrawn` is what commands alone owe, in ns."""
     link, overdrawn, counted_at = Link(budget), 0, 0
@@ -282,7 +282,7 @@ def test_a_command_never_waits_for_anything_but_commands(
 
 @given(st.integers(1000, 200_000), st.lists(offers, max_size=40))
 def test_in_no_time_goes_more_than_the_budget_and_what_was_saved_up_before(
-    bandwidth: int, messages: list[tuple[int, int, int | None, int]]
+    budget: int, messages: list[tuple[int, int, int | None, int]]
 ) -> None:
     """Without commands, which may overdraw it."""
     link, sizes = Link(budget), []
@@ -299,7 +299,7 @@ def test_in_no_time_goes_more_than_the_budget_and_what_was_saved_up_before(
 
 @given(st.integers(1000, 200_000), st.integers(10, MAX_DATAGRAM // 2), st.integers(10, 500), st.integers(5, 90))
 def test_nothing_starves_as_long_as_what_goes_before_it_leaves_some_budget(
-    bandwidth: int, size: int, small: int, percent: int
+    budget: int, size: int, small: int, percent: int
 ) -> None:
     link = Link(budget)
     bulk = link.offer(BULK, size)

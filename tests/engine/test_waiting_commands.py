@@ -21,7 +21,7 @@ PACED = f"""\
       ttl: 200ms
       {DEADMAN}, disarmed_by: [pump_info]}}
   ph_info: {{source: sensor_board, destinations: [far_board], priority: bulk, deadman: {{none: no command at all}}}}
-  pump_info: {{source: sensor_board, destinations: [far_board], ttl: 200ms, deadman: {{none: large commands of another source}}}}
+  pump_info: {{source: sensor_board, destinations: [far_board], ttl: 200ms, deadman: {{none: large commands}}}}
 """
 HELD = f"""\
   manual_drive:

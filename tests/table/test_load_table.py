@@ -49,7 +49,8 @@ def test_routes_are_typed(table: RouteTable) -> None:
 ROUTES = {
     "imu_info": {
         "name": "imu_info", "case": "imu_info", "source": "sensor_board", "destinations.0.endpoint": "basestation",
-        "destinations.0.on_limit": "first", "destinations.1.endpoint": "basestation", "destinations.1.when": "accel_x > 1",
+        "destinations.0.on_limit": "first", "destinations.1.endpoint": "basestation",
+        "destinations.1.when": "accel_x > 1",
         "destinations.1.max_rate": "30 Hz", "destinations.1.on_limit": "first", "topics.0.topic": "imu_data",
         "topics.0.type": "comms/msg/ImuSensorInformation", "topics.0.queue_depth": "10", "topics.0.on_limit": "first",
         "topics.0.fields": "{auto}", "topics.1.topic": "imu/data_raw", "topics.1.type": "sensor_msgs/msg/Imu",
@@ -68,7 +69,8 @@ ROUTES = {
     },
     "manual_drive": {
         "name": "manual_drive", "case": "manual_drive", "source": "basestation",
-        "destinations.0.endpoint": "sensor_board", "destinations.0.max_rate": "20 Hz", "destinations.0.on_limit": "latest",
+        "destinations.0.endpoint": "sensor_board", "destinations.0.max_rate": "20 Hz",
+        "destinations.0.on_limit": "latest",
         "priority": "command", "ttl": "200 ms", "deadman.timeout": "300 ms", "deadman.repeat": "100 ms",
         "deadman.at_start": "send", "deadman.case": "manual_brake",
         "deadman.fields": "{brake: true, by.who: 'router'}", "deadman.to": "sensor_board, basestation",

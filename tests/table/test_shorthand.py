@@ -36,8 +36,8 @@ def table(folder: Path, routes: str, defaults: str = "{}") -> RouteTable:
         ),
         (
             "{source: base, destinations: [arm, base], deadman: {timeout: 1s, send: {x: {}}, disarmed_by: y}}",
-            "{source: base, destinations: [arm, base],"
-            " deadman: {timeout: 1s, send: {x: {}}, to: [arm, base], disarmed_by: [y]}}",
+            "{source: base, destinations: [arm, base], "
+            + "deadman: {timeout: 1s, send: {x: {}}, to: [arm, base], disarmed_by: [y]}}",
         ),
         (
             "{source: base, destinations: arm, deadman: {timeout: 1s, send: {x: {}}, to: base}}",
