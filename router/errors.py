@@ -103,6 +103,7 @@ class Code(enum.Enum):
     UNKNOWN_ROS_TYPE = ("unknown-ros-type", "No installed package, nor `schemas/`, has this interface.")
     UNKNOWN_FIELD = ("unknown-field", "A field that the source message or the target does not have.")
     UNKNOWN_ENUM_VALUE = ("unknown-enum-value", "An enum, or a ROS type's constants, have no such name.")
+    MISSING_ENUM_VALUE = ("missing-enum-value", "A `map` without `else` that leaves out values.")
     QOS_CONFLICT = (
         "qos-conflict",
         "QoS settings that contradict each other, or that keep publisher and subscriber apart.",

@@ -5,8 +5,9 @@ Every entry that is wrong is a finding, and the rest of the mapping is still che
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Union
 
 from router.compiler.conversion import convert, same_named, unset
@@ -14,7 +15,7 @@ from router.compiler.expressions import ExpressionError, Scope, Typed, check
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
 from router.table.model import Expression, FieldEntry, FieldMap
-from router.types.model import Field, MessageType, Type
+from router.types.model import Field, MessageType, String, Type
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,20 @@ class FieldMapping:
     plan: Record
     rows: list[Row] = field(default_factory=list)
     findings: list[Diagnostic] = field(default_factory=list)
+
+
+TEXT = "text"
+
+
+def _in_long(entry: FieldEntry, target: MessageType) -> FieldEntry:
+    """The entry, or for `{text: imu_link}` of a string one with the literal."""
+    holder: Type | None = target
+    for name in entry.path[:-1]:
+        member = holder.field(name) if isinstance(holder, MessageType) else None
+        holder = member.type if member else None
+    if not isinstance(holder, String) or entry.path[-1] != TEXT or entry.value.items or entry.value.choices:
+        return entry
+    return FieldEntry(entry.path[:-1], entry.path_spans[:-1], replace(entry.value, literal=True))
 
 
 @dataclass(slots=True)
@@ -120,7 +135,7 @@ class _Builder:
     def sort(self, entries: Sequence[FieldEntry], target: MessageType) -> _Branch:
         """The entries by field. Unknown fields and fields that are given twice are reported and left out."""
         root = _Branch(target)
-        for entry in entries:
+        for entry in map(functools.partial(_in_long, target=target), entries):
             if holders := self._holders(entry, target):
                 self._insert(root, entry, holders)
         return root
@@ -202,6 +217,8 @@ class _Builder:
 
 def _text(expression: Expression) -> str:
     """An expression as the table has it, on one line."""
+    if expression.choices is not None or expression.literal:
+        return str(expression)
     if expression.items is not None:
         return f"[{', '.join(map(_text, expression.items))}]"
     return " ".join(expression.text.split())

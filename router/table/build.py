@@ -21,6 +21,7 @@ from router.table.addresses import LOCAL, REMOTE, Address, parse_local
 from router.table.keys import Key, keys_of
 from router.table.model import (
     ROS,
+    Choices,
     Deadman,
     Destination,
     Endpoint,
@@ -372,8 +373,33 @@ def _with_timeout(deadman: Entry) -> MappingNode:
     return settings
 
 
-def _expression(node: Node, _: SourceSpan) -> Expression:
-    """A scalar as it was written, or a list of expressions."""
+MAP, ELSE = "map", "else"
+
+
+def _is_choice(node: MappingNode) -> bool:
+    """Whether a mapping under a field chooses its value, rather than fill a message field by field."""
+    return isinstance(node.get(MAP), ScalarNode)
+
+
+def _choices(node: MappingNode, span: SourceSpan) -> Expression:
+    values = tuple(
+        (located(entry.key), _expression(entry.value, entry.key.span))
+        for name, entry in node.entries.items()
+        if name not in (MAP, ELSE)
+    )
+    otherwise = node.entries.get(ELSE)
+    chosen = Choices(
+        _expression(node.entries[MAP].value, span),
+        values,
+        _expression(otherwise.value, otherwise.key.span) if otherwise else None,
+    )
+    return Expression("", TextPlace(node.entries[MAP].key.span), choices=chosen)
+
+
+def _expression(node: Node, span: SourceSpan) -> Expression:
+    """A scalar as it was written, a list of expressions, or a choice."""
+    if isinstance(node, MappingNode):
+        return _choices(node, span)
     if isinstance(node, SequenceNode):
         return Expression("", TextPlace(node.span), tuple(_expression(item, item.span) for item in node.items))
     found = scalar(node)
@@ -398,7 +424,7 @@ def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[Sour
     for name, entry in fields.entries.items():
         inner = (*path, *name.split("."))
         inner_spans = (*spans, *_part_spans(entry.key))
-        if isinstance(entry.value, MappingNode):
+        if isinstance(entry.value, MappingNode) and not _is_choice(entry.value):
             yield from _field_entries(entry.value, inner, inner_spans)
         else:
             yield FieldEntry(inner, inner_spans, _expression(entry.value, entry.key.span))

@@ -159,19 +159,40 @@ class RecordSettings:
 class Expression:
     """The text of an expression, not yet parsed.
 
-    `place` tells where each character of it stands. A YAML sequence becomes `items`, with empty text.
+    `place` tells where each character of it stands. A YAML sequence becomes `items`, a mapping with the key `map`
+    becomes `choices`; both have empty text. `literal` text stands for itself.
     """
 
     text: str
     place: TextPlace
     items: tuple[Expression, ...] | None = None
+    choices: Choices | None = None
+    literal: bool = False
 
     @property
     def span(self) -> SourceSpan:
         return self.place.whole
 
     def __str__(self) -> str:
+        if self.choices is not None:
+            return str(self.choices)
+        if self.literal:
+            return repr(self.text)
         return self.text if self.items is None else f"[{', '.join(map(str, self.items))}]"
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """`{map: fix_quality, GPS_FIX: 1, else: 0}`: the value of `subject` chooses among `values`, by its name."""
+
+    subject: Expression
+    values: tuple[tuple[Located[str], Expression], ...]
+    otherwise: Expression | None
+
+    def __str__(self) -> str:
+        parts = [f"map: {self.subject}", *(f"{name.value}: {value}" for name, value in self.values)]
+        parts += [f"else: {self.otherwise}"] if self.otherwise is not None else []
+        return f"{{{', '.join(parts)}}}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,7 +98,10 @@ def _key(text: str, span: SourceSpan) -> ScalarNode:
 
 def _with(node: Node, defaults: Entries) -> Node:
     """The node, if it is a mapping, with the entries of `defaults` that it lacks."""
-    return replace(node, entries={**defaults, **node.entries}) if isinstance(node, MappingNode) and defaults else node
+    if not isinstance(node, MappingNode) or not defaults:
+        return node
+    missing = {key: entry for key, entry in defaults.items() if key not in node.entries}
+    return replace(node, entries={**node.entries, **missing})  # its own ones first: they are its place in the file
 
 
 def _changed(node: NodeT, key: str, change: Callable[[Node], Node]) -> NodeT:

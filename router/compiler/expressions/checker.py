@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import ast
+import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from router.compiler.expressions import operators
 from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE, Function
@@ -13,12 +14,17 @@ from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import MESSAGE, SOURCE, ExpressionError, Scope, Typed
 from router.compiler.expressions.syntax import Parsed, dotted, forbidden
 from router.compiler.source import attribute, call, load
-from router.errors import Code, SourceSpan, did_you_mean, nearest
-from router.table.model import Expression
+from router.errors import Code, Located, SourceSpan, did_you_mean, nearest
+from router.table.model import Choices, Expression
+from router.table.nodes import TextPlace
 from router.types.model import Enum, Int, List, MessageType, String, Type
 
 DEEPEST = 60
 """How deep an expression may nest, since Python's and our functions on syntax trees are recursive."""
+
+
+MOST_CHOICES = 100
+"""Values of a map, which nests as deep."""
 
 
 def check(expression: Expression, scope: Scope, expected: Type | None = None) -> Typed:
@@ -27,7 +33,11 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
     `expected` is the type of the field to be filled: clamp() and wrap() take their bounds from it, bare names are
     looked up among the values of an enum.
     """
-    if expression.items is not None:
+    if expression.literal:
+        typed = constant(expression.text, expression.span)
+    elif expression.choices is not None:
+        typed = _chosen(expression.choices, expression.span, scope, expected)
+    elif expression.items is not None:
         items = [check(item, scope, _element(expected)) for item in expression.items]
         typed = operators.list_of(items, expression.span)
     else:
@@ -36,6 +46,66 @@ def check(expression: Expression, scope: Scope, expected: Type | None = None) ->
     if typed.path is None:
         scope.reads.need_objects(typed.node)
     return typed
+
+
+def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | None) -> Typed:
+    """A chain of comparisons with the value of the subject.
+
+    Without `else`, the last value is for itself alone: any other one is refused at run time.
+    """
+    if len(choices.values) > MOST_CHOICES:
+        raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"a map has at most {MOST_CHOICES} values")
+    subject = check(choices.subject, scope)
+    keys = [_key(name, subject, scope) for name, _ in choices.values]
+    values = [check(value, scope, expected) for _, value in choices.values]
+    if choices.otherwise is not None:
+        made = check(choices.otherwise, scope, expected)
+    else:
+        _want_all(choices, subject, span)
+        made, last = values[-1], keys[-1]
+        if isinstance(subject.kind, EnumKind):
+            fitted = call("fit", copy.deepcopy(subject.node), copy.deepcopy(last.node), copy.deepcopy(last.node))
+            keys[-1] = Typed.at(last.span, last.kind, fitted)
+    for (name, _), key, value in reversed(list(zip(choices.values, keys, values, strict=True))):
+        test = operators.comparison([ast.Eq()], [replace(subject, node=copy.deepcopy(subject.node)), key], name.span)
+        made = operators.choice(test, value, replace(made, node=copy.deepcopy(made.node)), value.span)
+    return replace(made, span=span)
+
+
+def _key(name: Located[str], subject: Typed, scope: Scope) -> Typed:
+    """The value that a key of a map stands for: a name of the subject's enum, or a constant."""
+    if isinstance(subject.kind, EnumKind):
+        values = dict(subject.kind.enum.values)
+        if name.value in values:
+            return Typed.at(name.span, subject.kind, ast.Constant(values[name.value]))
+        message = f"'{subject.kind.enum.name}' has no value '{name.value}'"
+        raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, did_you_mean(name.value, values))
+    if isinstance(subject.kind, StringKind):
+        return Typed.at(name.span, StringKind(), ast.Constant(name.value))
+    if name.value in scope.message.constants:
+        return constant(scope.message.constants[name.value], name.span)
+    key = check(Expression(name.value, TextPlace(name.span)), scope)
+    if key.constant is None:
+        message = f"'{name.value}' is no constant"
+        raise ExpressionError(name.span, Code.TYPE_MISMATCH, message, "the keys of a map are values, not fields")
+    return key
+
+
+def _want_all(choices: Choices, subject: Typed, span: SourceSpan) -> None:
+    """Refuse a map without `else` that leaves out values, or whose subject has no list of them."""
+    hint = "list them, or say what they become: `else: VALUE`"
+    if isinstance(subject.kind, BoolKind) and {name.value for name, _ in choices.values} >= {"true", "false"}:
+        return
+    if not isinstance(subject.kind, EnumKind):
+        message = f"a {subject.kind} has more values than those of this map"
+        raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, hint)
+    listed = {name.value for name, _ in choices.values}
+    numbers = dict(subject.kind.enum.values)
+    covered = {numbers[name] for name in listed}
+    missing = [name for name, number in subject.kind.enum.values if number not in covered]
+    if missing:
+        names = ", ".join(missing)
+        raise ExpressionError(span, Code.MISSING_ENUM_VALUE, f"the map has no value for {names}", hint)
 
 
 def _element(expected: Type | None) -> Type | None:
@@ -138,8 +208,9 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
     if text.lower() in NOT_FINITE:
         known = [text.lower()]
     hint = _of_an_enum(text, scope) or did_you_mean(text, known) or "only constants can stand here"
-    if isinstance(expected, String) and not nearest(text, known):
-        hint = f"text has quotes of its own: \"'{text}'\""
+    if isinstance(expected, String):
+        close = nearest(text, known)
+        hint = (f"did you mean the field '{close}'? " if close else "") + f"as text it is {{text: {text}}}"
     return ExpressionError(span, Code.UNKNOWN_FIELD, f"{scope.message} has no field '{text}'", hint)
 
 
