@@ -17,12 +17,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from demo.expected import page_of
+from demo.expected import checked_table, page_of
 from demo.places import taken_places
 from demo.processes import TABLE, Demo, DemoError
 from demo.verdict import Finding
 from router.errors import RouterError
-from router.table import read_table
 from router.table.addresses import Address
 from router.table.model import RouteTable
 
@@ -83,12 +82,12 @@ def main() -> int:
     console = Console()
     console.print(f"Starting router, simulated rover and two ROS 2 nodes on {TABLE} ...", highlight=False)
     try:
-        table = read_table(TABLE)
+        table = checked_table(TABLE)
         findings = play(console, table)
     except RouterError as error:
         console.print(f"The demo cannot run: {error}", style="red", highlight=False, markup=False)
         return 1
-    pages = {"what flows where": table.metrics.value if table.metrics else None, "ROS topics": page_of(table)}
+    pages = {"what flows where": table.http.value if table.http else None, "ROS topics": page_of(table)}
     return tell(console, findings, pages)
 
 

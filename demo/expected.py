@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from router.compiler.check import check_table
 from router.compiler.topics import resolved
+from router.errors import TableError
 from router.table.addresses import Address
 from router.table.model import EndpointKind, GatewayFormat, Route, RouteTable, Transport
 
@@ -10,9 +14,17 @@ LOST, FOUND = 5.0, 8.0
 """Seconds after the simulator's start at which the link to all basestations is lost and found again."""
 
 
+def checked_table(path: Path) -> RouteTable:
+    """The table with the types of all topics. Raises TableError if it has errors."""
+    checked = check_table(path)
+    if checked.table is None or checked.has_errors:
+        raise TableError(checked.diagnostics)
+    return checked.table
+
+
 def active_routes(table: RouteTable) -> list[Route]:
     """All that carry something."""
-    return [route for route in table.routes if route.sources]
+    return [route for route in table.routes if route.ignore is None]
 
 
 def inbound_topics(table: RouteTable) -> dict[str, str]:
@@ -32,12 +44,12 @@ def command_topics(table: RouteTable) -> set[str]:
         topic.topic.value
         for route in active_routes(table)
         if route.is_outbound and any(destination.endpoint.value in boards for destination in route.destinations)
-        for topic in route.topics
+        for topic in route.source_topics
     }
 
 
 def _topics(routes: list[Route]) -> dict[str, str]:
-    return {topic.topic.value: topic.type.value for route in routes for topic in route.topics}
+    return {topic.topic.value: topic.type_name for route in routes for topic in route.all_topics}
 
 
 def page_of(table: RouteTable) -> Address | None:

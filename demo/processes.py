@@ -46,7 +46,7 @@ class Demo:
     """The four processes and what they say. Router and ROS listener start first, the others when those are up."""
 
     def __init__(self, table: RouteTable) -> None:
-        if table.metrics is None:
+        if table.http is None:
             raise DemoError(f"{TABLE} has no metrics address, and the demo reads its rates there")
         self._url = url_of(table)
         self._table = table

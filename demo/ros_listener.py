@@ -18,9 +18,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
-from demo.expected import inbound_topics
+from demo.expected import checked_table, inbound_topics
 from demo.ros_messages import message_class
-from router.table import read_table
 
 REPORT_INTERVAL = 0.5
 """Seconds."""
@@ -57,7 +56,7 @@ class Listener:
 
 
 def main() -> int:
-    table = read_table(Path(sys.argv[1]))
+    table = checked_table(Path(sys.argv[1]))
     rclpy.init()
     node = rclpy.create_node("demo_listener", namespace=table.node.namespace)
     listener = Listener(node, inbound_topics(table))

@@ -18,9 +18,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from demo.expected import command_topics, outbound_topics
+from demo.expected import checked_table, command_topics, outbound_topics
 from demo.ros_messages import filled, message_class
-from router.table import read_table
 
 INTERVAL = 0.1
 """Seconds."""
@@ -46,7 +45,7 @@ def talk(node: Node, topics: dict[str, str], commands: set[str], ended: threadin
 
 
 def main() -> int:
-    table = read_table(Path(sys.argv[1]))
+    table = checked_table(Path(sys.argv[1]))
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # which would end ROS between two publishers

@@ -74,7 +74,7 @@ class _Terminal:
         def on_ros(row: RouteRow) -> Text:
             """The slowest topic of the route counts: each shall get every message."""
             route = self._routes.get(row.route)  # none is that of a gateway
-            topics = () if route is None or route.is_outbound else route.topics
+            topics = () if route is None else route.topics
             return _count([topic_count(heard, topic.topic.value) for topic in topics])
 
         def on_udp(row: RouteRow) -> Text:

@@ -141,7 +141,7 @@ def test_a_browser_finds_the_rover_and_can_only_move_a_simulated_one(rover: Prog
     assert tried.address is not None
     assert tried.address.value.host == "127.0.0.1"
     assert tried.address.value.port < EPHEMERAL
-    commanded = {topic.topic.value for route in rover.table.routes if route.is_outbound for topic in route.topics}
+    commanded = {topic.topic.value for route in rover.table.routes for topic in route.source_topics}
     for inbound in tried.inbound:
         assert inbound.topic.topic.value in commanded
         assert inbound.ttl is not None

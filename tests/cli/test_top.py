@@ -54,7 +54,7 @@ def test_the_address_is_that_of_the_table(
 ) -> None:
     table = tmp_path / "table.yaml"
     address = served.removeprefix("http://")
-    table.write_text(f"version: 1\nextends: {BASE}\nmetrics: {{address: {address}}}\n{more}")
+    table.write_text(f"version: 1\nextends: {BASE}\nhttp: {{address: {address}}}\n{more}")
     assert main(["top", str(table), "--once", "--interval", "0.01"]) == OK
     assert "imu_info" in capsys.readouterr().out
 

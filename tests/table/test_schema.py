@@ -58,8 +58,8 @@ def test_every_key_has_a_title_and_a_description() -> None:
 def test_mappings_with_known_keys_refuse_others() -> None:
     closed = [
         schema
-        for schema in table_schema()["definitions"].values()
-        if isinstance(schema, dict) and schema.get("type") == "object" and "properties" in schema
+        for name, schema in table_schema()["definitions"].items()
+        if name != "choice" and isinstance(schema, dict) and schema.get("type") == "object" and "properties" in schema
     ]
     assert closed
     assert all(schema["additionalProperties"] is False for schema in [table_schema(), *closed])

@@ -21,6 +21,9 @@ def table(folder: Path, routes: str, defaults: str = "{}") -> RouteTable:
     return good(folder, f"{head}{ENDPOINTS}defaults: {defaults}\nroutes:\n{routes}")
 
 
+TO_BOTH = "{timeout: 1s, send: {x: {}}, to: [arm, base], disarmed_by: [y]}"
+
+
 @pytest.mark.parametrize(
     ("short", "long"),
     [
@@ -36,8 +39,7 @@ def table(folder: Path, routes: str, defaults: str = "{}") -> RouteTable:
         ),
         (
             "{source: base, destinations: [arm, base], deadman: {timeout: 1s, send: {x: {}}, disarmed_by: y}}",
-            "{source: base, destinations: [arm, base], "
-            + "deadman: {timeout: 1s, send: {x: {}}, to: [arm, base], disarmed_by: [y]}}",
+            "{source: base, destinations: [arm, base], deadman: " + TO_BOTH + "}",
         ),
         (
             "{source: base, destinations: arm, deadman: {timeout: 1s, send: {x: {}}, to: base}}",

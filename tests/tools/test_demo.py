@@ -18,6 +18,7 @@ from demo.expected import (
     FOUND,
     LOST,
     basestations,
+    checked_table,
     command_topics,
     expected_arrivals,
     halted_boards,
@@ -83,7 +84,7 @@ def all_shown(table: RouteTable) -> Shown:
 
 @pytest.fixture(scope="module")
 def sim_table() -> RouteTable:
-    return read_table(ROUTES / "sim.yaml")
+    return checked_table(ROUTES / "sim.yaml")
 
 
 def complaints(

@@ -257,7 +257,7 @@ def recorded(table: Path, folder: Path, keep: str) -> Program:
     ("folder", "keep", "grade", "text"),
     [
         ("later", "64MiB", Grade.FINE, "later, with 100 MiB free"),
-        (".", "4GiB", Grade.WARNING, "room for 100 MiB, `keep` says 4096"),
+        (".", "4GiB", Grade.WARNING, "room for 100 MiB, `retention` says 4096"),
         ("file/below", "4GiB", Grade.PROBLEM, "file is a file, and no folder"),
     ],
 )
