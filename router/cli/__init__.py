@@ -15,13 +15,12 @@ import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn, TypeAlias
 
 from router.errors import RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
 
-if TYPE_CHECKING:
-    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 OK = 0
 NETWORK_FAULT = 1

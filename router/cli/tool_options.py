@@ -7,7 +7,8 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 from router.assets import asset
 from router.cli import DEFAULT_TABLE
 from router.errors import TableError, UsageError
-from router.table.units import parse_duration, parse_rate
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
     from router.engine.wire import Wire
     from router.table.model import RouteTable
+    from router.tools.tap import TappedDatagram, TappedMessage
 
 
 TABLE_VARIABLE = "ROUTER_TABLE"
@@ -58,6 +59,28 @@ def named_table(args: argparse.Namespace) -> Path | None:
 def table_if_any(args: argparse.Namespace) -> Path | None:
     """The table that is named, or the default one if it is there."""
     return named_table(args) or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
+
+
+def add_tables(parser: argparse.ArgumentParser, about: str) -> None:
+    """As `add_table`, where several tables, or folders of them, may be the subject."""
+    parser.add_argument("paths", nargs="*", type=Path, metavar="PATH", help=about)
+    add_table(parser)
+
+
+def table_paths(args: argparse.Namespace) -> list[Path]:
+    """What a verb with `add_tables` is about. Raises UsageError."""
+    paths: list[Path] = args.paths
+    if paths and args.table is not None and {path.resolve() for path in paths} != {args.table.resolve()}:
+        raise UsageError(f"the table is {paths[0]} or, by --table, {args.table}; name one")
+    return paths or [table_path(args)]
+
+
+def add_styles(parser: argparse.ArgumentParser) -> None:
+    """How findings are written, as `args.style`: one of router.cli.findings.FORMATS."""
+    styles = parser.add_mutually_exclusive_group()
+    styles.set_defaults(style="text")
+    for style, about in (("json", "for programs"), ("github", "annotations beside the lines of a pull request")):
+        styles.add_argument(f"--{style}", dest="style", action="store_const", const=style, help=about)
 
 
 def add_wire_options(parser: argparse.ArgumentParser) -> None:
@@ -111,13 +134,30 @@ def add_count(parser: argparse.ArgumentParser, about: str = "end after N message
     parser.add_argument("--count", type=whole, metavar="N", help=about)
 
 
+def print_batches(batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace) -> None:
+    """Print until --count or --for is reached; while nothing comes, the batches are empty.
+
+    A batch is written at once: a system call for each line would cost more than the line.
+    """
+    left, until = args.count, time.monotonic() + (args.seconds or math.inf)
+    for batch in batches:
+        if shown := batch[:left]:
+            print("\n".join(each.json(args.hex) if args.json else each.line(args.hex) for each in shown), flush=True)
+        if time.monotonic() >= until or (left is not None and (left := left - len(shown)) == 0):
+            return
+
+
 def seconds(text: str) -> float:
     """`10s`, `500ms` as seconds."""
+    from router.table.units import parse_duration
+
     return _quantity(parse_duration, text) / 1e9
 
 
 def hertz(text: str) -> float:
     """`20Hz` as Hz."""
+    from router.table.units import parse_rate
+
     return _quantity(parse_rate, text)
 
 

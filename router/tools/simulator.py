@@ -71,13 +71,13 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
             raise UsageError(f"nothing is sent that '{silence.name}' could silence; {hint}")
 
 
-def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iterator[Stream]:
+def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[Stream]:
     """The streams of the table's UDP sources, in the order of the table. Raises UsageError for an unknown name."""
     for route in table.routes:
         if route.is_outbound:
             continue
         case = wire.case(route.case.value)
-        rate = RATES.get(case.name, USUAL_RATE) * rate_scale
+        rate = RATES.get(case.name, USUAL_RATE) * speed
         for source in route.sources:
             sender = STRANGER if source.value == ANY else source.value
             if sender != STRANGER and sender not in table.endpoints:
@@ -125,7 +125,7 @@ class Simulator:
         wire: Wire,
         table: RouteTable,
         seed: int,
-        rate_scale: float = 1.0,
+        speed: float = 1.0,
         *,
         deadmen: Sequence[DeadmanPlan] = (),
         silences: Sequence[Silence] = (),
@@ -136,7 +136,7 @@ class Simulator:
         played = boards(wire, table, deadmen, self.statistics.changes.append)
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
-        self._streams = tuple(streams(wire, table, seed, rate_scale))
+        self._streams = tuple(streams(wire, table, seed, speed))
         self._silences = silences
         check_silences(silences, self._streams)
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed) for stream in self._streams]
