@@ -68,6 +68,11 @@ GROUPS = {
 VERBS = {verb: summary for verbs in GROUPS.values() for verb, summary in verbs.items()}
 
 SHELLS = ("bash", "zsh", "fish")
+_OPTIONS = {
+    "--version": "show the version and exit",
+    f"--completion {'|'.join(SHELLS)}": "print what completes verbs and options: eval it where your shell starts",
+}
+_INDENT = " " * 12
 
 
 class _Version(argparse.Action):
@@ -99,14 +104,10 @@ class _Parser(argparse.ArgumentParser):
         for group, verbs in GROUPS.items():
             lines += ["", f"{group}:"]
             for verb, summary in verbs.items():
-                lines += textwrap.wrap(f"  {verb:9} {summary}", width, subsequent_indent=" " * 12)
-        options = {
-            "--version": "show the version and exit",
-            f"--completion {'|'.join(SHELLS)}": "print what completes verbs and options: eval it where your shell starts",
-        }
+                lines += textwrap.wrap(f"  {verb:9} {summary}", width, subsequent_indent=_INDENT)
         lines += ["", *textwrap.wrap("'router VERB --help' has the options of a verb, with examples.", width), ""]
-        for option, summary in options.items():
-            lines += textwrap.wrap(f"  {option}  {summary}", width, subsequent_indent=" " * 12)
+        for option, summary in _OPTIONS.items():
+            lines += [f"  {option}", *textwrap.wrap(summary, width, initial_indent=_INDENT, subsequent_indent=_INDENT)]
         return "\n".join([*lines, ""])
 
 
