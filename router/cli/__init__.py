@@ -15,6 +15,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import NoReturn, TypeAlias
 
 from router.errors import RouterError, TableError, TransportError, UsageError, nearest
@@ -89,9 +90,9 @@ class _Completion(argparse.Action):
     """Prints what a shell has to evaluate so that it completes verbs and options."""
 
     def __call__(self, parser: argparse.ArgumentParser, namespace: object, shell: object, *rest: object) -> None:
-        import argcomplete
+        from argcomplete.shell_integration import shellcode
 
-        print(argcomplete.shellcode(["router"], shell=str(shell)))
+        print(shellcode(["router"], shell=str(shell)))
         parser.exit()
 
 
@@ -181,19 +182,10 @@ def _run(arguments: Sequence[str]) -> int:
     parser.add_argument("--version", action=_Version, nargs=0)
     parser.add_argument("--completion", action=_Completion, choices=SHELLS)
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=argparse.ArgumentParser)
-    completing = "_ARGCOMPLETE" in os.environ
-    chosen = _verb(os.environ.get("COMP_LINE", "").split()[1:] if completing else arguments)
-    module = None
-    for verb, summary in VERBS.items():
-        if verb == chosen:
-            module = importlib.import_module(f"router.cli.{verb}")
-            module.add_parser(subparsers)
-        else:
-            subparsers.add_parser(verb, help=summary)
-    if completing:
-        import argcomplete
-
-        argcomplete.autocomplete(parser)
+    if "_ARGCOMPLETE" in os.environ:
+        _complete(parser, subparsers)
+    chosen = _verb(arguments)
+    module = _add_verbs(subparsers, chosen)
     if chosen is not None and chosen not in VERBS:
         print(f"router: there is no verb '{chosen}'; {_suggestion(chosen, VERBS)}", file=sys.stderr)
         return BAD_USAGE
@@ -221,6 +213,27 @@ def _run(arguments: Sequence[str]) -> int:
             return BAD_USAGE
         return NETWORK_FAULT if isinstance(error, TransportError) else BAD_TABLE
     return code
+
+
+def _add_verbs(subparsers: Subparsers, chosen: str | None) -> ModuleType | None:
+    """Add every verb, the chosen one with its arguments. Return its module."""
+    module = None
+    for verb, summary in VERBS.items():
+        if verb == chosen:
+            module = importlib.import_module(f"router.cli.{verb}")
+            module.add_parser(subparsers)
+        else:
+            subparsers.add_parser(verb, help=summary)
+    return module
+
+
+def _complete(parser: argparse.ArgumentParser, subparsers: Subparsers) -> NoReturn:
+    """Answer a shell that completes what is typed: COMP_LINE."""
+    import argcomplete
+
+    _add_verbs(subparsers, _verb(os.environ.get("COMP_LINE", "").split()[1:]))
+    argcomplete.autocomplete(parser)
+    sys.exit(OK)
 
 
 def _refuse(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:

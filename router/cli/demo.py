@@ -25,9 +25,9 @@ from router.engine.wire import Wire
 from router.log import configure_log
 from router.tools.simulator import Simulator
 
-_DESCRIPTION = """Play the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C. Nothing
-leaves this computer. The first lines say where to look with a browser or Foxglove; 'ros2 topic list' and the other verbs
-look at it as well. Where the rover's ROS messages are not installed, it is the table of 'router init'."""
+_DESCRIPTION = """Play the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
+Nothing leaves this computer. The first lines say where to look with a browser or Foxglove; 'ros2 topic list' and the
+other verbs look at it as well. Where the rover's ROS messages are not installed, it is the table of 'router init'."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

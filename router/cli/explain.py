@@ -20,10 +20,10 @@ from router.compiler.metrics import Counters
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
 
-_DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides,
-and largest sizes; with --code, also the code that the router runs. Of a gateway, show what it sends how often, and what it lets in: with
-a ~ in front each topic that its patterns match, of those that the table names, or with --live of all that there are.
-With --diff, say what one table does otherwise than another, and nothing else."""
+_DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides, and
+largest sizes; with --code, also the code that the router runs. Of a gateway, show what it sends how often, and what
+it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or with --live of
+all that there are. With --diff, say what one table does otherwise than another, and nothing else."""
 _EXAMPLES = (
     "router explain imu_info",
     "router explain imu_info --code",
@@ -49,10 +49,12 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.diff is not None:
-        return _diff(*args.diff)
     if args.seconds is not None and not args.live:
         raise UsageError("--for belongs to --live")
+    return _diff(*args.diff) if args.diff is not None else _explain(args)
+
+
+def _explain(args: argparse.Namespace) -> int:
     path = table_path(args)
     checked = check_table(path)
     print_findings(checked.diagnostics, sys.stderr)

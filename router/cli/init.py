@@ -22,9 +22,9 @@ _ROVER = {
     "protos": "what its boards and basestation send",
     "schemas": "for editors, and 'comms', its ROS messages; colcon builds them (docs/ros.md)",
 }
-_DESCRIPTION = """Write a first table into a folder: one board and one topic, on this computer, with a simulator for the
-board. With --rover, write the rover's own tables, protos and ROS messages instead, to run them and to change them. Where
-there is one of the folders already, nothing is written."""
+_DESCRIPTION = """Write a first table into a folder: one board and one topic, on this computer, with a simulator for
+the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run them and to change
+them. Where there is one of the folders already, nothing is written."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

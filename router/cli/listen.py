@@ -34,8 +34,8 @@ _BELONGS_TO = {
 """Options that only some places have."""
 
 _DESCRIPTION = """Listen at a place and print what comes, one line for each message, until Ctrl-C. Of a gateway, each
-message and schema: compressed and batched packets are understood, and how many there were is said at the end. At a UDP
-port, the payloads of envelopes: the port must be free, so that no router has part in it."""
+message and schema: compressed and batched packets are understood, and how many there were is said at the end. At a
+UDP port, the payloads of envelopes: the port must be free, so that no router has part in it."""
 _PLACES = """places:
   udp://[HOST:]PORT     what a gateway sends to this address of this computer
   tcp://HOST:PORT       a gateway's TCP, connected to again and again

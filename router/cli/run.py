@@ -28,8 +28,8 @@ from router.log import configure_log, logger
 from router.table.model import Gateway, Transport
 from router.tools.udp import reachable
 
-_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router reload').
-SIGUSR1: save the last datagrams, where the table keeps them ('record').
+_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router
+reload'). SIGUSR1: save the last datagrams, where the table keeps them ('record').
 
 Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table has errors or what it names cannot be opened."""
 _PARAMETERS = """The ROS parameter routes_path chooses the table as well. Any other is a variable of the table in lower
@@ -100,7 +100,7 @@ def _log_places(router: Router) -> None:
         width = max(map(len, found), default=0)
         logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
     else:
-        logger.info("where to look", **found)
+        logger.info("where to look", **{name.lower().replace(" ", "_"): place for name, place in found.items()})
 
 
 def _places(router: Router) -> Iterator[tuple[str, str]]:

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from router.types.lock import Conflict
     from router.types.lock_file import Lock
 
-_DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there. A number that is reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written. `--accept` takes such a change when all boards get new firmware; `router validate` prints the command."""
+_DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there. A number that is
+reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written. `--accept` takes such a
+change when all boards get new firmware; `router validate` prints the command."""
 _PROTOS = "folder of .proto files, instead of a table"
 _EXAMPLES = (
     "router schema lock",

@@ -26,9 +26,9 @@ CHANGE_REFRESH = 0.1
 CHANGES_SHOWN = 3
 
 
-_DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Boards obey
-commands, halt for a deadman, and stop when left alone for a second. The endpoints' addresses must be this machine's, as
-they are in routes/sim.yaml."""
+_DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Boards
+obey commands, halt for a deadman, and stop when left alone for a second. The endpoints' addresses must be this
+machine's, as they are in routes/sim.yaml."""
 _EXAMPLES = (
     "router sim -t routes/sim.yaml",
     "router sim -t routes/sim.yaml --silent basestation:5-8    # a lost link",

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 DEGRADED = 3
 
-_DESCRIPTION = f"""Say in one line whether the router of a table runs, and what is wrong with it: a stuck receive thread,
-a reload that failed, boards that are silent, deadmen that send in place of commands.
+_DESCRIPTION = f"""Say in one line whether the router of a table runs, and what is wrong with it: a stuck receive
+thread, a reload that failed, boards that are silent, deadmen that send in place of commands.
 
 Exit code: {OK} it runs and is healthy, {NETWORK_FAULT} none runs, {DEGRADED} it runs and something is wrong,
 {BAD_USAGE} wrong usage. 'router doctor' says what to do about it."""

@@ -17,9 +17,9 @@ from router.cli.tool_options import (
 )
 from router.errors import UsageError
 
-_DESCRIPTION = """Print what a running router receives, before it routes it: the fields that are not default. The router
-is asked where the table's 'metrics.address' says, on this computer; it does not wait for this terminal, and says how
-many datagrams were too many for it. To listen at a port or a ROS topic without a router: 'router listen'."""
+_DESCRIPTION = """Print what a running router receives, before it routes it: the fields that are not default. The
+router is asked where the table's 'metrics.address' says, on this computer; it does not wait for this terminal, and
+says how many datagrams were too many for it. To listen at a port or a ROS topic without a router: 'router listen'."""
 _EXAMPLES = (
     "router tap imu_info gps_info -t routes/sim.yaml",
     "router tap --from arm_board --for 10s",

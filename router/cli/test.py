@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TextIO
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
-from router.cli.findings import excerpt, github_escaped, is_coloured, plural, print_findings, visible
 from router.cli.findings import as_data as finding_data
+from router.cli.findings import excerpt, github_escaped, is_coloured, plural, print_findings, visible
 from router.cli.tool_options import add_styles, add_tables, table_paths
 from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, SourceSpan, TableError, UsageError, shown_path
@@ -26,8 +26,8 @@ _DESCRIPTION = f"""Run the tests of route tables: given this message, the table 
 table stands for the tests beside it, of rover.yaml those in rover.test.yaml; a folder for the *.test.yaml and
 *.test.yml in it (not in folders below it). docs/testing-tables.md has the language.
 
-Exit code: {OK} all passed, {FAILED} a test failed or --coverage found a gap,
-{BAD_TABLE} a test file or its table is wrong, {BAD_USAGE} wrong usage."""
+Exit code: {OK} all passed, {FAILED} a test failed or --coverage found a gap, {BAD_TABLE} a test file or its table is
+wrong, {BAD_USAGE} wrong usage."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -102,13 +102,14 @@ MOST_CHANGES = 100
 
 @dataclass(slots=True)
 class Statistics:
-    """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
+    """Counts since the start. `is_answered`: the table sends something back. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
 
     `unsent` are datagrams that the kernel refused to take. `changes` are those of the boards, the newest last.
     """
 
     sent: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     unsent: int = 0
+    is_answered: bool = True
     inboxes: dict[str, Inbox] = field(default_factory=dict)
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=MOST_CHANGES))
 
@@ -132,7 +133,7 @@ class Simulator:
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nobody receives what boards would send")
-        self.statistics = Statistics()
+        self.statistics = Statistics(is_answered=any(route.destinations for route in table.routes))
         played = boards(wire, table, deadmen, self.statistics.changes.append)
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
