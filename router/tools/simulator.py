@@ -102,7 +102,9 @@ MOST_CHANGES = 100
 
 @dataclass(slots=True)
 class Statistics:
-    """Counts since the start. `is_answered`: the table sends something back. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
+    """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
+
+    `is_answered`: whether the table sends something back.
 
     `unsent` are datagrams that the kernel refused to take. `changes` are those of the boards, the newest last.
     """
