@@ -104,9 +104,8 @@ MOST_CHANGES = 100
 class Statistics:
     """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
 
-    `is_answered`: whether the table sends something back.
-
-    `unsent` are datagrams that the kernel refused to take. `changes` are those of the boards, the newest last.
+    `is_answered`: whether the table sends something back. `unsent` are datagrams that the kernel refused to take.
+    `changes` are those of the boards, the newest last.
     """
 
     sent: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))

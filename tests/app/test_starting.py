@@ -169,7 +169,7 @@ def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
     process = start(MODULE, "run", table)
     wait_for_start(process)
     good = table.read_text()
-    asking = [sys.executable, "-m", "router", "reload", str(table)]
+    asking = [sys.executable, "-m", "router", "reload", "-t", str(table)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
 
     table.write_text(good + "  gps_info: {source: any, destinations: [basestation]}\n")

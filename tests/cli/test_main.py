@@ -33,7 +33,7 @@ def test_every_verb_has_its_module_and_help(verb: str, capsys: pytest.CaptureFix
     assert capsys.readouterr().out.startswith(f"usage: router {verb}")
 
 
-@pytest.mark.parametrize("arguments", [[], ["valdate"], ["validate", "--colour"], ["validate", "--format", "xml"]])
+@pytest.mark.parametrize("arguments", [["validate", "--colour"], ["sim", "--for", "5"]])
 def test_wrong_usage_ends_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main(arguments)
@@ -85,7 +85,7 @@ def test_what_a_verb_raises_becomes_an_exit_code(
 
 
 def test_a_reader_that_leaves_early_is_no_reason_to_complain() -> None:
-    command = [sys.executable, "-m", "router", "validate", "--format", "json", *["nope.yaml"], *map(str, range(3000))]
+    command = [sys.executable, "-m", "router", "validate", "--json", *["nope.yaml"], *map(str, range(3000))]
     process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout
     process.stdout.close()

@@ -145,7 +145,7 @@ def test_a_table_that_extends_another_needs_tests_of_what_it_changes_only(
     table.write_text(f"version: 1\nextends: ../routes/rover.yaml\nroutes:\n  load_cell_info: {{topics: [{topic}]}}\n")
     tests = table.with_name("scale.test.yaml")
     tests.write_text("tests:\n  a: {expect: nothing}\n")
-    assert main(["test", "--coverage", "--format", "json", "routes", "lab"]) == FAILED
+    assert main(["test", "--coverage", "--json", "routes", "lab"]) == FAILED
     inherited, changed = json.loads(capsys.readouterr().out)["coverage"]
     assert inherited["gaps"] == []
     lacking = [(gap["kind"], gap["file"]) for gap in changed["gaps"]]
@@ -160,7 +160,7 @@ def test_a_table_that_extends_another_needs_tests_of_what_it_changes_only(
 
 def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(rover, "pressure_kpa * 1000", "pressure_kpa * 100")
-    assert main(["test", "--coverage", "--format", "json"]) == FAILED
+    assert main(["test", "--coverage", "--json"]) == FAILED
     data = json.loads(capsys.readouterr().out)
     (failed,) = [test for test in data["tests"] if not test["passed"]]
     (failure,) = failed["failures"]
@@ -173,14 +173,14 @@ def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixtur
     assert coverage["gaps"] == []
     assert data["findings"] == []
     change(rover.with_name("rover.test.yaml"), "from: sensor_board", "from: sensor_bord")
-    assert main(["test", "--format", "json"]) == BAD_TABLE
+    assert main(["test", "--json"]) == BAD_TABLE
     (found,) = json.loads(capsys.readouterr().out)["findings"]
     assert found["code"] == "unknown-endpoint"
 
 
 def test_github_shows_failures_beside_the_lines(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(rover, "pressure_kpa * 1000", "pressure_kpa * 100")
-    assert main(["test", "--format", "github"]) == FAILED
+    assert main(["test", "--github"]) == FAILED
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("::error file=routes/rover.test.yaml,line=")
     assert "title=pressure reaches the operator and ROS%2C in pascal" in line

@@ -77,9 +77,9 @@ def test_strict_makes_warnings_errors(routes: Path, capsys: pytest.CaptureFixtur
 
 
 def test_json_is_a_list_of_findings_and_nothing_else(routes: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["validate", "--format", "json"]) == OK
+    assert main(["validate", "--json"]) == OK
     assert json.loads(capsys.readouterr().out) == []
     (routes / "bad.yaml").write_text("a: [")
-    assert main(["validate", "--format", "json"]) == BAD_TABLE
+    assert main(["validate", "--json"]) == BAD_TABLE
     [finding] = json.loads(capsys.readouterr().out)
     assert (finding["file"], finding["code"]) == ("routes/bad.yaml", "bad-yaml")

@@ -181,7 +181,7 @@ def test_the_doctor_names_a_missing_ros_package_once(routed: Router, packages: P
     for name in "AB":
         (share / f"{name}.msg").write_text("float32 x\n")
     (tmp_path / "here" / "table.yaml").write_text(TABLE)
-    found = routed("doctor", "table.yaml", AMENT_PREFIX_PATH=str(tmp_path / "install")).stdout
+    found = routed("doctor", "-t", "table.yaml", AMENT_PREFIX_PATH=str(tmp_path / "install")).stdout
     [problem, remedy] = [line for line in found.splitlines() if "absent_msgs" in line]
     assert problem.startswith("problem  ROS        absent_msgs/msg/A is not installed")
     assert problem.endswith("(there is no Python package 'absent_msgs.msg'); and 1 more of its types")
