@@ -325,6 +325,7 @@ def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
         "-m",
         "router",
         name,
+        "-t",
         str(table),
     ]
     answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)

@@ -185,16 +185,16 @@ def test_a_hand_over_is_told_on_both_sides(table: Path, capsys: pytest.CaptureFi
         "and once when the router starts\n"
         "    disarmed by commands of imu_info\n"
     ) in explained(capsys, table, "arm_ctrl")
-    code = explained(capsys, table, "imu_info")
+    code = explained(capsys, table, "imu_info", "--code")
     assert f"({table}:6:34)\n    disarms the deadman of arm_ctrl\n" in code
     assert re.search(r"send_laptop\(.*, None\)", code)
     assert re.search(r"send_basestation\([^,]*\)", code)
 
 
-def test_without_a_case_all_are_explained_with_the_code_that_runs(
+def test_without_a_case_all_are_explained_and_with_code_also_what_runs(
     table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = explained(capsys, table)
+    out = explained(capsys, table, "--code")
     assert "imu_info: SensorBoardIMUInfo" in out
     assert "\ndef route_imu_info(" in out
     assert "  ignored: not part of this test\n" in out
@@ -373,9 +373,9 @@ def test_live_shows_topics_of_the_network_with_who_publishes_them(
     from tests.ros.peers import Publisher
 
     with closing(Publisher("greeting", "std_msgs/msg/String")):
-        while "~" not in (told := explained(capsys, gateways, "net", "--live", "0.5")):
+        while "~" not in (told := explained(capsys, gateways, "net", "--live", "--for", "500ms")):
             pass
     assert "  ~ /greeting  std_msgs/msg/String of 1  the latest value every 500 ms  by /greeting\n" in told
     assert "/imu_data  comms/msg/ImuSensorInformation, no publisher  " in explained(
-        capsys, gateways, "vr_headset", "--live", "0.1"
+        capsys, gateways, "vr_headset", "--live", "--for", "100ms"
     )

@@ -44,7 +44,7 @@ def gateway() -> Iterator[socket.socket]:
 def listening(*options: str) -> Iterator[tuple[subprocess.Popen[str], tuple[str, int]]]:
     """A process that listens on a free UDP port by now, and where that is."""
     port = free_port()
-    command = [*LISTEN, f"127.0.0.1:{port}", *options]
+    command = [*LISTEN, f"udp://127.0.0.1:{port}", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert process.stderr.readline() == f"listening: udp 127.0.0.1:{port}; Ctrl-C ends it\n"
