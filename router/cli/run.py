@@ -76,7 +76,7 @@ def _table(args: argparse.Namespace, parameter: str | None) -> Path:
     typed: Path | None = args.subject or args.table
     if typed is not None and table_path(args).resolve() != Path(parameter).resolve():
         raise UsageError(f"TABLE is {typed}, {_ROUTES_PATH} is {parameter}; name one table")
-    return Path(parameter)
+    return typed or Path(parameter)
 
 
 def route(program: Program, ros_args: Sequence[str], environ: Mapping[str, str]) -> None:
@@ -85,7 +85,7 @@ def route(program: Program, ros_args: Sequence[str], environ: Mapping[str, str])
     signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
     with Router(program, ["--ros-args", *ros_args], environ) as router:
         tune_interpreter()
-        _log_places(router)
+        _show_places(router)
         with supervised(router.progress, router.feed_watchdog):
             _serve_signals(router, ending)
         for number in ending:
@@ -93,14 +93,13 @@ def route(program: Program, ros_args: Sequence[str], environ: Mapping[str, str])
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)
 
 
-def _log_places(router: Router) -> None:
-    """Say where to look, readably on a terminal."""
+def _show_places(router: Router) -> None:
+    """Say on a terminal where to look; elsewhere the log has the addresses, with "router started"."""
+    if not sys.stderr.isatty():
+        return
     found = dict(_places(router))
-    if sys.stderr.isatty():
-        width = max(map(len, found), default=0)
-        logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
-    else:
-        logger.info("where to look", **{name.lower().replace(" ", "_"): place for name, place in found.items()})
+    width = max(map(len, found), default=0)
+    logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
 
 
 def _places(router: Router) -> Iterator[tuple[str, str]]:
