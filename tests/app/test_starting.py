@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -123,6 +124,23 @@ def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table
     process = start(MODULE, "run", table, "--ros-args", "-p", f"listen_port:={port}")
     assert wait_for_start(process)["listening"] == {"rover": f"127.0.0.1:{port}"}
     end(process)
+
+
+DEADMAN = "    deadman: {timeout: 500ms, send: {ph_info: {}}, to: [basestation]}\n"
+
+
+def test_arguments_that_ros_refuses_end_it_before_deadmen_send(table: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    text = table.read_text() + DEADMAN + TOPIC
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.bind(("127.0.0.1", 0))
+        station.settimeout(0.5)
+        port = station.getsockname()[1]
+        table.write_text(re.sub(r"(basestation: {address: \"127.0.0.1:)\d+", rf"\g<1>{port}", text))
+        code, said = ended("run", table, "--ros-args", "--bad")
+        assert (code, said) == (78, ["router run: the ROS node cannot be created: ['--bad']"])
+        with pytest.raises(TimeoutError):
+            station.recv(100)
 
 
 def test_a_carrier_that_there_is_not_ends_the_start(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
