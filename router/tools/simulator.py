@@ -5,6 +5,7 @@ Each endpoint binds its own address, sends the payload cases of which the table 
 
 from __future__ import annotations
 
+import errno
 import heapq
 import random
 import re
@@ -178,7 +179,12 @@ class Simulator:
         self._senders[endpoint.name] = sender
 
     def _open(self, address: Address, owner: str) -> socket.socket:
-        opened = open_udp(address, owner)
+        try:
+            opened = open_udp(address, owner)
+        except UsageError as error:
+            if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
+                raise UsageError(f"{error}; take a table with addresses of this machine: -t routes/sim.yaml") from error
+            raise
         self._opened.append(opened)
         return opened
 
