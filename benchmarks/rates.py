@@ -98,7 +98,7 @@ def measure(hertz: int, seconds: int, folder: Path) -> dict[str, Arrivals]:
         table.write_text(WITH_BUDGET)
         with RouterProcess(folder, table):
             # A second longer than what is measured.
-            rate = f"--rate {hertz} --count {hertz * (seconds + 1)}"
+            rate = f"--rate {hertz}Hz --count {hertz * (seconds + 1)}"
             words = f"send imu_info {FIELDS} --table {table} --to rover --from {hosts['sensor_board']} {rate}"
             sender = subprocess.Popen(
                 [sys.executable, "-m", "router", *words.split()], cwd=ROOT, stdout=subprocess.DEVNULL

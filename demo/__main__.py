@@ -29,13 +29,12 @@ ROOT = Path(__file__).parent.parent
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 SUCCESS = "It works: boards, basestation and real ROS 2 heard each other, and a lost link stopped the rover."
-NEXT_STEPS = f"""\
+NEXT_STEPS = """\
 Where to look next:
   routes/rover.yaml                      what goes where
   .venv/bin/router validate routes/      what is wrong with it, before driving
   .venv/bin/router explain imu_info      what becomes of one message
-  .venv/bin/router run {TABLE}   all this by hand; in another terminal:
-  .venv/bin/router sim"""
+  .venv/bin/router demo                  boards and router, until Ctrl-C"""
 
 
 def leave(number: int, frame: FrameType | None) -> None:
@@ -69,7 +68,7 @@ def tell(console: Console, findings: list[Finding], pages: Mapping[str, Address 
         console.print(NEXT_STEPS, highlight=False)
         for shows, page in pages.items():
             if page is not None:
-                console.print(f"  {f'http://{page}/':<37}  {shows}, while those two run", highlight=False)
+                console.print(f"  {f'http://{page}/':<37}  {shows}, while that runs", highlight=False)
         return 0
     console.print("\nThe demo failed: see the lines above.", style="bold red")
     return 1

@@ -73,7 +73,7 @@ class Demo:
         self._start("router", "router", "run", str(TABLE))
         self._wait_until_up(listener)
         cut_off = [word for name in basestations(self._table) for word in ("--silent", f"{name}:{LOST}-{FOUND}")]
-        simulator = self._start("simulator", "router", "sim", str(TABLE), "--json", *cut_off)
+        simulator = self._start("simulator", "router", "sim", "-t", str(TABLE), "--json", *cut_off)
         self._wait_until(lambda: bool(simulator.latest), "the simulator did not start")
         talker = self._start("talker", "demo.ros_talker", str(TABLE))
         window = Window()

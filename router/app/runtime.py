@@ -105,6 +105,7 @@ class Runtime:
         with ExitStack() as undo:
             if self._ros is None and _needs_ros(program):
                 check_environment(os.environ)  # before deadmen send, as the start may fail here
+                _check_ros_arguments(program, self._ros_args)
             sockets = self.sockets.prepare(program)
             undo.callback(sockets.opened.close)
             self._context.counts.make_room(program.counters)
@@ -261,6 +262,16 @@ def _needs_ros(program: Program) -> bool:
     return bool(program.publishers or program.subscriptions or program.gateways)
 
 
+def _check_ros_arguments(program: Program, ros_args: Sequence[str]) -> None:
+    """Raises StartError. Without arguments ROS is not loaded for it, which takes a while."""
+    if len(ros_args) > 1:
+        try:
+            from router.ros.node import check_arguments
+        except ImportError as error:
+            raise _missing_ros(program, error) from error
+        check_arguments(ros_args)
+
+
 def _open_ros(
     program: Program,
     ros_args: Sequence[str],
@@ -271,9 +282,12 @@ def _open_ros(
     try:
         from router.ros.router_node import RouterNode
     except ImportError as error:
-        what = f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}"
-        raise StartError(f"{what}; {ros_remedy()}") from error
+        raise _missing_ros(program, error) from error
     return RouterNode(program.table.node, (), (), {}, ros_args, incompatible, subscriber_joined)
+
+
+def _missing_ros(program: Program, error: ImportError) -> StartError:
+    return StartError(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}; {ros_remedy()}")
 
 
 def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:

@@ -1,21 +1,27 @@
 """The command line: which verbs there are. A verb's module is imported once the verb is chosen.
 
-A verb's module offers `add_parser(subparsers)` and `run(args) -> int`.
+A verb's module offers `add_parser(subparsers)`, which calls `add_verb`, and `run(args) -> int`.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
 import importlib
 import io
 import os
+import re
+import shutil
 import sys
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import ModuleType
+from typing import NoReturn, TypeAlias
 
-from router.errors import RouterError, TableError, TransportError, UsageError
+from router.errors import RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 OK = 0
 NETWORK_FAULT = 1
@@ -27,25 +33,47 @@ BROKEN_PIPE = 141
 
 DEFAULT_TABLE = Path("routes/rover.yaml")
 
-VERBS = {
-    "init": "copy the example tables, their protos and their ROS messages into a folder",
-    "run": "run a route table between UDP and ROS 2",
-    "validate": "say what is wrong with route tables",
-    "explain": "show what a route does, field by field, with its code, and what a gateway sends",
-    "graph": "draw what a table routes",
-    "test": "prove what tables do, without network or ROS",
-    "send": "send envelopes with payloads of your choice",
-    "tap": "show what a running router receives, or what arrives on a UDP port or a ROS topic",
-    "top": "watch a running router",
-    "listen": "show what a gateway sends",
-    "record": "record what a running router receives",
-    "replay": "send a recording again, or run it through two tables",
-    "reload": "have a running router take its changed table",
-    "sim": "play the boards and the basestation",
-    "doctor": "look for what keeps a router from working here",
-    "new": "add a message: proto, lock, ROS message, route and test",
-    "schema": "keep the field numbers of the wire types",
+GROUPS = {
+    "Check": {
+        "validate": "say what is wrong with route tables",
+        "test": "prove what tables do, without network or ROS",
+        "explain": "show what a route does, field by field",
+        "graph": "draw what a table routes",
+        "doctor": "look for what keeps a router from working here",
+    },
+    "Run": {
+        "run": "run a route table between UDP and ROS 2",
+        "status": "say in a line whether the router runs and is healthy",
+        "reload": "have the running router take its changed table",
+    },
+    "Watch": {
+        "top": "watch rates, drops and ages of the running router",
+        "tap": "show what the running router receives",
+        "listen": "show what a gateway, a UDP port or a ROS topic carries",
+    },
+    "Record": {
+        "record": "record what the running router receives",
+        "replay": "send a recording again, or run it through two tables",
+    },
+    "Try": {
+        "demo": "play boards and router on this computer until Ctrl-C",
+        "init": "write a first table into a folder",
+        "sim": "play the boards and the basestation of a table",
+        "send": "send envelopes with payloads of your choice",
+    },
+    "Protocol": {
+        "new": "add a message: proto, lock, ROS message, route and test",
+        "schema": "keep the field numbers of the wire types",
+    },
 }
+VERBS = {verb: summary for verbs in GROUPS.values() for verb, summary in verbs.items()}
+
+SHELLS = ("bash", "zsh", "fish")
+_OPTIONS = {
+    "--version": "show the version and exit",
+    f"--completion {'|'.join(SHELLS)}": "print what completes verbs and options: eval it where your shell starts",
+}
+_INDENT = " " * 12
 
 
 class _Version(argparse.Action):
@@ -56,6 +84,57 @@ class _Version(argparse.Action):
 
         print(f"router {version('rover-router')}")
         parser.exit()
+
+
+class _Completion(argparse.Action):
+    """Prints what a shell has to evaluate so that it completes verbs and options."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: object, shell: object, *rest: object) -> None:
+        from argcomplete.shell_integration import shellcode
+
+        print(shellcode(["router"], shell=str(shell)))
+        parser.exit()
+
+
+class _Parser(argparse.ArgumentParser):
+    """The verbs in groups, in place of one long list."""
+
+    def format_help(self) -> str:
+        width = shutil.get_terminal_size().columns - 2
+        lines = ["usage: router VERB ...", "", *textwrap.wrap(self.description or "", width)]
+        for group, verbs in GROUPS.items():
+            lines += ["", f"{group}:"]
+            for verb, summary in verbs.items():
+                lines += textwrap.wrap(f"  {verb:9} {summary}", width, subsequent_indent=_INDENT)
+        lines += ["", *textwrap.wrap("'router VERB --help' has the options of a verb, with examples.", width), ""]
+        for option, summary in _OPTIONS.items():
+            lines += [f"  {option}", *textwrap.wrap(summary, width, initial_indent=_INDENT, subsequent_indent=_INDENT)]
+        return "\n".join([*lines, ""])
+
+
+class _Help(argparse.HelpFormatter):
+    """Fills paragraphs to the terminal's width, except those with indented lines: examples."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n\n".join(
+            part if "\n  " in part else super(_Help, self)._fill_text(part, width, indent)
+            for part in text.strip().split("\n\n")
+        )
+
+
+def add_verb(
+    subparsers: Subparsers, name: str, description: str, *examples: str, more: str = ""
+) -> argparse.ArgumentParser:
+    """Add the parser of a verb (or of an action of one). Its help ends with `more`, then with the examples."""
+    shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
+    return subparsers.add_parser(
+        name,
+        help=VERBS.get(name),
+        description=description,
+        epilog=f"{more}\n\n{shown}",
+        formatter_class=_Help,
+        allow_abbrev=False,
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,7 +166,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _verb(arguments: Sequence[str]) -> str | None:
-    return next((argument for argument in arguments if not argument.startswith("-")), None)
+    """The first argument, unless it is an option: those before a verb do without one."""
+    return arguments[0] if arguments and not arguments[0].startswith("-") else None
 
 
 def _open_what_is_closed() -> None:
@@ -98,26 +178,23 @@ def _open_what_is_closed() -> None:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(
-        prog="router",
-        description="Route messages between protobuf over UDP and ROS 2.",
-        formatter_class=functools.partial(argparse.HelpFormatter, indent_increment=1),  # with 2, long verbs break
-    )
-    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
-    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    parser = _Parser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
+    parser.add_argument("--version", action=_Version, nargs=0)
+    parser.add_argument("--completion", action=_Completion, choices=SHELLS)
+    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=argparse.ArgumentParser)
+    if "_ARGCOMPLETE" in os.environ:
+        _complete(parser, subparsers)
     chosen = _verb(arguments)
-    module = None
-    for verb, summary in VERBS.items():
-        if verb == chosen:
-            module = importlib.import_module(f"router.cli.{verb}")
-            module.add_parser(subparsers)
-        else:
-            subparsers.add_parser(verb, help=summary)
+    module = _add_verbs(subparsers, chosen)
+    if chosen is not None and chosen not in VERBS:
+        print(f"router: there is no verb '{chosen}'; {_suggestion(chosen, VERBS)}", file=sys.stderr)
+        return BAD_USAGE
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
-        subparsers.choices[args.verb].error(f"unrecognized arguments: {' '.join(unknown)}")
+        _refuse(subparsers.choices[chosen] if chosen else parser, unknown)
     if module is None:
-        raise AssertionError("argparse refuses what is no verb")
+        parser.print_help()
+        return OK
     try:
         Path.cwd()
     except FileNotFoundError:
@@ -136,3 +213,37 @@ def _run(arguments: Sequence[str]) -> int:
             return BAD_USAGE
         return NETWORK_FAULT if isinstance(error, TransportError) else BAD_TABLE
     return code
+
+
+def _add_verbs(subparsers: Subparsers, chosen: str | None) -> ModuleType | None:
+    """Add every verb, the chosen one with its arguments. Return its module."""
+    module = None
+    for verb, summary in VERBS.items():
+        if verb == chosen:
+            module = importlib.import_module(f"router.cli.{verb}")
+            module.add_parser(subparsers)
+        else:
+            subparsers.add_parser(verb, help=summary)
+    return module
+
+
+def _complete(parser: argparse.ArgumentParser, subparsers: Subparsers) -> NoReturn:
+    """Answer a shell that completes what is typed: COMP_LINE."""
+    import argcomplete
+
+    _add_verbs(subparsers, _verb(os.environ.get("COMP_LINE", "").split()[1:]))
+    argcomplete.autocomplete(parser)
+    sys.exit(OK)
+
+
+def _refuse(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:
+    """Say which words a verb does not take, and which option the first of them may stand for."""
+    option = unknown[0].partition("=")[0]
+    close = nearest(option, re.findall(r"--\w[\w-]*", parser.format_help())) if option.startswith("-") else None
+    hint = f"did you mean '{close}'?" if close else f"'{parser.prog} --help' lists what it takes"
+    parser.error(f"unrecognized arguments: {' '.join(unknown)}; {hint}")
+
+
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    close = nearest(name, known)
+    return f"did you mean '{close}'?" if close else "'router' lists them"

@@ -1,15 +1,16 @@
-"""`router doctor [TABLE]`: what keeps a router from working on this computer, and what to do about it."""
+"""`router doctor`: what keeps a router from working on this computer, and what to do about it."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 from collections import Counter
-from pathlib import Path
 
-from router.cli import DEFAULT_TABLE, OK, VERBS
+from router.cli import OK, Subparsers, add_verb
 from router.cli.findings import is_coloured, plural
+from router.cli.tool_options import add_table, table_path
 from router.tools.doctor_checks import CheckResult, Grade
 
 SICK = 1
@@ -21,23 +22,24 @@ _STYLES = {Grade.FINE: "\x1b[32m", Grade.WARNING: "\x1b[33m", Grade.PROBLEM: "\x
 _RESET = "\x1b[0m"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("doctor", help=VERBS["doctor"], description=_DESCRIPTION)
-    parser.add_argument("table", type=Path, nargs="?", default=DEFAULT_TABLE, metavar="TABLE")
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "doctor", _DESCRIPTION, "router doctor", "router doctor -t routes/sim.yaml")
+    add_table(parser)
     parser.add_argument(
         "--pre-start", action="store_true", help="only what would make a start fail, and nothing if all is well"
     )
+    parser.add_argument("--json", action="store_true", help="one JSON object per line and result")
 
 
 def run(args: argparse.Namespace) -> int:
     from router.tools.doctor import before_start, examine
 
     grades: Counter[Grade] = Counter()
-    for result in (before_start if args.pre_start else examine)(args.table, os.environ):
+    for result in (before_start if args.pre_start else examine)(table_path(args), os.environ):
         grades[result.grade] += 1
         if result.grade is Grade.PROBLEM or not args.pre_start:
-            print(shown(result, coloured=is_coloured(sys.stdout)), flush=True)
-    if not args.pre_start:
+            print(_json(result) if args.json else shown(result, coloured=is_coloured(sys.stdout)), flush=True)
+    if not args.pre_start and not args.json:
         print(_summary(grades))
     return SICK if grades[Grade.PROBLEM] else OK
 
@@ -49,6 +51,12 @@ def shown(result: CheckResult, *, coloured: bool) -> str:
         grade = f"{_STYLES[result.grade]}{grade}{_RESET}"
     text = f"{grade} {result.about:10} {result.text}"
     return f"{text}\n{'':20}-> {result.remedy}" if result.remedy else text
+
+
+def _json(result: CheckResult) -> str:
+    return json.dumps(
+        {"grade": result.grade.value, "about": result.about, "text": result.text, "remedy": result.remedy}
+    )
 
 
 def _summary(grades: Counter[Grade]) -> str:

@@ -6,9 +6,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured, print_findings
-from router.cli.tool_options import positive
+from router.cli.tool_options import add_table, seconds, table_path
 from router.compiler import Checked, check_table
 from router.compiler.checked import CheckedRoute
 from router.compiler.commands import lower_commands
@@ -20,31 +20,43 @@ from router.compiler.metrics import Counters
 from router.errors import UsageError, did_you_mean
 from router.tools.explain import diff, explained_gateway, explained_route, ignored_gateway, known_topics, seen_topics
 
-_DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides,
-largest sizes, and the code that the router runs. Of a gateway, show what it sends how often, and what it lets in: with
-a ~ in front each topic that its patterns match, of those that the table names, or with --live of all that there are.
-With --diff, say what one table does otherwise than another, and nothing else."""
+_DESCRIPTION = """Show where a route's messages come from and go, the whole mapping with the types on both sides, and
+largest sizes; with --code, also the code that the router runs. Of a gateway, show what it sends how often, and what
+it lets in: with a ~ in front each topic that its patterns match, of those that the table names, or with --live of
+all that there are. With --diff, say what one table does otherwise than another, and nothing else."""
+_EXAMPLES = (
+    "router explain imu_info",
+    "router explain imu_info --code",
+    "router explain dashboard --live",
+    "router explain --diff routes/legacy.yaml routes/rover.yaml",
+)
 _LIVE = 2.0
 """Seconds that discovery takes at most, as a rule."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("explain", help=VERBS["explain"], description=_DESCRIPTION)
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "explain", _DESCRIPTION, *_EXAMPLES)
     everything = "payload cases and gateways; all of the table when none is named"
     parser.add_argument("names", nargs="*", metavar="NAME", help=everything)
-    parser.add_argument("--table", type=Path, default=DEFAULT_TABLE, help="route table (default: %(default)s)")
+    add_table(parser)
     parser.add_argument(
         "--diff", nargs=2, type=Path, metavar=("OLD", "NEW"), help="two tables: what NEW does otherwise than OLD"
     )
-    parser.add_argument("--no-code", action="store_true", help="leave the generated code out")
-    live = f"look for topics in the ROS network as well, for so long (default: {_LIVE:g})"
-    parser.add_argument("--live", nargs="?", type=positive, const=_LIVE, metavar="SECONDS", help=live)
+    parser.add_argument("--code", action="store_true", help="show the generated code as well")
+    parser.add_argument("--live", action="store_true", help="look for topics in the ROS network as well")
+    about = f"look for them for so long, as 5s (default: {_LIVE:g}s)"
+    parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.diff is not None:
-        return _diff(*args.diff)
-    checked = check_table(args.table)
+    if args.seconds is not None and not args.live:
+        raise UsageError("--for belongs to --live")
+    return _diff(*args.diff) if args.diff is not None else _explain(args)
+
+
+def _explain(args: argparse.Namespace) -> int:
+    path = table_path(args)
+    checked = check_table(path)
     print_findings(checked.diagnostics, sys.stderr)
     if checked.has_errors or checked.table is None:
         return BAD_TABLE
@@ -56,12 +68,12 @@ def run(args: argparse.Namespace) -> int:
     known = [*routes, *gateways, *ignored]
     for name in args.names:
         if name not in known:
-            raise UsageError(f"{args.table} has no route or gateway '{name}'; {did_you_mean(name, known)}")
+            raise UsageError(f"{path} has no route or gateway '{name}'; {did_you_mean(name, known)}")
     executed_by = _executors(checked)
-    topics = known_topics(checked.table) if args.live is None else seen_topics(checked.table, args.live)
+    topics = seen_topics(checked.table, args.seconds or _LIVE) if args.live else known_topics(checked.table)
     for name in args.names or known:
         for route in routes.get(name, ()):
-            _print_route(route, checked, executed_by, args.no_code)
+            _print_route(route, checked, executed_by, with_code=args.code)
         if name in gateways:
             print(*explained_gateway(gateways[name], topics), sep="\n", end="\n\n")
         if name in ignored:
@@ -88,10 +100,10 @@ def _diff(old: Path, new: Path) -> int:
     return OK
 
 
-def _print_route(route: CheckedRoute, checked: Checked, executed_by: Executors, no_code: bool) -> None:
+def _print_route(route: CheckedRoute, checked: Checked, executed_by: Executors, *, with_code: bool) -> None:
     assert checked.table is not None  # noqa: S101 - a table without errors is one
     print(*explained_route(route, checked, executed_by), sep="\n")
-    if not no_code and not route.route.ignore:
+    if with_code and not route.route.ignore:
         for handler in compile_handlers(route, checked.table, Counters()):
             _print_code(handler.source)
     print()

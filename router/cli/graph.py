@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import print_findings
+from router.cli.tool_options import add_table, table_path
 from router.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,11 +21,10 @@ as the viewer likes, with addresses, types and conditions under the pointer; or 
 (.dot)."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("graph", help=VERBS["graph"], description=_DESCRIPTION)
-    parser.add_argument(
-        "table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help="route table (default: %(default)s)"
-    )
+def add_parser(subparsers: Subparsers) -> None:
+    examples = ("router graph -o routes.svg", "router graph routes/legacy.yaml -o legacy.mmd")
+    parser = add_verb(subparsers, "graph", _DESCRIPTION, *examples)
+    add_table(parser, is_subject=True)
     what = f"what to write; its name ends in {', '.join(SUFFIXES)}"
     parser.add_argument("-o", "--output", type=_output, required=True, metavar="FILE", help=what)
 
@@ -39,7 +39,7 @@ def _output(text: str) -> Path:
 def run(args: argparse.Namespace) -> int:
     from router.compiler import check_table
 
-    checked = check_table(args.table)
+    checked = check_table(table_path(args))
     print_findings(checked.diagnostics, sys.stderr)
     if checked.has_errors or checked.table is None:
         return BAD_TABLE

@@ -1,41 +1,62 @@
-"""`router init [DIR]`: copy `routes/`, `protos/` and `schemas/` of the router into a folder.
-
-The layout is that of a checkout, so that the documentation holds for both.
-"""
+"""`router init DIR`: write a first table with its protos and its test, or copy all that comes with the router."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
 import shutil
 from pathlib import Path
 
 from router.assets import asset
-from router.cli import OK, VERBS
+from router.cli import OK, Subparsers, add_verb
 from router.errors import UsageError, shown_path
 
-_PARTS = {
-    "routes": "the example tables and their test: `router validate`, `router test`",
-    "protos": "what boards and basestation send: after a change, `router schema lock --protos protos`",
-    "schemas": "for editors, and `comms`, the ROS messages of the tables; colcon builds them (docs/ros.md)",
+FIRST_TABLE = Path(__file__).parents[1] / "tools" / "first_table"
+
+_FIRST = {
+    "routes": "rover.yaml, the table, and rover.test.yaml, its tests",
+    "protos": "what the board sends, and the lock of its numbers",
 }
-_DESCRIPTION = """Copy what comes with the router into a folder, to run it and to change it there. Where there is
-one of them already, nothing is written."""
+_ROVER = {
+    "routes": "the rover's tables and their test",
+    "protos": "what its boards and basestation send",
+    "schemas": "for editors, and 'comms', its ROS messages; colcon builds them (docs/ros.md)",
+}
+_DESCRIPTION = """Write a first table into a folder: one board and one topic, on this computer, with a simulator for
+the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run them and to change
+them. Where there is one of the folders already, nothing is written."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("init", help=VERBS["init"], description=_DESCRIPTION)
-    parser.add_argument("folder", metavar="DIR", nargs="?", type=Path, default=Path(), help="default: where you are")
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "init", _DESCRIPTION, "router init robot", "router init --rover .")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="made if it is not there")
+    parser.add_argument("--rover", action="store_true", help="the rover's tables, protos and ROS messages")
 
 
 def run(args: argparse.Namespace) -> int:
-    targets = {part: args.folder / part for part in _PARTS}
+    parts = _ROVER if args.rover else _FIRST
+    targets = {part: args.folder / part for part in parts}
     try:
         for target in targets.values():
             if target.exists():
                 raise UsageError(f"{shown_path(target)} is there already; nothing was written")
         for part, target in targets.items():
-            shutil.copytree(asset(part), target, copy_function=shutil.copyfile)  # drops read-only modes
-            print(f"{shown_path(target)}: {_PARTS[part]}")
+            source = asset(part) if args.rover else FIRST_TABLE / part
+            shutil.copytree(source, target, copy_function=shutil.copyfile)  # drops read-only modes
+            print(f"{shown_path(target)}: {parts[part]}")
     except OSError as error:
         raise UsageError(str(error)) from error
+    print(_next_steps(args.folder, is_rover=args.rover))
     return OK
+
+
+def _next_steps(folder: Path, *, is_rover: bool) -> str:
+    table = " -t routes/sim.yaml" if is_rover else ""
+    steps = {
+        f"cd {shlex.quote(str(folder))}": "" if folder.resolve() != Path.cwd() else None,
+        "router validate && router test": "",
+        f"router run{table}": "    # until Ctrl-C; it says where its status page is",
+        f"router sim{table}": "    # in another terminal: plays the boards",
+    }
+    shown = [f"  {step}{note}" for step, note in steps.items() if note is not None]
+    return "\n".join(["", "next:", *shown])

@@ -1,63 +1,99 @@
-"""`router listen HOST:PORT`: what a gateway sends, one line each. The reference client of the gateway's formats."""
+"""`router listen PLACE`: what a gateway sends, what arrives at a UDP port, or what a ROS topic carries, one line each.
+
+It has no part in a running router. For gateways it is the reference client of their formats.
+"""
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import VERBS
-from router.cli.tool_options import say, whole
-from router.errors import TransportError, UsageError
+from router.cli import Subparsers, add_verb
+from router.cli.tool_options import add_count, add_for, add_wire_options, load_wire, print_batches, say
+from router.errors import StartError, TransportError, UsageError
 
 if TYPE_CHECKING:
     from router.tools.gateway_messages import Heard
 
 FORMATS = ("gateway_v1", "json_lines")
+GATEWAYS = ("udp", "tcp", "ws", "zenoh")
+_BELONGS_TO = {
+    "topics": ("--topic", GATEWAYS),
+    "record": ("--record", GATEWAYS),
+    "format": ("--format", ("tcp",)),
+    "ask": ("--ask", ("udp",)),
+    "hex": ("--hex", ("envelope", "topic")),
+    "type": ("--type", ("topic",)),
+}
+"""Options that only some places have."""
+
+_DESCRIPTION = """Listen at a place and print what comes, one line for each message, until Ctrl-C. Of a gateway, each
+message and schema: compressed and batched packets are understood, and how many there were is said at the end. At a
+UDP port, the payloads of envelopes: the port must be free, so that no router has part in it."""
+_PLACES = """places:
+  udp://[HOST:]PORT     what a gateway sends to this address of this computer
+  tcp://HOST:PORT       a gateway's TCP, connected to again and again
+  ws://HOST:PORT        a gateway's websocket, likewise
+  zenoh://KEY           a gateway's key; ?connect=tcp/10.0.0.1:7447, also
+                        listen=LOCATOR and mode=peer|client|router
+  envelope://[HOST:]PORT    envelopes, as boards and basestation get them
+  envelope://NAME       the same at the address of an endpoint or listener
+  topic://NAME          a ROS topic"""
+_EXAMPLES = (
+    "router listen udp://8502 --ask 127.0.0.1:8500",
+    "router listen ws://127.0.0.1:28765 --topic '/imu/*' --for 10s",
+    "router listen envelope://9000 --count 100 --json",
+    "router listen envelope://basestation -t routes/sim.yaml",
+    "router listen topic://imu_data",
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser(
-        "listen",
-        help=VERBS["listen"],
-        description="Print each message and schema that a gateway sends as one line. Compressed and batched "
-        "packets are understood. How many there were is said at the end.",
-        epilog="Places: [udp://][HOST:]PORT receives on this address of this machine; tcp://HOST:PORT and "
-        "ws://HOST:PORT connect to a gateway, again and again; zenoh://KEY?connect=tcp/10.0.0.1:7447 has the key "
-        "of a gateway, and further listen=LOCATOR and mode=peer|client|router.",
-    )
-    parser.add_argument("place", metavar="PLACE", help="[HOST:]PORT, or tcp://, ws:// or zenoh:// (see below)")
-    parser.add_argument("--format", choices=FORMATS, help="of tcp:// (default: what the first bytes say)")
-    parser.add_argument("--ask", metavar="HOST:PORT", help="udp: ask this `receive` address of a gateway for schemas")
-    parser.add_argument(
-        "--topic", action="append", metavar="GLOB", help="only such topics, as /loki_1/**; several are possible"
-    )
-    parser.add_argument("--count", type=whole, metavar="N", help="end after N messages (default: at Ctrl-C)")
-    parser.add_argument("--for", dest="seconds", type=_seconds, metavar="DURATION", help="end after this time: 10s")
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "listen", _DESCRIPTION, *_EXAMPLES, more=_PLACES)
+    parser.add_argument("place", metavar="PLACE", help="udp://, tcp://, ws://, zenoh://, envelope:// or topic://")
+    add_count(parser)
+    add_for(parser)
     parser.add_argument("--json", action="store_true", help="one JSON object per line, data as it is received")
-    parser.add_argument("--record", type=Path, metavar="FILE", help="append the same JSON lines to this file")
-
-
-def _seconds(text: str) -> float:
-    from router.table.units import parse_duration
-
-    try:
-        return parse_duration(text) / 1e9
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    parser.add_argument("--hex", action="store_true", help="envelopes and ROS: with the bytes of each")
+    parser.add_argument("--type", metavar="TYPE", help="ROS: the topic's type (default: what its publishers say)")
+    about = "gateways: only such topics, as /loki_1/**; several are possible"
+    parser.add_argument("--topic", dest="topics", action="append", metavar="GLOB", help=about)
+    parser.add_argument("--record", type=Path, metavar="FILE", help="gateways: append JSON lines to this file as well")
+    parser.add_argument("--format", choices=FORMATS, help="tcp: how it is split (default: what the first bytes say)")
+    parser.add_argument("--ask", metavar="HOST:PORT", help="udp: ask this 'receive' address of a gateway for schemas")
+    add_wire_options(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    scheme, separator, rest = args.place.partition("://")
+    if not separator:
+        forms = f"udp://{scheme} is where a gateway sends to, envelope://{scheme} where a router does"
+        raise UsageError(f"'{scheme}' does not say what it is: {forms}, topic://{scheme} is a ROS topic")
+    for name, (option, schemes) in _BELONGS_TO.items():
+        if getattr(args, name) and scheme not in schemes:
+            raise UsageError(f"{option} belongs to {', '.join(f'{each}://' for each in schemes)}")
+    if scheme == "envelope":
+        _listen_to_port(rest, args)
+    elif scheme == "topic":
+        _listen_to_topic(rest, args)
+    else:
+        _listen_to_gateway(args)
+    return 0
+
+
+def _listen_to_gateway(args: argparse.Namespace) -> None:
     from router.table.model import GatewayFormat
     from router.tools.gateway_client import GatewayClient, topic_filter
     from router.tools.gateway_messages import Message
     from router.tools.gateway_sources import open_source, remote
 
-    client = GatewayClient(topic_filter(args.topic or ()))
+    client = GatewayClient(topic_filter(args.topics or ()))
     form = GatewayFormat(args.format) if args.format else None
     gateway = remote(args.ask) if args.ask else None
     show = _printer(args.json)
@@ -76,7 +112,42 @@ def run(args: argparse.Namespace) -> int:
             pass
         finally:
             say(str(client.tally(source)))
-    return 0
+
+
+def _listen_to_port(place: str, args: argparse.Namespace) -> None:
+    from router.tools import udp
+    from router.tools.tap import listen
+
+    wire, table = load_wire(args)
+    with udp.open_udp(udp.listening(place, table), place) as receiver:
+        host, port = receiver.getsockname()
+        say(f"listening on {host}:{port}; Ctrl-C ends it")
+        with suppress(KeyboardInterrupt):
+            print_batches(listen(receiver, wire, udp.peer_names(table)), args)
+
+
+def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
+    from router.ros.environment import check_environment, ros_remedy
+
+    try:
+        check_environment(os.environ)
+        from router.ros.topics import TopicListener
+    except StartError as error:
+        raise UsageError(str(error)) from error
+    except ImportError as error:
+        raise UsageError(f"a topic needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
+    from router.tools.tap import listen_to_topic
+
+    with suppress(KeyboardInterrupt):
+        if args.type is None:
+            say(f"waiting for a publisher of {topic}; Ctrl-C ends it")
+        try:
+            listener = TopicListener(topic, args.type)
+        except StartError as error:
+            raise UsageError(str(error)) from error
+        with closing(listener):
+            say(f"listening to {topic} of {listener.type_name}; Ctrl-C ends it")
+            print_batches(listen_to_topic(listener), args)
 
 
 @contextmanager

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import print_findings
+from router.cli.tool_options import add_table, table_path
 
 if TYPE_CHECKING:
     from router.compiler import Checked
@@ -23,18 +24,21 @@ layout. What cannot be is refused, and then nothing is written."""
 _FIELDS = """such as `dose_rate:float state:SensorState`, or, with its unit, a single 'dose_rate:float # uSv/h'; types
 are bool, float, double, int32, int64, uint32, uint64, and enums and messages of the protos"""
 
+_EXAMPLES = (
+    "router new SensorBoardRadiationInfo --number 27 --board sensor",
+    "router new ArmBoardGrip --number 28 --board arm --fields 'force:float # N'",
+)
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("new", help=VERBS["new"], description=_DESCRIPTION)
+
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "new", _DESCRIPTION, *_EXAMPLES)
     parser.add_argument("name", metavar="NAME", help="of the message: its board, then what it is, as one word each")
     parser.add_argument("--number", type=int, required=True, metavar="N", help="in the envelope, never used before")
     parser.add_argument(
         "--board", required=True, metavar="BOARD", help="endpoint that sends it, `_board` may be missing"
     )
     parser.add_argument("--fields", nargs="+", default=(), metavar="FIELD", help=_FIELDS)
-    parser.add_argument(
-        "--table", type=Path, default=DEFAULT_TABLE, help="route table of the boards (default: %(default)s)"
-    )
+    add_table(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     if is_installed(asset("schemas")):
         what = "this router is installed, and its ROS messages with it; use the one of a checkout"
         raise UsageError(f"{what}, or write by hand what docs/adding-a-message.md lists")
-    before = _check(args.table)
+    path = table_path(args)
+    before = _check(path)
     errors = [finding for checked in before for finding in checked.diagnostics if checked.has_errors]
     if errors:
         print_findings(errors, sys.stderr)
@@ -58,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     written = Written(planned.texts)
     try:
         written.write(site.schema.lock, locked(site))
-        after = _check(args.table)
+        after = _check(path)
         print_findings(_news(before, after), sys.stderr)
     except BaseException:  # Ctrl-C, too
         written.undo()

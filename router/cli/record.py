@@ -1,15 +1,17 @@
-"""`router record [TABLE]`: what a running router receives, to a file; or what it has kept in memory."""
+"""`router record`: what a running router receives, to a file; or what it has kept in memory."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from datetime import datetime, timezone
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING
 
-from router.cli import OK, VERBS
-from router.cli.tool_options import add_router_options, progress, running_url
+from router.cli import OK, Subparsers, add_verb
+from router.cli.tool_options import add_for, add_router_options, progress, running_url, table_path
 from router.errors import UsageError
 
 if TYPE_CHECKING:
@@ -22,22 +24,24 @@ if TYPE_CHECKING:
 FAILED = 1
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser(
-        "record",
-        help=VERBS["record"],
-        description="Write every datagram that a running router receives to an MCAP file, until Ctrl-C: before it is "
-        "routed, also what no route takes, with sender and time. Foxglove opens the file as it is, 'router replay' "
-        "sends it again. To record always, without this command, give the table a 'record'.",
-    )
+_DESCRIPTION = """Write every datagram that a running router receives to an MCAP file, until Ctrl-C: before it is
+routed, also what no route takes, with sender and time. Foxglove opens the file as it is, 'router replay' sends it
+again. To record always, without this command, give the table a 'record'."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    examples = ("router record -o it.mcap --for 1min", "router record -t routes/sim.yaml", "router record --last")
+    parser = add_verb(subparsers, "record", _DESCRIPTION, *examples)
     add_router_options(parser)
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: TABLE_TIME.mcap in this folder")
     parser.add_argument("--last", action="store_true", help="have the router save what it has kept in memory instead")
+    add_for(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.last and args.output:
-        raise UsageError("--last writes to the directory of the table's 'record', on the router's computer; leave -o")
+    if args.last and (args.output or args.seconds):
+        where = "the directory of the table's 'record', on the router's computer"
+        raise UsageError(f"--last writes to {where}; leave -o and --for")
     return _save_last(args) if args.last else _record(args)
 
 
@@ -59,7 +63,7 @@ def _record(args: argparse.Namespace) -> int:
     from router.tools.recordings import TapRecording
     from router.tools.running_router import tap
 
-    table = read_table(args.table)
+    table = read_table(table_path(args))
     url = running_url(args)
     time = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
     # The router goes before whatever runs on its computer to watch it.
@@ -70,9 +74,12 @@ def _record(args: argparse.Namespace) -> int:
         print(f"recording the router at {url} to {recording.path}; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
             with progress(_columns) as update:
-                for batch in batches:
+                until = monotonic() + (args.seconds or math.inf)
+                for batch in batches:  # there is one each second, at least
                     recording.take(batch)
                     update(description=_summary(recording))
+                    if monotonic() >= until:
+                        break
         except KeyboardInterrupt:
             pass
         finally:

@@ -1,11 +1,12 @@
-"""`router reload [TABLE]`: a running router reads its table again, and takes it over if it is good."""
+"""`router reload`: a running router reads its table again, and takes it over if it is good."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 
-from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
+from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.tool_options import add_router_options, running_url
 
 PATIENCE = 60.0
@@ -15,20 +16,23 @@ _DESCRIPTION = f"""\
 Have a running router read its table again, with all files that the table names, and take it over between two datagrams:
 nothing is lost, and what has not changed goes on as it is. A table with errors changes nothing; its findings are
 printed. SIGHUP does the same, and tells in the log.
+
 Exit code: {OK} it was taken over, {BAD_USAGE} wrong usage, {BAD_TABLE} it was not, 1 no router answers."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser(
-        "reload", help=VERBS["reload"], description=_DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "reload", _DESCRIPTION, "router reload", "router reload -t routes/sim.yaml")
     add_router_options(parser)
+    parser.add_argument("--json", action="store_true", help="the result as a JSON object: ok, text, findings")
 
 
 def run(args: argparse.Namespace) -> int:
     from router.tools.running_router import post
 
     answer = post(running_url(args), "/-/reload", PATIENCE)
+    if args.json:
+        print(json.dumps(answer.body))
+        return OK if answer.ok else BAD_TABLE
     for finding in answer.body.get("findings", ()):
         print(finding, file=sys.stderr)
     text = answer.body.get("text", "")

@@ -9,8 +9,8 @@ from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import DEFAULT_TABLE, OK, VERBS
-from router.cli.tool_options import progress
+from router.cli import OK, Subparsers, add_verb
+from router.cli.tool_options import add_table, progress, speed, table_if_any, table_path
 from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
@@ -29,35 +29,29 @@ that it has for their senders. With --against, send nothing, but run them throug
 what would be delivered differently; exit code 1 where anything would.
 """
 
-EPILOG = """\
-examples:
-  router replay rover_20260412T101500Z.mcap --table routes/sim.yaml
-  router replay it.mcap --rate max --to 127.0.0.1:5000 --from 127.0.0.30
-  router replay it.mcap --against routes/new.yaml
-"""
+_EXAMPLES = (
+    "router replay it.mcap -t routes/sim.yaml",
+    "router replay it.mcap --speed max --to 127.0.0.1:5000 --from 127.0.0.30",
+    "router replay it.mcap --against routes/new.yaml",
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser(
-        "replay",
-        help=VERBS["replay"],
-        description=_DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "replay", _DESCRIPTION, *_EXAMPLES)
     parser.add_argument("file", type=Path, metavar="FILE", help="what 'record' has written")
-    parser.add_argument("--rate", metavar="RATE", help="2x is twice as fast, max without waiting (default: 1x)")
+    about = "2x is twice as fast, max without waiting (default: 1x)"
+    parser.add_argument("--speed", type=speed, metavar="SPEED", help=about)
     parser.add_argument("--to", metavar="PLACE", help="HOST:PORT, or a name of the table (default: its listeners)")
     parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table")
-    parser.add_argument("--table", type=Path, metavar="TABLE", help=f"default: {DEFAULT_TABLE}, if there")
+    add_table(parser)
     parser.add_argument("--against", type=Path, metavar="NEW", help="compare TABLE with this table instead")
 
 
 def run(args: argparse.Namespace) -> int:
     from router.recording.reader import Recording
 
-    if args.against is not None and (args.rate or args.to or args.origin):
-        raise UsageError("--against sends nothing: --rate, --to and --from have no part in it")
+    if args.against is not None and (args.speed or args.to or args.origin):
+        raise UsageError("--against sends nothing: --speed, --to and --from have no part in it")
     with closing(Recording(args.file)) as recording:
         code = _compare(args, recording) if args.against is not None else _send(args, recording)
         if recording.ends_early:
@@ -68,17 +62,16 @@ def run(args: argparse.Namespace) -> int:
 def _send(args: argparse.Namespace, recording: Recording) -> int:
     from router.table import read_table
     from router.tools import udp
-    from router.tools.recordings import Replayer, on_time, parse_rate
+    from router.tools.recordings import Replayer, on_time
 
-    rate = parse_rate(args.rate or "1x")
-    path = args.table or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
+    path = table_if_any(args)
     table = read_table(path) if path is not None else None
     to = udp.destination(args.to, table) if args.to else None
     origin = udp.origin(args.origin, table) if args.origin else None
     replayer = Replayer(table, to, origin)
     try:
         with closing(replayer), _progress(recording, "sending") as update:
-            for found in on_time(recording, rate):
+            for found in on_time(recording, args.speed or 1.0):
                 replayer.send(found)
                 update(completed=recording.position)
     except KeyboardInterrupt:
@@ -94,7 +87,7 @@ def _advise(resent: Resent) -> int:
         more = f" and {len(resent.elsewhere) - 5} more" if len(resent.elsewhere) > 5 else ""
         print(
             f"router replay: this computer lacks the addresses of {listed}{more}: sent from its own, which a table "
-            "takes for strangers; --table TABLE has other addresses for them, or --from PLACE",
+            "takes for strangers; -t TABLE has other addresses for them, or --from PLACE",
             file=sys.stderr,
         )
     if resent.refused:
@@ -107,7 +100,7 @@ def _compare(args: argparse.Namespace, recording: Recording) -> int:
     from router.rehearsal.against import Against, Report
 
     definitions = Definitions()
-    old, new = (_checked(path, definitions) for path in (args.table or DEFAULT_TABLE, args.against))
+    old, new = (_checked(path, definitions) for path in (table_path(args), args.against))
     assert old.program is not None and new.program is not None  # noqa: S101, PT018 - they have no errors
     against = Against(old.program, new.program)
     with _progress(recording, "comparing") as update:

@@ -1,6 +1,6 @@
 """`router run [TABLE] [--ros-args ...]`: compile the table, open everything, route until a signal.
 
-The ROS parameter `routes_path` may name the table instead of TABLE.
+The ROS parameter `routes_path` may name the table as well.
 """
 
 from __future__ import annotations
@@ -17,35 +17,35 @@ import yaml
 
 from router.app import Router, tune_interpreter
 from router.app.process import supervised
-from router.cli import BAD_TABLE, BAD_USAGE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured, print_findings
+from router.cli.tool_options import add_table, table_path
 from router.compiler import check_table
+from router.compiler.program import Program
 from router.errors import StartError, UsageError
 from router.log import LEVELS as LOG_LEVELS
-from router.log import configure_log
+from router.log import configure_log, logger
+from router.table.model import Gateway, Transport
+from router.tools.udp import reachable
 
-_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router reload').
-SIGUSR1: save the last datagrams, where the table keeps them ('record').
+_DESCRIPTION = f"""Route as a table says, until SIGINT or SIGTERM. SIGHUP: read the table again (see 'router
+reload'). SIGUSR1: save the last datagrams, where the table keeps them ('record').
+
 Exit code: {OK} stopped, {BAD_USAGE} wrong usage, {BAD_TABLE} the table has errors or what it names cannot be opened."""
-
-_EPILOG = """\
-The ROS parameter routes_path chooses the table in place of TABLE. Any other is a variable of the table in lower case,
-and wins over the environment:
-  router run --ros-args -p routes_path:=routes/legacy.yaml -p listen_port:=5001 -p dst_ip:=127.0.0.1
-"""
+_PARAMETERS = """The ROS parameter routes_path chooses the table as well. Any other is a variable of the table in lower
+case, and wins over the environment."""
+_EXAMPLES = (
+    "router run",
+    "router run routes/sim.yaml",
+    "router run --ros-args -p routes_path:=routes/legacy.yaml -p listen_port:=5001",
+)
 
 _ROUTES_PATH = "routes_path"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser(
-        "run",
-        help=VERBS["run"],
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("table", type=Path, nargs="?", metavar="TABLE", help=f"route table (default: {DEFAULT_TABLE})")
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "run", _DESCRIPTION, *_EXAMPLES, more=_PARAMETERS)
+    add_table(parser, is_subject=True)
     parser.add_argument(
         "--log-level", choices=LOG_LEVELS, default="info", help="least that is logged (default: %(default)s)"
     )
@@ -58,26 +58,66 @@ def run(args: argparse.Namespace) -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGUSR1})  # for callers other than `router.main`
     configure_log(args.log_level, coloured=is_coloured(sys.stderr))
     parameters = ros_parameters(args.ros_args)
-    named = parameters.get(_ROUTES_PATH)  # relative to the working directory, as TABLE
-    if args.table and named and args.table.resolve() != Path(named).resolve():
-        raise UsageError(f"TABLE is {args.table}, {_ROUTES_PATH} is {named}; name one table")
-    table = args.table or Path(named or DEFAULT_TABLE)
     environ = {**os.environ, **table_variables(parameters)}
-    checked = check_table(table, environ)
+    checked = check_table(_table(args, parameters.get(_ROUTES_PATH)), environ)
     print_findings(checked.diagnostics, sys.stderr)
     if checked.program is None:
         return BAD_TABLE
+    program = checked.program
+    del checked  # so that a reload can free it
+    route(program, args.ros_args, environ)
+    return OK
+
+
+def _table(args: argparse.Namespace, parameter: str | None) -> Path:
+    """Raises UsageError. A parameter is relative to the working directory, as TABLE."""
+    if not parameter:
+        return table_path(args)
+    typed: Path | None = args.subject or args.table
+    if typed is not None and table_path(args).resolve() != Path(parameter).resolve():
+        raise UsageError(f"TABLE is {typed}, {_ROUTES_PATH} is {parameter}; name one table")
+    return typed or Path(parameter)
+
+
+def route(program: Program, ros_args: Sequence[str], environ: Mapping[str, str]) -> None:
+    """Run a program until SIGINT or SIGTERM. Raises StartError."""
     ending = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, ending)
-    with Router(checked.program, ["--ros-args", *args.ros_args], environ) as router:
+    signal.pthread_sigmask(signal.SIG_BLOCK, {*ending, signal.SIGHUP, signal.SIGUSR1})
+    with Router(program, ["--ros-args", *ros_args], environ) as router:
         tune_interpreter()
-        del checked  # so that a reload can free it
+        _show_places(router)
         with supervised(router.progress, router.feed_watchdog):
             _serve_signals(router, ending)
         for number in ending:
             signal.signal(number, signal.SIG_DFL)  # a second signal ends the process at once
         signal.pthread_sigmask(signal.SIG_UNBLOCK, ending)
-    return OK
+
+
+def _show_places(router: Router) -> None:
+    """Say on a terminal where to look; elsewhere the log has the addresses, with "router started"."""
+    if not sys.stderr.isatty():
+        return
+    found = dict(_places(router))
+    width = max(map(len, found), default=0)
+    logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
+
+
+def _places(router: Router) -> Iterator[tuple[str, str]]:
+    table = router.program.table
+    if router.metrics_address is not None:
+        yield "status page", f"http://{reachable(router.metrics_address)}/"
+    for name, gateway in table.gateways.items():
+        yield f"gateway {name}", _place(gateway)
+    if table.foxglove is not None:
+        yield "Foxglove", f"ws://{reachable(table.foxglove.value)}"
+
+
+def _place(gateway: Gateway) -> str:
+    if gateway.zenoh is not None:
+        return f"zenoh://{gateway.zenoh.key.value}"
+    assert gateway.address is not None  # noqa: S101 - all but Zenoh have one
+    scheme = {Transport.WEBSOCKET: "http", Transport.TCP: "tcp"}.get(gateway.transport.value, "udp")
+    return f"{scheme}://{reachable(gateway.address.value)}{'/' if scheme == 'http' else ''}"
 
 
 def _serve_signals(router: Router, ending: Collection[signal.Signals]) -> None:

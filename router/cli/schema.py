@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.assets import asset, is_installed
-from router.cli import BAD_TABLE, DEFAULT_TABLE, OK, VERBS
+from router.cli import BAD_TABLE, OK, VERBS, Subparsers, add_verb
 from router.cli.findings import plural, print_findings
+from router.cli.tool_options import add_table, table_if_any
 from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, shown_path
 from router.table import load_table
 from router.table.model import EnvelopeSettings
@@ -24,18 +25,24 @@ if TYPE_CHECKING:
     from router.types.lock import Conflict
     from router.types.lock_file import Lock
 
-_DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there.
-A number that is reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written.
-`--accept` takes such a change when all boards get new firmware; `router validate` prints the command."""
-_PROTOS = f"folder of .proto files (default: as {DEFAULT_TABLE} says, if it is there)"
+_DESCRIPTION = f"""Write envelope.lock.json beside the .proto files, or add to it what is new there. A number that is
+reused, renumbered, retyped or renamed is refused: exit code {BAD_TABLE}, nothing written. `--accept` takes such a
+change when all boards get new firmware; `router validate` prints the command."""
+_PROTOS = "folder of .proto files, instead of a table"
+_EXAMPLES = (
+    "router schema lock",
+    "router schema lock --protos protos",
+    "router schema lock --accept Motor.rpm --accept PBEnvelope.imu_info",
+)
 _LOCK = "the lock file (default: as the table says, else envelope.lock.json in the folder)"
 _ACCEPT = "a change that is meant, called as the finding calls it: Message.field, Enum.VALUE, or a whole Message"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("schema", help=VERBS["schema"])
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "schema", f"{VERBS['schema'].capitalize()}.", *_EXAMPLES)
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    lock = actions.add_parser("lock", help="record new field numbers in the lock file", description=_DESCRIPTION)
+    lock = add_verb(actions, "lock", _DESCRIPTION, *_EXAMPLES)
+    add_table(lock)
     lock.add_argument("--protos", type=Path, metavar="DIR", help=_PROTOS)
     lock.add_argument("--lock", type=Path, metavar="FILE", help=_LOCK)
     lock.add_argument("--message", metavar="NAME", help=f"the envelope (default: of table or lock, else {ENVELOPE})")
@@ -53,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     path = lock_path(settings.protos, settings.lock)
     if is_installed(path):
         what = f"{path} belongs to the installed router, and is lost when that is upgraded"
-        raise UsageError(f"{what}; copy the protos with `router init`, and name yours: --protos protos")
+        raise UsageError(f"{what}; copy the protos with `router init --rover DIR`, and name yours: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
     schema = load_protos(settings.protos, settings.message, settings.lock)
     lock = LockComparison(schema, find_envelope(schema, settings.oneof))
@@ -77,7 +84,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace) -> EnvelopeSettings:
     """Where the protos and the lock are. Raises TableError for a broken table."""
-    settings = None if args.protos else _of_default_table()
+    if args.protos and args.table:
+        raise UsageError("--protos and --table both say where the messages are; give one")
+    settings = None if args.protos else _of_table(table_if_any(args))
     if settings is None:
         root = args.protos or asset("protos")
         span = SourceSpan(shown_path(root))
@@ -85,14 +94,14 @@ def _settings(args: argparse.Namespace) -> EnvelopeSettings:
     return replace(settings, lock=Located(args.lock.absolute(), settings.protos.span)) if args.lock else settings
 
 
-def _of_default_table() -> EnvelopeSettings | None:
-    if not DEFAULT_TABLE.exists():
+def _of_table(path: Path | None) -> EnvelopeSettings | None:
+    if path is None:
         return None
-    table, findings = load_table(DEFAULT_TABLE)
+    table, findings = load_table(path)
     if table is None:
         raise TableError(findings)
     if table.envelope is None:
-        raise UsageError(f"{DEFAULT_TABLE} has no 'envelope'; name the folder of the protos: --protos protos")
+        raise UsageError(f"{path} has no 'envelope'; name the folder of the protos: --protos protos")
     return table.envelope
 
 

@@ -7,36 +7,31 @@ import contextlib
 import sys
 from typing import TYPE_CHECKING
 
-from router.cli import VERBS
-from router.cli.tool_options import add_wire_options, load_wire, positive, whole
+from router.cli import Subparsers, add_verb
+from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, whole
 
 if TYPE_CHECKING:
     from router.table.addresses import Address
     from router.table.model import RouteTable
     from router.tools.udp import Sent
 
-EPILOG = """\
-examples:
-  router send imu_info accel_x=1.5 state=SENSOR_OPERATING --to 127.0.0.1:5000
-  router send imu_info accel_z=9.81 --table routes/sim.yaml --to rover --from sensor_board --rate 100 --count 1000
-  router send detected_object bbox.x=0x10 type=OBJECT_ROCK --to basestation
-"""
+_EXAMPLES = (
+    "router send imu_info accel_x=1.5 state=SENSOR_OPERATING --to 127.0.0.1:5000",
+    "router send imu_info -t routes/sim.yaml --to rover --from sensor_board",
+    "router send detected_object bbox.x=0x10 type=OBJECT_ROCK --to basestation",
+    "router send manual_drive --to rover --rate 20Hz --count 1000",
+)
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser(
-        "send",
-        help=VERBS["send"],
-        description="Build a payload from field=value words and send it in an envelope.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_parser(subparsers: Subparsers) -> None:
+    description = "Build a payload from field=value words and send it in an envelope."
+    parser = add_verb(subparsers, "send", description, *_EXAMPLES)
     parser.add_argument("case", metavar="CASE", help="payload case, such as imu_info")
     parser.add_argument("fields", nargs="*", metavar="FIELD=VALUE", help="x=1, bbox.x=3, points[1]=2, state=NAME")
     parser.add_argument("--to", required=True, metavar="PLACE", help="HOST:PORT, or a name of the table")
     parser.add_argument("--from", dest="origin", metavar="PLACE", help="HOST[:PORT], or an endpoint of the table")
-    parser.add_argument("--rate", type=positive, metavar="HZ", help="per second (default: as fast as possible)")
-    parser.add_argument("--count", type=whole, metavar="N", help="how many (default: 1, with --rate until Ctrl-C)")
+    parser.add_argument("--rate", type=hertz, metavar="RATE", help="as 20Hz (default: as fast as possible)")
+    add_count(parser, "how many (default: 1, with --rate until Ctrl-C)")
     parser.add_argument("--trim", action="store_true", help="remove trailing zero bytes, as the old boards do")
     parser.add_argument("--pad", type=whole, default=0, metavar="N", help="fill up with zeros to N bytes, as they do")
     add_wire_options(parser)

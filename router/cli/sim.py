@@ -1,17 +1,17 @@
-"""`router sim [TABLE]`: play all boards and the basestation of a table on this machine."""
+"""`router sim`: play all boards and the basestation of a table on this machine."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import signal
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import VERBS
-from router.cli.tool_options import positive
-from router.errors import TableError
+from router.cli import Subparsers, add_verb
+from router.cli.tool_options import add_for, add_table, speed, table_path
+from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
     from router.tools.sim_view import SimView
@@ -26,22 +26,22 @@ CHANGE_REFRESH = 0.1
 CHANGES_SHOWN = 3
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser(
-        "sim",
-        help=VERBS["sim"],
-        description="Send plausible, moving values from every endpoint of a table and show what each receives. "
-        "Boards obey commands, halt for a deadman, and stop when left alone for a second. "
-        "The endpoints' addresses must be this machine's, as they are in routes/sim.yaml.",
-        epilog="A lost link, and what the boards make of it: router sim --silent basestation:5-8",
-    )
-    default = Path("routes/sim.yaml")
-    parser.add_argument(
-        "table", nargs="?", type=Path, default=default, metavar="TABLE", help=f"route table (default: {default})"
-    )
-    parser.add_argument("--duration", type=positive, metavar="SECONDS", help="how long (default: until Ctrl-C)")
+_DESCRIPTION = """Send plausible, moving values from every endpoint of a table and show what each receives. Boards
+obey commands, halt for a deadman, and stop when left alone for a second. The endpoints' addresses must be this
+machine's, as they are in routes/sim.yaml."""
+_EXAMPLES = (
+    "router sim -t routes/sim.yaml",
+    "router sim -t routes/sim.yaml --silent basestation:5-8    # a lost link",
+    "router sim -t routes/sim.yaml --speed 10x --for 1min --json",
+)
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    parser = add_verb(subparsers, "sim", _DESCRIPTION, *_EXAMPLES)
+    add_table(parser)
+    add_for(parser)
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="the same seed sends the same values")
-    parser.add_argument("--rate-scale", type=positive, default=1.0, metavar="X", help="2 sends twice as often")
+    parser.add_argument("--speed", type=speed, default=1.0, metavar="SPEED", help="2x sends twice as often")
     parser.add_argument(
         "--silent",
         action="append",
@@ -60,11 +60,13 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.simulator import Simulator, parse_silence
 
     silences = [parse_silence(text) for text in args.silent]
-    checked = check_table(args.table)
+    if args.speed == math.inf:
+        raise UsageError("--speed max is for recordings; give a factor, as 10x")
+    checked = check_table(table_path(args))
     if checked.program is None:
         raise TableError(checked.diagnostics)
     wire, program = Wire(checked.program.envelope), checked.program
-    simulator = Simulator(wire, program.table, args.seed, args.rate_scale, deadmen=program.deadmen, silences=silences)
+    simulator = Simulator(wire, program.table, args.seed, args.speed, deadmen=program.deadmen, silences=silences)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: simulator.stop())
     view = SimView(wire, simulator.statistics)
@@ -80,7 +82,7 @@ def _show_json(simulator: Simulator, view: SimView, args: argparse.Namespace) ->
     def write(seconds: float, final: bool) -> None:
         print(json.dumps(view.as_json(seconds, final)), flush=True)
 
-    write(simulator.run(args.duration, JSON_REFRESH, lambda seconds: write(seconds, False)), True)
+    write(simulator.run(args.seconds, JSON_REFRESH, lambda seconds: write(seconds, False)), True)
 
 
 def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -> None:
@@ -98,7 +100,7 @@ def _show_lines(simulator: Simulator, view: SimView, args: argparse.Namespace) -
             print(view.line(), flush=True)
 
     print(f"{simulator.summary}; Ctrl-C ends it", flush=True)
-    seconds = simulator.run(args.duration, CHANGE_REFRESH, write)
+    seconds = simulator.run(args.seconds, CHANGE_REFRESH, write)
     due = seconds
     write(seconds)
 
@@ -120,7 +122,7 @@ def _show_terminal(simulator: Simulator, view: SimView, args: argparse.Namespace
             room = console.height - 2 - statuses.row_count - len(changes)
             live.update(Group(title, view.headline(), statuses, view.table(room), *changes), refresh=True)
 
-        seconds = simulator.run(args.duration, TERMINAL_REFRESH, draw)
+        seconds = simulator.run(args.seconds, TERMINAL_REFRESH, draw)
     view.update(seconds)
     console.print(view.table(1000))
     console.print(view.statuses())

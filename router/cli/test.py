@@ -10,37 +10,40 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
-from router.cli.findings import FORMATS, excerpt, github_escaped, is_coloured, plural, print_findings, visible
+from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import as_data as finding_data
+from router.cli.findings import excerpt, github_escaped, is_coloured, plural, print_findings, visible
+from router.cli.tool_options import add_styles, add_tables, table_paths
 from router.compiler.lookup import Definitions
-from router.errors import Diagnostic, SourceSpan, TableError, shown_path
+from router.errors import Diagnostic, SourceSpan, TableError, UsageError, shown_path
 from router.rehearsal.coverage import Coverage
-from router.rehearsal.reading import find_test_files, read_test_file
+from router.rehearsal.reading import ENDINGS, find_test_files, read_test_file
 from router.rehearsal.running import Result, run_tests
 from router.table import in_order
 
 FAILED = 1
-DEFAULT = Path("routes")
-_DESCRIPTION = f"""Run the tests of route tables: given this message, the table sends and publishes exactly that.
-A folder stands for the *.test.yaml and *.test.yml in it (not in folders below it); without a PATH it is '{DEFAULT}'.
-docs/testing-tables.md has the language. Exit code: {OK} all passed, {FAILED} a test failed or --coverage found a gap,
-{BAD_TABLE} a test file or its table is wrong, {BAD_USAGE} wrong usage."""
+_DESCRIPTION = f"""Run the tests of route tables: given this message, the table sends and publishes exactly that. A
+table stands for the tests beside it, of rover.yaml those in rover.test.yaml; a folder for the *.test.yaml and
+*.test.yml in it (not in folders below it). docs/testing-tables.md has the language.
+
+Exit code: {OK} all passed, {FAILED} a test failed or --coverage found a gap, {BAD_TABLE} a test file or its table is
+wrong, {BAD_USAGE} wrong usage."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("test", help=VERBS["test"], description=_DESCRIPTION)
-    parser.add_argument("paths", metavar="PATH", nargs="*", type=Path, help="a test file, or a folder with test files")
+def add_parser(subparsers: Subparsers) -> None:
+    examples = ("router test", "router test routes/ --coverage", "router test --only 'the operator'")
+    parser = add_verb(subparsers, "test", _DESCRIPTION, *examples)
+    add_tables(parser, "a table, a test file, or a folder with test files")
     parser.add_argument("--coverage", action="store_true", help="list what of the tables no test has touched")
     parser.add_argument("--only", metavar="TEXT", help="run the tests whose name contains this")
-    parser.add_argument("--format", choices=FORMATS, default="text", help="how results are written (default: text)")
+    add_styles(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     if args.coverage and args.only:
         print("router test: --coverage is about all tests; leave out --only", file=sys.stderr)
         return BAD_USAGE
-    paths = args.paths or [DEFAULT]
+    paths = [_tests_of(path) for path in table_paths(args)]
     files = find_test_files(paths)
     if not files:
         print(f"router test: no tests (*.test.yaml) in {', '.join(map(str, paths))}", file=sys.stderr)
@@ -50,15 +53,25 @@ def run(args: argparse.Namespace) -> int:
     if args.only and not results and not findings:
         print(f"router test: the name of no test contains {args.only!r}", file=sys.stderr)
         return BAD_USAGE
-    if findings and args.format != "json":
-        print_findings(findings, sys.stderr, args.format)
-    _print_results(results, findings, coverages.values(), sys.stdout, args.format)
-    if args.format == "text" and (results or not findings):
+    if findings and args.style != "json":
+        print_findings(findings, sys.stderr, args.style)
+    _print_results(results, findings, coverages.values(), sys.stdout, args.style)
+    if args.style == "text" and (results or not findings):
         print(_summary(results, len(files)))
     if findings:
         return BAD_TABLE
     is_complete = all(coverage.is_complete for coverage in coverages.values())
     return OK if is_complete and all(result.passed for result in results) else FAILED
+
+
+def _tests_of(path: Path) -> Path:
+    """The test file beside a table; any other path as it is. Raises UsageError for a table without one."""
+    if not path.is_file() or path.name.endswith(ENDINGS):
+        return path
+    tests = path.with_name(f"{path.stem}.test{path.suffix}")
+    if not tests.exists():
+        raise UsageError(f"{shown_path(path)} has no tests: there is no {shown_path(tests)}")
+    return tests
 
 
 def _results(

@@ -1,76 +1,186 @@
-"""Shared by verbs: options that find the envelope or a running router, numbers in range, a progress display."""
+"""Shared by verbs: which table, envelope and running router; durations, rates and speeds; a progress display."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
+import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
 from router.cli import DEFAULT_TABLE
-from router.errors import UsageError
+from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
 
     from router.engine.wire import Wire
     from router.table.model import RouteTable
+    from router.tools.tap import TappedDatagram, TappedMessage
+
+
+TABLE_VARIABLE = "ROUTER_TABLE"
+
+
+def add_table(parser: argparse.ArgumentParser, *, is_subject: bool = False) -> None:
+    """Which table a verb is about: `-t TABLE`. Where the table is the subject, it may be the only argument as well."""
+    if is_subject:
+        parser.add_argument("subject", nargs="?", type=Path, metavar="TABLE", help="short for -t TABLE")
+    about = f"route table (default: {TABLE_VARIABLE} of the environment, or {DEFAULT_TABLE})"
+    parser.add_argument("-t", "--table", type=Path, metavar="TABLE", help=about)
+
+
+def table_path(args: argparse.Namespace) -> Path:
+    """The table that a verb is about. Raises UsageError where none is named and the default one is not there."""
+    if (named := named_table(args)) is not None:
+        return named
+    if not DEFAULT_TABLE.exists():
+        how = f"name a table by -t TABLE or {TABLE_VARIABLE}, or write a first one: `router init DIR`"
+        raise UsageError(f"there is no {DEFAULT_TABLE} here; {how}")
+    return DEFAULT_TABLE
+
+
+def named_table(args: argparse.Namespace) -> Path | None:
+    """The table that the command line or the environment names. Raises UsageError for two on the command line."""
+    subject: Path | None = getattr(args, "subject", None)
+    option: Path | None = args.table
+    if subject is not None and option is not None and subject.resolve() != option.resolve():
+        raise UsageError(f"the table is {subject} or, by --table, {option}; name one")
+    of_environment = os.environ.get(TABLE_VARIABLE)
+    return subject or option or (Path(of_environment) if of_environment else None)
+
+
+def table_if_any(args: argparse.Namespace) -> Path | None:
+    """The table that is named, or the default one if it is there."""
+    return named_table(args) or (DEFAULT_TABLE if DEFAULT_TABLE.exists() else None)
+
+
+def add_tables(parser: argparse.ArgumentParser, about: str) -> None:
+    """As `add_table`, where several tables, or folders of them, may be the subject."""
+    parser.add_argument("paths", nargs="*", type=Path, metavar="PATH", help=about)
+    add_table(parser)
+
+
+def table_paths(args: argparse.Namespace) -> list[Path]:
+    """What a verb with `add_tables` is about. Raises UsageError."""
+    paths: list[Path] = args.paths
+    if paths and args.table is not None and {path.resolve() for path in paths} != {args.table.resolve()}:
+        raise UsageError(f"the table is {paths[0]} or, by --table, {args.table}; name one")
+    return paths or [table_path(args)]
+
+
+def add_styles(parser: argparse.ArgumentParser) -> None:
+    """How findings are written, as `args.style`: one of router.cli.findings.FORMATS."""
+    styles = parser.add_mutually_exclusive_group()
+    styles.set_defaults(style="text")
+    for style, about in (("json", "for programs"), ("github", "annotations beside the lines of a pull request")):
+        styles.add_argument(f"--{style}", dest="style", action="store_const", const=style, help=about)
 
 
 def add_wire_options(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_mutually_exclusive_group()
-    group.add_argument("--table", type=Path, metavar="TABLE", help=f"route table (default: {DEFAULT_TABLE}, if there)")
-    group.add_argument("--protos", type=Path, metavar="DIR", help="folder of .proto files, instead of a table")
+    add_table(parser)
+    parser.add_argument("--protos", type=Path, metavar="DIR", help="folder of .proto files, instead of a table")
 
 
 def load_wire(args: argparse.Namespace) -> tuple[Wire, RouteTable | None]:
-    """Raises TableError."""
+    """The messages, of a table if there is one. Raises TableError and UsageError."""
     from router.engine.wire import wire_of_protos, wire_of_table
     from router.table import read_table
 
-    if args.protos is None and (args.table is not None or DEFAULT_TABLE.exists()):
-        table = read_table(args.table or DEFAULT_TABLE)
+    if args.protos is not None and args.table is not None:
+        raise UsageError("--protos and --table both say where the messages are; give one")
+    if args.protos is None and (path := table_if_any(args)) is not None:
+        table = read_table(path)
         return wire_of_table(table), table
     return wire_of_protos(args.protos or asset("protos")), None
 
 
 def add_router_options(parser: argparse.ArgumentParser) -> None:
     """Which running router: that of a table, or at a URL."""
-    about = f"the table that it runs, for its http.address (default: {DEFAULT_TABLE})"
-    parser.add_argument("table", nargs="?", type=Path, default=DEFAULT_TABLE, metavar="TABLE", help=about)
+    add_table(parser)
     add_url_option(parser)
 
 
 def add_url_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--url", metavar="URL", help="where the running router answers instead: http://127.0.0.1:9108")
+    about = "where the running router answers, instead of where its table says: http://127.0.0.1:9108"
+    parser.add_argument("--url", metavar="URL", help=about)
 
 
 def running_url(args: argparse.Namespace) -> str:
-    """The URL from --url or from the table, which may have errors elsewhere. Raises UsageError."""
+    """The URL from --url or from the table, which may have errors elsewhere. Raises TableError and UsageError."""
     from router.table import load_table
     from router.tools.running_router import url_of
 
     if args.url:
         return str(args.url)
-    table, findings = load_table(args.table or DEFAULT_TABLE)
+    table, findings = load_table(table_path(args))
     if table is None:
-        raise UsageError(f"{findings[0]}; name the table that the router runs, or give --url")
+        raise TableError(findings)
     return url_of(table)
+
+
+def add_for(parser: argparse.ArgumentParser, about: str = "end after this time, as 10s (default: at Ctrl-C)") -> None:
+    """`--for 10s`, as `args.seconds`."""
+    parser.add_argument("--for", dest="seconds", type=seconds, metavar="DURATION", help=about)
+
+
+def add_count(parser: argparse.ArgumentParser, about: str = "end after N messages (default: at Ctrl-C)") -> None:
+    parser.add_argument("--count", type=whole, metavar="N", help=about)
+
+
+def print_batches(batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace) -> None:
+    """Print until --count or --for is reached; while nothing comes, the batches are empty.
+
+    A batch is written at once: a system call for each line would cost more than the line.
+    """
+    left, until = args.count, time.monotonic() + (args.seconds or math.inf)
+    for batch in batches:
+        if shown := batch[:left]:
+            print("\n".join(each.json(args.hex) if args.json else each.line(args.hex) for each in shown), flush=True)
+        if time.monotonic() >= until or (left is not None and (left := left - len(shown)) == 0):
+            return
+
+
+def seconds(text: str) -> float:
+    """`10s`, `500ms` as seconds."""
+    from router.table.units import parse_duration
+
+    return _quantity(parse_duration, text) / 1e9
+
+
+def hertz(text: str) -> float:
+    """`20Hz` as Hz."""
+    from router.table.units import parse_rate
+
+    return _quantity(parse_rate, text)
+
+
+def speed(text: str) -> float:
+    """`2x` as a factor; `max` is infinite."""
+    if text == "max":
+        return math.inf
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)x", text)
+    if found is None or not 0 < float(found[1]) <= 1e6:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a speed such as 2x or 0.5x, or max")
+    return float(found[1])
+
+
+def _quantity(parse: Callable[[str], float], text: str) -> float:
+    try:
+        return parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def say(line: str) -> None:
     """Print a line for whoever started the verb; stdout is for what it shows."""
     print(line, file=sys.stderr, flush=True)
-
-
-def positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value <= 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0 and at most 1000000")
-    return value
 
 
 def whole(text: str) -> int:

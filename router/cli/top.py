@@ -1,18 +1,20 @@
-"""`router top [TABLE]`: a running router at a glance, from its metrics."""
+"""`router top`: a running router at a glance, from its metrics."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from router.cli import OK, VERBS
-from router.cli.tool_options import add_router_options, positive, running_url
+from router.cli import OK, Subparsers, add_verb
+from router.cli.tool_options import add_router_options, running_url, seconds
 from router.errors import TransportError
 
 if TYPE_CHECKING:
-    from router.tools.top import Order
+    from router.tools.top import Order, View
 
 ORDERS = ("table", "rate", "drops", "age", "latency")
 _DESCRIPTION = """Show each route of a running router: messages per second, where they went, what was dropped and why,
@@ -20,39 +22,56 @@ the time since the last one, and how long routes took in the middle (p50) and at
 terminal it is shown again and again, and keys sort it."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("top", help=VERBS["top"], description=_DESCRIPTION)
+def add_parser(subparsers: Subparsers) -> None:
+    examples = ("router top", "router top -t routes/sim.yaml --sort drops", "router top --once --json")
+    parser = add_verb(subparsers, "top", _DESCRIPTION, *examples)
     add_router_options(parser)
     parser.add_argument(
         "--sort", choices=ORDERS, default=ORDERS[0], help="the largest first (default: as in the table)"
     )
-    parser.add_argument("--interval", type=positive, default=1.0, metavar="SECONDS", help="(default: %(default)g)")
+    about = "between two looks, as 500ms (default: 1s)"
+    parser.add_argument("--interval", type=seconds, default=1.0, metavar="DURATION", help=about)
     parser.add_argument("--once", action="store_true", help="show it once and end, as where there is no terminal")
+    parser.add_argument("--json", action="store_true", help="once, as a JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
     from router.tools.top import Order
 
     url = running_url(args)
-    if args.once or not sys.stdout.isatty():
+    if args.json:
+        _print_json(url, Order(args.sort), args.interval)
+    elif args.once or not sys.stdout.isatty():
         _show_once(url, Order(args.sort), args.interval)
     else:
         _show(url, Order(args.sort), args.interval)
     return OK
 
 
+def _print_json(url: str, order: Order, interval: float) -> None:
+    """The fields of `View`, with all rows. Times in seconds."""
+    from router.tools.top import ordered
+
+    seen = _look(url, interval)
+    print(json.dumps(asdict(seen) | {"routes": [asdict(row) for row in ordered(seen.routes, order)]}))
+
+
 def _show_once(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
 
+    from router.tools.top_view import page
+
+    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
+    console.print(page(_look(url, interval), order))
+
+
+def _look(url: str, interval: float) -> View:
     from router.tools.running_router import metrics
     from router.tools.top import view
-    from router.tools.top_view import page
 
     before = metrics(url)
     time.sleep(interval)
-    after = metrics(url)
-    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-    console.print(page(view(before, after), order))
+    return view(before, metrics(url))
 
 
 _PLAIN_WIDTH = 160

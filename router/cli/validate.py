@@ -8,37 +8,39 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from router.cli import BAD_TABLE, BAD_USAGE, OK, VERBS
-from router.cli.findings import FORMATS, count_line, print_findings, severity
+from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
+from router.cli.findings import count_line, print_findings, severity
+from router.cli.tool_options import add_styles, add_tables, table_paths
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, Severity, UsageError, shown_path
 from router.table import summary
 
-DEFAULT = Path("routes")
-_DESCRIPTION = f"""Report every finding in the tables, with file, line, column and a hint.
-A folder stands for the *.yaml and *.yml in it (not in folders below it, and not *.test.yaml);
-without a PATH it is '{DEFAULT}'. Exit code: {OK} clean, {BAD_TABLE} errors, {BAD_USAGE} wrong usage."""
+_DESCRIPTION = f"""Report every finding in the tables, with file, line, column and a hint. A folder stands for the
+*.yaml and *.yml in it (not in folders below it, and not *.test.yaml).
+
+Exit code: {OK} clean, {BAD_TABLE} errors, {BAD_USAGE} wrong usage."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    parser = subparsers.add_parser("validate", help=VERBS["validate"], description=_DESCRIPTION)
-    parser.add_argument("paths", metavar="PATH", nargs="*", type=Path, help="a table, or a folder with tables")
-    parser.add_argument("--format", choices=FORMATS, default="text", help="how findings are written (default: text)")
+def add_parser(subparsers: Subparsers) -> None:
+    examples = ("router validate", "router validate routes/ --strict", "router validate routes/ --github")
+    parser = add_verb(subparsers, "validate", _DESCRIPTION, *examples)
+    add_tables(parser, "a table, or a folder with tables")
+    add_styles(parser)
     parser.add_argument("--strict", action="store_true", help="take warnings for errors")
 
 
 def run(args: argparse.Namespace) -> int:
-    tables = find_tables(args.paths or [DEFAULT])
+    tables = find_tables(table_paths(args))
     findings: dict[Diagnostic, None] = {}  # tables that extend the same one share its findings
     definitions = Definitions()
     for path in tables:
         checked = check_table(path, definitions=definitions)
         findings.update(dict.fromkeys(checked.diagnostics))
-        if args.format == "text" and checked.table and not checked.diagnostics:
+        if args.style == "text" and checked.table and not checked.diagnostics:
             print(f"{shown_path(path)}: ok ({summary(checked.table)})")
-    print_findings(list(findings), sys.stdout, args.format, strict=args.strict)
-    if args.format == "text" and findings:
+    print_findings(list(findings), sys.stdout, args.style, strict=args.strict)
+    if args.style == "text" and findings:
         print(count_line(list(findings), len(tables), strict=args.strict))
     wrong = any(severity(finding, strict=args.strict) is Severity.ERROR for finding in findings)
     return BAD_TABLE if wrong else OK

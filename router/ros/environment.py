@@ -70,7 +70,7 @@ def ros_package_remedy(package: str) -> str:
     if not (ours / package).is_dir():
         return f"{source}, or install it"
     commands = (
-        "router init",
+        "router init --rover .",
         "export AMENT_PREFIX_PATH=$VIRTUAL_ENV",
         f"colcon build --base-paths schemas/{package}",
         ". install/setup.sh",

@@ -42,6 +42,16 @@ def open_node(name: str, namespace: str = "/", ros_args: Sequence[str] = ()) -> 
         raise StartError(f"the ROS node cannot be created: {error}") from error
 
 
+def check_arguments(ros_args: Sequence[str]) -> None:
+    """Raise StartError for arguments that ROS does not take, without opening a node."""
+    context = Context()
+    try:
+        context.init(list(ros_args), initialize_logging=False)
+    except RCL_ERRORS as error:
+        raise StartError(f"the ROS node cannot be created: {error}") from error
+    context.try_shutdown()
+
+
 def _ignore_sim_time(node: Node) -> None:
     """Warn of `use_sim_time`, and drop the subscription to /clock that comes with it."""
     if node.get_parameter(_SIM_TIME).value:

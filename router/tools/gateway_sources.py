@@ -288,20 +288,15 @@ class UdpSource:
 
 
 _SPAN = SourceSpan("command line", 1, 1)
-_FORMS = "[udp://][HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?connect=LOCATOR"
+_FORMS = "udp://[HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?connect=LOCATOR"
 
 
 def open_source(text: str, form: GatewayFormat | None, gateway: Address | None, say: Say) -> Source:
-    """Open the source that `text` names. `form` belongs to tcp, `gateway` (to request schemas) to udp.
+    """Open the source that `text` names. `form` is for tcp, `gateway` (to request schemas) for udp.
 
     Raises UsageError and TransportError.
     """
-    scheme, colon, rest = text.rpartition("://")
-    scheme = scheme if colon else "udp"
-    if form is not None and scheme != "tcp":
-        raise UsageError("--format belongs to tcp://; elsewhere what arrives tells")
-    if gateway is not None and scheme != "udp":
-        raise UsageError("--ask belongs to udp; elsewhere schemas come unasked")
+    scheme, _, rest = text.partition("://")
     match scheme:
         case "udp":
             return UdpSource(_local(rest), gateway, say)

@@ -83,18 +83,8 @@ class TapRecording:
             raise UsageError(f"cannot go on writing {self.path}: {error.strerror}") from error
 
 
-def parse_rate(text: str) -> float | None:
-    """Parse `2x` or `0.5x`; return None for `max`. Raises UsageError."""
-    if text == "max":
-        return None
-    found = _RATE.fullmatch(text)
-    if found is None or not 0 < (rate := float(found[1])) <= 1e6:
-        raise UsageError(f"'{text}' is no rate: 2x is twice as fast as it was recorded, 0.5x half, max without waiting")
-    return rate
-
-
-def on_time(recording: Recording, rate: float | None) -> Iterator[Recorded]:
-    """Yield each datagram when it is due; without waiting where `rate` is None.
+def on_time(recording: Recording, speed: float) -> Iterator[Recorded]:
+    """Yield each datagram when it is due; without waiting at an infinite speed.
 
     A clock that was set during the recording changes nothing.
     """
@@ -102,10 +92,9 @@ def on_time(recording: Recording, rate: float | None) -> Iterator[Recorded]:
     for found in recording.datagrams():
         if first is None:
             start, first = time.monotonic(), found.steady  # not before: opening a large recording takes its time
-        if rate is not None:
-            wait = start + (found.steady - first) / 1e9 / rate - time.monotonic()
-            if wait > 0:
-                time.sleep(wait)
+        wait = start + (found.steady - first) / 1e9 / speed - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
         yield found
 
 

@@ -70,6 +70,12 @@ def metrics(url: str) -> Snapshot:
     return found
 
 
+def is_receiving(url: str) -> bool:
+    """Whether the receive thread of a running router gets further. Raises TransportError where no router answers."""
+    with closing(_connection(url, PATIENCE)) as connection:
+        return _asked(connection, url, "GET", "/healthz").status == http.client.OK
+
+
 @contextmanager
 def tap(
     url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()
@@ -117,7 +123,7 @@ def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: 
         connection.request(method, path, headers={"Content-Length": "0"} if method == "POST" else {})
         return connection.getresponse()
     except (OSError, http.client.HTTPException) as error:
-        remedy = "is it running? another table, or --url, names another router"
+        remedy = "is it running? -t TABLE or --url names another router"
         raise TransportError(f"no router answers at {url}: {error}; {remedy}") from error
 
 

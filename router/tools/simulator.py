@@ -5,6 +5,7 @@ Each endpoint binds its own address, sends the payload cases of which the table 
 
 from __future__ import annotations
 
+import errno
 import heapq
 import random
 import re
@@ -71,13 +72,13 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
             raise UsageError(f"nothing is sent that '{silence.name}' could silence; {hint}")
 
 
-def streams(wire: Wire, table: RouteTable, seed: int, rate_scale: float) -> Iterator[Stream]:
+def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[Stream]:
     """The streams of the table's UDP sources, in the order of the table. Raises UsageError for an unknown name."""
     for route in table.routes:
         if not route.sources:
             continue
         case = wire.case(route.case.value)
-        rate = RATES.get(case.name, USUAL_RATE) * rate_scale
+        rate = RATES.get(case.name, USUAL_RATE) * speed
         for source in route.sources:
             sender = STRANGER if source.value == ANY else source.value
             if sender != STRANGER and sender not in table.endpoints:
@@ -104,11 +105,13 @@ MOST_CHANGES = 100
 class Statistics:
     """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
 
-    `unsent` are datagrams that the kernel refused to take. `changes` are those of the boards, the newest last.
+    `is_answered`: whether the table sends something back. `unsent` are datagrams that the kernel refused to take.
+    `changes` are those of the boards, the newest last.
     """
 
     sent: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     unsent: int = 0
+    is_answered: bool = True
     inboxes: dict[str, Inbox] = field(default_factory=dict)
     changes: deque[Change] = field(default_factory=lambda: deque(maxlen=MOST_CHANGES))
 
@@ -125,18 +128,18 @@ class Simulator:
         wire: Wire,
         table: RouteTable,
         seed: int,
-        rate_scale: float = 1.0,
+        speed: float = 1.0,
         *,
         deadmen: Sequence[DeadmanPlan] = (),
         silences: Sequence[Silence] = (),
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nobody receives what boards would send")
-        self.statistics = Statistics()
+        self.statistics = Statistics(is_answered=any(route.destinations for route in table.routes))
         played = boards(wire, table, deadmen, self.statistics.changes.append)
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
-        self._streams = tuple(streams(wire, table, seed, rate_scale))
+        self._streams = tuple(streams(wire, table, seed, speed))
         self._silences = silences
         check_silences(silences, self._streams)
         self._models = [PayloadModel(stream.case.name, stream.case.type, seed) for stream in self._streams]
@@ -176,7 +179,12 @@ class Simulator:
         self._senders[endpoint.name] = sender
 
     def _open(self, address: Address, owner: str) -> socket.socket:
-        opened = open_udp(address, owner)
+        try:
+            opened = open_udp(address, owner)
+        except UsageError as error:
+            if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
+                raise UsageError(f"{error}; take a table with addresses of this machine: -t routes/sim.yaml") from error
+            raise
         self._opened.append(opened)
         return opened
 

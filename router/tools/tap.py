@@ -1,4 +1,4 @@
-"""What `router tap` shows: datagrams of a running router or of a UDP port, and messages of a ROS topic, decoded."""
+"""What `router tap` and `listen` show: datagrams of a running router or a UDP port, messages of a ROS topic."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _enums(message: MessageType) -> Iterator[Enum]:
 
 
 PATIENCE = 0.2
-"""Seconds after which Ctrl-C is noticed at the latest, while no message comes."""
+"""Seconds after which Ctrl-C, and the end of --for, are noticed at the latest, while no message comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,19 +223,25 @@ class RunningTap:
         return self._condition is None or self._condition.holds(case, payload, tapped.peer, at)
 
 
-def listen_to_topic(listener: TopicListener) -> Iterator[TappedMessage]:
-    """Wait for one message after the other, for ever."""
+def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
+    """Wait for messages, for ever; after PATIENCE without one, yield an empty list."""
     while True:
-        for cdr, arrived in listener.take(PATIENCE):
-            yield TappedMessage(_local_time(arrived), listener.type_name, cdr, listener.message(cdr))
+        yield [
+            TappedMessage(_local_time(arrived), listener.type_name, cdr, listener.message(cdr))
+            for cdr, arrived in listener.take(PATIENCE)
+        ]
 
 
-def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> Iterator[TappedDatagram]:
-    """Wait for one datagram after the other, for ever."""
-    receiver.setblocking(True)
+def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> Iterator[list[TappedDatagram]]:
+    """Wait for one datagram after the other, for ever; after PATIENCE without one, yield an empty list."""
+    receiver.settimeout(PATIENCE)
     while True:
-        data, peer = receiver.recvfrom(LARGEST_DATAGRAM)
-        yield tapped_datagram(wall_ns(), name_of(peer), data, wire)
+        try:
+            data, peer = receiver.recvfrom(LARGEST_DATAGRAM)
+        except TimeoutError:
+            yield []
+        else:
+            yield [tapped_datagram(wall_ns(), name_of(peer), data, wire)]
 
 
 def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire) -> TappedDatagram:

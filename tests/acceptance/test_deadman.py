@@ -177,7 +177,7 @@ def steady(driver: Driver) -> Iterator[subprocess.Popen[Any] | ForkedProcess]:
         return
     words = [f"{name}={value}" for name, value in driver.command.values.items()]
     addresses = ["--to", f"{ROUTER}:{driver.place.listen}", "--from", HOSTS["basestation"]]
-    command = [sys.executable, "-m", "router", "send", driver.route, *words, *addresses, "--rate", "50"]
+    command = [sys.executable, "-m", "router", "send", driver.route, *words, *addresses, "--rate", "50Hz"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         try:
             yield process

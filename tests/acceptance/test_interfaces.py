@@ -140,10 +140,10 @@ def test_verbs_reach_a_listener_by_the_address_of_its_interface(site: Rover) -> 
             site.rover.run(*router, "send", "imu_info", "--table", table, "--to", listener)
             assert site.basestation.recv(1000) == IMU
             assert site.count("datagrams_received_total", listener=listener) == 1
-        found = site.rover.run(*router, "doctor", table, check=False)
+        found = site.rover.run(*router, "doctor", "-t", table, check=False)
         assert "listener 'lan': network interface lan0 is up" in found
         site.rover.ip("link", "set", "radio0", "down")
-        found = site.rover.run(*router, "doctor", table, check=False)
+        found = site.rover.run(*router, "doctor", "-t", table, check=False)
         assert "listener 'radio': network interface radio0 is down: nothing comes in" in found
 
 

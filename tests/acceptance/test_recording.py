@@ -78,7 +78,7 @@ def test_everything_is_recorded_before_it_is_routed_here_and_by_another_process(
     with recording_router(tmp_path) as (place, router):
         table, other = tmp_path / "table.yaml", tmp_path / "it.mcap"
         recorder = subprocess.Popen(
-            router_command("record", table, "-o", other),
+            router_command("record", "-t", table, "-o", other),
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -139,11 +139,11 @@ def test_the_last_minute_is_saved_by_signal_by_command_and_by_a_deadman_and_can_
         routed = place.waiting()["basestation"]
         router.process.send_signal(signal.SIGUSR1)
         wait_until(lambda: any(path.stem.endswith("_signal") for path in files(tmp_path)), "the signal's file")
-        told = Path(said("record", table, "--last").strip())
+        told = Path(said("record", "-t", table, "--last").strip())
         assert [each.data for each in read(told)] == [imu(at) for at in range(100)]
 
         before = received(place)
-        assert said("replay", told, "--table", table, "--rate", "10x") == "sent 100 datagrams\n"
+        assert said("replay", told, "--table", table, "--speed", "10x") == "sent 100 datagrams\n"
         wait_until(lambda: received(place) - before == 100)
         wait_until(lambda: total(place.scrape(), "datagrams_sent", route="imu_info") == 200)
         assert Counter(place.waiting()["basestation"]) == Counter(routed)

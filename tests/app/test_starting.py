@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -125,6 +126,23 @@ def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table
     end(process)
 
 
+DEADMAN = "    deadman: {timeout: 500ms, send: {ph_info: {}}, to: [basestation]}\n"
+
+
+def test_arguments_that_ros_refuses_end_it_before_deadmen_send(table: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2")
+    text = table.read_text() + DEADMAN + TOPIC
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.bind(("127.0.0.1", 0))
+        station.settimeout(0.5)
+        port = station.getsockname()[1]
+        table.write_text(re.sub(r"(basestation: {address: \"127.0.0.1:)\d+", rf"\g<1>{port}", text))
+        code, said = ended("run", table, "--ros-args", "--bad")
+        assert (code, said) == (78, ["router run: the ROS node cannot be created: ['--bad']"])
+        with pytest.raises(TimeoutError):
+            station.recv(100)
+
+
 def test_a_carrier_that_there_is_not_ends_the_start(table: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With no thread left that keeps the process alive, while signals are blocked."""
     monkeypatch.setenv("ROUTER_CARRIER", "rust")
@@ -169,7 +187,7 @@ def test_sighup_and_the_command_have_the_table_read_again(table: Path) -> None:
     process = start(MODULE, "run", table)
     wait_for_start(process)
     good = table.read_text()
-    asking = [sys.executable, "-m", "router", "reload", str(table)]
+    asking = [sys.executable, "-m", "router", "reload", "-t", str(table)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
 
     table.write_text(good + "  gps_info: {source: any, destinations: [basestation]}\n")
@@ -325,6 +343,7 @@ def test_a_full_shared_memory_is_told(table: Path, name: str) -> None:
         "-m",
         "router",
         name,
+        "-t",
         str(table),
     ]
     answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)

@@ -30,13 +30,13 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_before_a_start_that_will_work_it_is_silent(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor", "--pre-start", str(table)]) == 0
+    assert main(["doctor", "--pre-start", "-t", str(table)]) == 0
     assert capsys.readouterr().out == ""
 
 
 def test_a_bad_table_is_a_problem(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table.write_text(table.read_text() + "routs: {}\n")
-    assert main(["doctor", str(table)]) == 1
+    assert main(["doctor", "-t", str(table)]) == 1
     out = capsys.readouterr().out
     assert "problem  table" in out
     assert "did you mean 'routes'?" in out

@@ -41,7 +41,7 @@ def explained(capsys: pytest.CaptureFixture[str], table: Path, *words: str) -> s
 def test_a_route_is_told_with_its_targets_their_conditions_and_mappings(
     table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert explained(capsys, table, "imu_info", "--no-code") == (
+    assert explained(capsys, table, "imu_info") == (
         f"imu_info: SensorBoardIMUInfo, field 13 of PBEnvelope  ({table}:5:3)\n"
         "  largest encoding: 51 bytes, 53 in its envelope\n"
         "  source: sensor_board (127.0.0.30)\n"
@@ -68,7 +68,7 @@ def test_who_serves_commands_from_ros_is_told(tmp_path: Path, capsys: pytest.Cap
     table = tmp_path / "table.yaml"
     rover = ROUTES / "rover.yaml"
     table.write_text(f"version: 1\nextends: {rover}\nroutes: {{arm_target: {{fields: {{target_x: target_x * 2}}}}}}\n")
-    told = explained(capsys, table, "drive_motor", "arm_target", "rover_localization", "--no-code")
+    told = explained(capsys, table, "drive_motor", "arm_target", "rover_localization")
     assert [line.strip() for line in told.splitlines() if line.startswith("    by ")] == [
         "by the carrier",
         f"by Python: `target_x: target_x * 2` needs it; its freshness is Python's  ({table}:3:42)",
@@ -137,7 +137,7 @@ def publishing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_who_publishes_on_a_topic_is_told_and_what_needs_python(
     publishing: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = explained(capsys, publishing, "--no-code")
+    told = explained(capsys, publishing)
     lines = re.findall(r"^  topic (\w)|^    by (.*)$", told, re.MULTILINE)
     topics, executors = [topic for topic, _ in lines if topic], [by for _, by in lines if by]
     assert list(zip(topics, executors, strict=True)) == [
@@ -168,7 +168,7 @@ def test_routes_of_one_case_are_told_with_their_own_places_and_auto_with_the_ele
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     rover = ROUTES / "rover.yaml"
-    told = explained(capsys, rover, "detected_object", "--no-code")
+    told = explained(capsys, rover, "detected_object")
     places = re.findall(r"^detected_object_from_ros\w*: .*:(\d+):7\)$", told, re.MULTILINE)
     written = rover.read_text(encoding="utf-8").splitlines()
     assert [written[int(line) - 1].strip()[:16] for line in places] == ["- source: {topic"] * 2
@@ -185,16 +185,16 @@ def test_a_hand_over_is_told_on_both_sides(table: Path, capsys: pytest.CaptureFi
         "and once when the router starts\n"
         "    disarmed by commands of imu_info\n"
     ) in explained(capsys, table, "arm_ctrl")
-    code = explained(capsys, table, "imu_info")
+    code = explained(capsys, table, "imu_info", "--code")
     assert f"({table}:6:34)\n    disarms the deadman of arm_ctrl\n" in code
     assert re.search(r"send_laptop\(.*, None\)", code)
     assert re.search(r"send_basestation\([^,]*\)", code)
 
 
-def test_without_a_case_all_are_explained_with_the_code_that_runs(
+def test_without_a_case_all_are_explained_and_with_code_also_what_runs(
     table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = explained(capsys, table)
+    out = explained(capsys, table, "--code")
     assert "imu_info: SensorBoardIMUInfo" in out
     assert "\ndef route_imu_info(" in out
     assert "  ignored: not part of this test\n" in out
@@ -214,9 +214,7 @@ def test_an_unknown_name_and_a_bad_table_are_told_instead(
 
 def test_a_source_is_told_with_the_listener_that_believes_it(table: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table.write_text(table.read_text().replace("laptop:", "sensor_board: {listener: rover}, laptop:", 1))
-    assert "  source: sensor_board (127.0.0.30 by listener rover)\n" in explained(
-        capsys, table, "imu_info", "--no-code"
-    )
+    assert "  source: sensor_board (127.0.0.30 by listener rover)\n" in explained(capsys, table, "imu_info")
 
 
 GATEWAYS = """\
@@ -354,7 +352,7 @@ def test_a_variable_that_is_no_text_is_told_by_its_name(
 
 
 def test_without_a_name_routes_and_gateways_are_told(gateways: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = explained(capsys, gateways, "--no-code")
+    told = explained(capsys, gateways)
     assert told.index("imu_info: ") < told.index("vr_headset: gateway") < told.index("dashboard: gateway")
 
 
@@ -365,7 +363,7 @@ def test_of_an_ignored_gateway_the_reason_is_told(
     over.write_text(f"extends: {gateways}\ngateways:\n  dashboard: {{ignore: no page on this rover}}\n")
     told = f"dashboard: gateway  ({over}:3:3)\n  ignored: no page on this rover\n\n"
     assert explained(capsys, over, "dashboard") == told
-    assert told in explained(capsys, over, "--no-code")
+    assert told in explained(capsys, over)
 
 
 def test_live_shows_topics_of_the_network_with_who_publishes_them(
@@ -375,9 +373,9 @@ def test_live_shows_topics_of_the_network_with_who_publishes_them(
     from tests.ros.peers import Publisher
 
     with closing(Publisher("greeting", "std_msgs/msg/String")):
-        while "~" not in (told := explained(capsys, gateways, "net", "--live", "0.5")):
+        while "~" not in (told := explained(capsys, gateways, "net", "--live", "--for", "500ms")):
             pass
     assert "  ~ /greeting  std_msgs/msg/String of 1  the latest value every 500 ms  by /greeting\n" in told
     assert "/imu_data  comms/msg/ImuSensorInformation, no publisher  " in explained(
-        capsys, gateways, "vr_headset", "--live", "0.1"
+        capsys, gateways, "vr_headset", "--live", "--for", "100ms"
     )

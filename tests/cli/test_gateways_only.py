@@ -34,7 +34,7 @@ def test_verbs_about_the_table_show_the_gateway_and_nothing_that_it_does_not_hav
     for name in ("map.svg", "map.mmd", "map.dot"):
         assert main(["graph", "only.yaml", "-o", name]) == OK
         assert "headset" in Path(name).read_text()
-    main(["doctor", "only.yaml"])
+    main(["doctor", "-t", "only.yaml"])
     said = capsys.readouterr().out
     assert "only.yaml: 1 gateway\n" in said
     assert "buffers" not in said
@@ -46,8 +46,8 @@ def test_verbs_about_the_table_show_the_gateway_and_nothing_that_it_does_not_hav
     [
         (["send", "imu_info", "--to", "127.0.0.1:5000", "--table", "only.yaml"], NO_ENVELOPE),
         (["tap", "--table", "only.yaml", "--url", "http://127.0.0.1:9"], NO_ENVELOPE),
-        (["tap", "5000", "--table", "only.yaml"], NO_ENVELOPE),
-        (["sim", "only.yaml", "--duration", "1"], "only.yaml has no listeners"),
+        (["listen", "envelope://5000", "--table", "only.yaml"], NO_ENVELOPE),
+        (["sim", "-t", "only.yaml", "--for", "1s"], "only.yaml has no listeners"),
         (
             ["new", "SensorBoardDose", "--number", "99", "--board", "s", "--table", "only.yaml"],
             "only.yaml has no 'envelope' that a message could be added to",

@@ -44,7 +44,7 @@ def gateway() -> Iterator[socket.socket]:
 def listening(*options: str) -> Iterator[tuple[subprocess.Popen[str], tuple[str, int]]]:
     """A process that listens on a free UDP port by now, and where that is."""
     port = free_port()
-    command = [*LISTEN, f"127.0.0.1:{port}", *options]
+    command = [*LISTEN, f"udp://127.0.0.1:{port}", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert process.stderr.readline() == f"listening: udp 127.0.0.1:{port}; Ctrl-C ends it\n"
@@ -99,7 +99,7 @@ def test_a_file_that_takes_no_more_ends_it(gateway: socket.socket) -> None:
 
 
 def test_it_ends_after_its_time(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["listen", f"127.0.0.1:{free_port()}", "--for", "1ms"]) == 0
+    assert main(["listen", f"udp://127.0.0.1:{free_port()}", "--for", "1ms"]) == 0
     assert capsys.readouterr().err.endswith("\n0 messages, 0 schemas, 0 undecodable, 0 lost\n")
 
 
@@ -130,7 +130,7 @@ def test_a_terminal_gets_colours_and_one_line_for_each(gateway: socket.socket) -
     port = free_port()
     ours, terminal = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "60"}
-    command = [*LISTEN, f"127.0.0.1:{port}", "--count", "1"]
+    command = [*LISTEN, f"udp://127.0.0.1:{port}", "--count", "1"]
     with subprocess.Popen(command, stdout=terminal, stderr=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stderr is not None
         process.stderr.readline()
@@ -147,13 +147,16 @@ def test_a_terminal_gets_colours_and_one_line_for_each(gateway: socket.socket) -
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["here"], "'here' is not [udp://][HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?connect=LOCATOR"),
-        (["5000", "--topic", "imu"], "--topic: 'imu' does not begin with '/'"),
-        (["5000", "--record", "-"], "--record takes a file; --json prints the same"),
-        (["5000", "--record", "/nowhere/file"], "--record /nowhere/file: No such file or directory"),
-        (["5000", "--format", "json_lines"], "--format belongs to tcp://"),
-        (["ws://127.0.0.1:1", "--ask", "127.0.0.1:2"], "--ask belongs to udp"),
-        (["5000", "--ask", "here"], "'here' is not HOST:PORT"),
+        (
+            ["udp://here"],
+            "'here' is not udp://[HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?connect=LOCATOR",
+        ),
+        (["udp://5000", "--topic", "imu"], "--topic: 'imu' does not begin with '/'"),
+        (["udp://5000", "--record", "-"], "--record takes a file; --json prints the same"),
+        (["udp://5000", "--record", "/nowhere/file"], "--record /nowhere/file: No such file or directory"),
+        (["udp://5000", "--format", "json_lines"], "--format belongs to tcp://"),
+        (["ws://127.0.0.1:1", "--ask", "127.0.0.1:2"], "--ask belongs to udp://"),
+        (["udp://5000", "--ask", "here"], "'here' is not HOST:PORT"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(
@@ -173,6 +176,6 @@ def test_a_zenoh_network_that_cannot_be_reached_is_exit_code_1(capsys: pytest.Ca
 
 def test_a_wrong_duration_is_refused_as_usage(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["listen", "5000", "--for", "5"])
+        main(["listen", "udp://5000", "--for", "5"])
     assert caught.value.code == 2
     assert "'5' is not a number with a unit of" in capsys.readouterr().err

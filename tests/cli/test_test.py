@@ -113,7 +113,7 @@ def test_whatever_is_changed_in_the_table_some_test_notices(
 
 def test_failure_shows_both_files(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(rover, "radians(gyro_y)", "radians(gyro_x)")
-    assert main(["test"]) == FAILED
+    assert main(["test", "routes"]) == FAILED
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith(": failed: the IMU reaches the operator as it is, and ROS in SI units")
     assert re.fullmatch(
@@ -130,7 +130,7 @@ def test_failure_shows_both_files(rover: Path, capsys: pytest.CaptureFixture[str
 def test_what_no_test_touches_is_listed_and_fails(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tests = rover.with_name("rover.test.yaml")
     change(tests, "arm_feedback: {arm_error: 3}", "arm_feedback: any")
-    assert main(["test", "--coverage"]) == FAILED
+    assert main(["test", "--coverage", "routes"]) == FAILED
     out = capsys.readouterr().out
     assert "not covered: no test compares what arm_feedback has for arm_feedback\n" in out
     assert "topic: arm_feedback" in out
@@ -145,7 +145,7 @@ def test_a_table_that_extends_another_needs_tests_of_what_it_changes_only(
     table.write_text(f"version: 1\nextends: ../routes/rover.yaml\nroutes:\n  load_cell_info: {{topics: [{topic}]}}\n")
     tests = table.with_name("scale.test.yaml")
     tests.write_text("tests:\n  a: {expect: nothing}\n")
-    assert main(["test", "--coverage", "--format", "json", "routes", "lab"]) == FAILED
+    assert main(["test", "--coverage", "--json", "routes", "lab"]) == FAILED
     inherited, changed = json.loads(capsys.readouterr().out)["coverage"]
     assert inherited["gaps"] == []
     lacking = [(gap["kind"], gap["file"]) for gap in changed["gaps"]]
@@ -160,7 +160,7 @@ def test_a_table_that_extends_another_needs_tests_of_what_it_changes_only(
 
 def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(rover, "pressure_kpa * 1000", "pressure_kpa * 100")
-    assert main(["test", "--coverage", "--format", "json"]) == FAILED
+    assert main(["test", "--coverage", "--json", "routes"]) == FAILED
     data = json.loads(capsys.readouterr().out)
     (failed,) = [test for test in data["tests"] if not test["passed"]]
     (failure,) = failed["failures"]
@@ -173,33 +173,33 @@ def test_json_has_results_and_coverage(rover: Path, capsys: pytest.CaptureFixtur
     assert coverage["gaps"] == []
     assert data["findings"] == []
     change(rover.with_name("rover.test.yaml"), "from: sensor_board", "from: sensor_bord")
-    assert main(["test", "--format", "json"]) == BAD_TABLE
+    assert main(["test", "--json", "routes"]) == BAD_TABLE
     (found,) = json.loads(capsys.readouterr().out)["findings"]
     assert found["code"] == "unknown-endpoint"
 
 
 def test_github_shows_failures_beside_the_lines(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(rover, "pressure_kpa * 1000", "pressure_kpa * 100")
-    assert main(["test", "--format", "github"]) == FAILED
+    assert main(["test", "--github", "routes"]) == FAILED
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("::error file=routes/rover.test.yaml,line=")
     assert "title=pressure reaches the operator and ROS%2C in pascal" in line
 
 
 def test_only_runs_the_tests_that_are_named_so(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["test", "--only", "the operator"]) == OK
+    assert main(["test", "--only", "the operator", "routes"]) == OK
     some = int(capsys.readouterr().out.split()[0])
-    assert main(["test"]) == OK
+    assert main(["test", "routes"]) == OK
     assert 1 < some < int(capsys.readouterr().out.split()[0])
-    assert main(["test", "--only", "the operator", "--coverage"]) == BAD_USAGE
-    assert main(["test", "--only", "the oprator"]) == BAD_USAGE
+    assert main(["test", "--only", "the operator", "--coverage", "routes"]) == BAD_USAGE
+    assert main(["test", "--only", "the oprator", "routes"]) == BAD_USAGE
     assert "the name of no test contains 'the oprator'" in capsys.readouterr().err
 
 
 def test_what_is_wrong_with_a_test_file_is_exit_code_78(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tests = rover.with_name("rover.test.yaml")
     change(tests, "from: sensor_board", "from: sensor_bord")
-    assert main(["test"]) == BAD_TABLE
+    assert main(["test", "routes"]) == BAD_TABLE
     heard = capsys.readouterr()
     assert "error[unknown-endpoint]" in heard.err
     assert "did you mean 'sensor_board'?" in heard.err
@@ -208,7 +208,7 @@ def test_what_is_wrong_with_a_test_file_is_exit_code_78(rover: Path, capsys: pyt
 
 def test_route_that_is_gone_from_the_table_is_noticed(rover: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change(rover, "topic: imu/mag", "topic: imu/magnetic_field")
-    assert main(["test"]) == BAD_TABLE
+    assert main(["test", "routes"]) == BAD_TABLE
     assert "rover.yaml has no route that publishes on 'imu/mag'" in capsys.readouterr().err
 
 

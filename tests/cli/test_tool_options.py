@@ -1,15 +1,80 @@
-"""What verbs share: progress is for whoever looks, and for nobody else."""
+"""What verbs share: which table, numbers with units, and progress for whoever looks."""
 
 from __future__ import annotations
 
+import argparse
 import io
+import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import pytest
 from rich.progress import ProgressColumn, TextColumn
 
-from router.cli.tool_options import progress
+from router.cli.tool_options import add_table, hertz, named_table, progress, seconds, speed, table_path
+from router.errors import UsageError
+
+
+def parsed(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_table(parser, is_subject=True)
+    return parser.parse_args(words)
+
+
+@pytest.mark.parametrize(
+    ("words", "environment", "table"),
+    [
+        ((), "", "routes/rover.yaml"),
+        ((), "of_environment.yaml", "of_environment.yaml"),
+        (("-t", "option.yaml"), "of_environment.yaml", "option.yaml"),
+        (("subject.yaml",), "of_environment.yaml", "subject.yaml"),
+        (("subject.yaml", "--table", "./subject.yaml"), "", "subject.yaml"),
+    ],
+)
+def test_the_table_is_typed_or_of_the_environment_or_the_default(
+    words: tuple[str, ...], environment: str, table: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("routes").mkdir()
+    Path("routes/rover.yaml").touch()
+    monkeypatch.setenv("ROUTER_TABLE", environment)
+    assert table_path(parsed(*words)) == Path(table)
+
+
+def test_two_tables_and_none_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROUTER_TABLE", raising=False)
+    with pytest.raises(UsageError, match=r"the table is a\.yaml or, by --table, b\.yaml; name one"):
+        named_table(parsed("a.yaml", "-t", "b.yaml"))
+    with pytest.raises(UsageError, match=r"no routes/rover\.yaml here; name a table by -t .* `router init DIR`"):
+        table_path(parsed())
+
+
+@pytest.mark.parametrize(
+    ("parse", "text", "value"),
+    [
+        (seconds, "10s", 10.0),
+        (seconds, "250ms", 0.25),
+        (hertz, "20Hz", 20.0),
+        (hertz, "0.5 Hz", 0.5),
+        (speed, "2x", 2.0),
+        (speed, "0.5x", 0.5),
+        (speed, "max", math.inf),
+    ],
+)
+def test_numbers_have_units(parse: Callable[[str], float], text: str, value: float) -> None:
+    assert parse(text) == value
+
+
+@pytest.mark.parametrize(
+    ("parse", "texts"),
+    [(seconds, ("10", "", "0s")), (hertz, ("20", "0Hz")), (speed, ("2", "0x", "-1x", "x", "2xx", "1e9x", "fast"))],
+)
+def test_numbers_without_their_unit_are_refused(parse: Callable[[str], float], texts: tuple[str, ...]) -> None:
+    for text in texts:
+        with pytest.raises(argparse.ArgumentTypeError):
+            parse(text)
 
 
 class Terminal(io.StringIO):

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from router.cli import BAD_USAGE, OK, main
+from router.cli import BAD_TABLE, OK, main
 from tests.ports import free_port
 from tests.tools.answering import answering
 
@@ -42,7 +42,7 @@ def served() -> Iterator[str]:
 
 
 def test_without_a_terminal_it_is_shown_once(served: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top", "--url", served, "--interval", "0.01", "--sort", "drops"]) == OK
+    assert main(["top", "--url", served, "--interval", "10ms", "--sort", "drops"]) == OK
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("in 7 (0/s), delivered 7")
     assert [line.split()[0] for line in lines[3:]] == ["gps_info", "imu_info"]
@@ -55,15 +55,13 @@ def test_the_address_is_that_of_the_table(
     table = tmp_path / "table.yaml"
     address = served.removeprefix("http://")
     table.write_text(f"version: 1\nextends: {BASE}\nhttp: {{address: {address}}}\n{more}")
-    assert main(["top", str(table), "--once", "--interval", "0.01"]) == OK
+    assert main(["top", "-t", str(table), "--once", "--interval", "10ms"]) == OK
     assert "imu_info" in capsys.readouterr().out
 
 
-def test_where_there_is_no_table_its_name_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["top", str(tmp_path / "gone.yaml")]) == BAD_USAGE
-    said = capsys.readouterr().err
-    assert "gone.yaml" in said
-    assert said.endswith("; name the table that the router runs, or give --url\n")
+def test_where_there_is_no_table_that_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["top", "-t", str(tmp_path / "gone.yaml")]) == BAD_TABLE
+    assert "gone.yaml:1:1: error[bad-file]" in capsys.readouterr().err
 
 
 def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -74,7 +72,7 @@ def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> N
 @pytest.mark.parametrize("text", ["<html>hello</html>", "", 'node_cpu{cpu="0"} 1\n', 'router_kernel_drops{a="b"} 1\n'])
 def test_what_is_no_router_is_said_in_a_line(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with answering(text) as url:
-        assert main(["top", "--url", url, "--interval", "0.01"]) == 1
+        assert main(["top", "--url", url, "--interval", "10ms"]) == 1
     assert re.fullmatch(rf"router top: what answers at {url}/metrics is no router.*\n", capsys.readouterr().err)
 
 
@@ -91,7 +89,7 @@ def test_on_a_terminal_keys_sort_and_end_it(served: str) -> None:
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 20, 100, 0, 0))
     before = termios.tcgetattr(theirs)
-    command = [sys.executable, "-m", "router", "top", "--url", served, "--interval", "60"]
+    command = [sys.executable, "-m", "router", "top", "--url", served, "--interval", "1min"]
     environment = {**os.environ, "TERM": "xterm"}
     with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment) as process:
         read_until(ours, "sorted by table")

@@ -39,7 +39,7 @@ def test_a_folder_stands_for_its_tables(routes: Path, capsys: pytest.CaptureFixt
     for name in ("second.yml", "x.test.yaml", ".hidden.yaml", "notes.txt", "below/third.yaml"):
         (routes / name).parent.mkdir(exist_ok=True)
         shutil.copy(routes / "good.yaml", routes / name)
-    for arguments in ([], ["routes"], ["routes", "routes/good.yaml"]):
+    for arguments in (["routes"], ["routes", "routes/good.yaml"]):
         assert main(["validate", *arguments]) == OK
         lines = capsys.readouterr().out.splitlines()
         assert [line.partition(":")[0] for line in lines] == ["routes/good.yaml", "routes/second.yml"]
@@ -59,7 +59,7 @@ def test_a_table_that_is_not_there_is_a_finding(routes: Path, capsys: pytest.Cap
 def test_all_tables_are_checked_and_counted_once(routes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (routes / "bad.yaml").write_text("extends: good.yaml\nnode: {name: 5}\n")
     (routes / "worse.yaml").write_text("extends: bad.yaml\n")
-    assert main(["validate"]) == BAD_TABLE
+    assert main(["validate", "routes"]) == BAD_TABLE
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("routes/good.yaml: ok")
     [wrong] = [line for line in lines if "error[" in line]
@@ -70,16 +70,16 @@ def test_all_tables_are_checked_and_counted_once(routes: Path, capsys: pytest.Ca
 def test_strict_makes_warnings_errors(routes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = (routes / "good.yaml").read_text().replace("  ph_info: {ignore: not part of this test}\n", "")
     (routes / "good.yaml").write_text(text)
-    assert main(["validate"]) == OK
+    assert main(["validate", "routes"]) == OK
     assert "1 warning in 1 table" in capsys.readouterr().out
-    assert main(["validate", "--strict"]) == BAD_TABLE
+    assert main(["validate", "--strict", "routes"]) == BAD_TABLE
     assert "error[uncovered-payload-case]" in capsys.readouterr().out
 
 
 def test_json_is_a_list_of_findings_and_nothing_else(routes: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["validate", "--format", "json"]) == OK
+    assert main(["validate", "--json", "routes"]) == OK
     assert json.loads(capsys.readouterr().out) == []
     (routes / "bad.yaml").write_text("a: [")
-    assert main(["validate", "--format", "json"]) == BAD_TABLE
+    assert main(["validate", "--json", "routes"]) == BAD_TABLE
     [finding] = json.loads(capsys.readouterr().out)
     assert (finding["file"], finding["code"]) == ("routes/bad.yaml", "bad-yaml")

@@ -154,7 +154,7 @@ def test_tables_are_valid_where_they_are_installed(installed: Path, tmp_path: Pa
 
 
 def test_its_examples_can_be_copied(installed: Path, tmp_path: Path) -> None:
-    output(start(installed, "init", tmp_path / "copy"))
+    output(start(installed, "init", "--rover", tmp_path / "copy"))
     [assets] = installed.rglob("_assets")
     names = [{path.relative_to(root) for path in root.rglob("*")} for root in (assets, tmp_path / "copy")]
     assert names[0] == names[1] > {Path("routes/rover.yaml"), Path("schemas/comms/package.xml")}

@@ -171,7 +171,7 @@ def test_it_routes_to_ros_nodes_of_another_user(running: Machine) -> None:
     heard = running.shell(
         f"(for i in $(seq 100); do {SEND}; sleep 0.1; done) >/dev/null 2>&1 & sending=$!\n"
         f"HOME=/tmp setpriv --reuid=65534 --regid=65534 --clear-groups "
-        f"{ROUTER} tap --topic ph_data --type comms/msg/SensorBoardPHInfo --count 2; kill $sending"
+        f"{ROUTER} listen topic://ph_data --type comms/msg/SensorBoardPHInfo --count 2; kill $sending"
     )
     assert heard.count("ph_value=7") == 2
 

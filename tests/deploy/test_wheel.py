@@ -126,17 +126,17 @@ def test_without_a_compiler_it_is_for_any_platform_and_python_does_the_carriers_
 
 def test_the_examples_are_copied_and_work_where_they_are(routed: Router, packages: Path, tmp_path: Path) -> None:
     tables.ship(packages / "router" / "_assets")
-    assert "`router init` writes example tables there" in routed("validate").stdout
-    assert routed("init").returncode == 0
+    assert "write a first one: `router init DIR`" in routed("validate").stderr
+    assert routed("init", "--rover", ".").returncode == 0
     copied = tmp_path / "here"
     assert contents(copied) == contents(packages / "router" / "_assets")
     for name in ("routes/sim.yaml", "protos/envelope.lock.json", "schemas/comms/package.xml"):
         assert (copied / name).is_file()
-    valid = routed("validate")
+    valid = routed("validate", "routes")
     assert valid.returncode == 0, valid.stdout
     shutil.rmtree(copied / "schemas")
     before = contents(copied)
-    again = routed("init")
+    again = routed("init", "--rover", ".")
     assert (again.returncode, again.stderr) == (2, "router init: routes is there already; nothing was written\n")
     assert contents(copied) == before
 
@@ -149,11 +149,11 @@ def test_the_lock_of_the_installation_is_not_written(routed: Router, packages: P
         assert refused.returncode == 2
         assert refused.stderr == (
             f"router schema: {shipped}/envelope.lock.json belongs to the installed router, and is lost when that is "
-            "upgraded; copy the protos with `router init`, and name yours: --protos protos\n"
+            "upgraded; copy the protos with `router init --rover DIR`, and name yours: --protos protos\n"
         )
     assert routed("new", "SensorBoardMore", "--number", "99", "--board", "sensor").returncode == 2
     assert contents(packages) == before
-    routed("init")
+    routed("init", "--rover", ".")
     locked = routed("schema", "lock", "--protos", "protos")
     assert "2 new numbers" in locked.stdout, locked.stderr
     assert (tmp_path / "here" / "protos" / "envelope.lock.json").is_file()
@@ -181,7 +181,7 @@ def test_the_doctor_names_a_missing_ros_package_once(routed: Router, packages: P
     for name in "AB":
         (share / f"{name}.msg").write_text("float32 x\n")
     (tmp_path / "here" / "table.yaml").write_text(TABLE)
-    found = routed("doctor", "table.yaml", AMENT_PREFIX_PATH=str(tmp_path / "install")).stdout
+    found = routed("doctor", "-t", "table.yaml", AMENT_PREFIX_PATH=str(tmp_path / "install")).stdout
     [problem, remedy] = [line for line in found.splitlines() if "absent_msgs" in line]
     assert problem.startswith("problem  ROS        absent_msgs/msg/A is not installed")
     assert problem.endswith("(there is no Python package 'absent_msgs.msg'); and 1 more of its types")
@@ -195,6 +195,6 @@ def test_an_installation_is_told_how_to_get_ros_without_make(monkeypatch: pytest
     assert ros_remedy() == ("run `pip install 'rover-router[ros]'`, or source the setup.sh of an installed ROS 2 Jazzy")
     assert ros_package_remedy("comms") == (
         "source the workspace that has the ROS package 'comms', or build it in an activated environment: "
-        "`router init && export AMENT_PREFIX_PATH=$VIRTUAL_ENV && "
+        "`router init --rover . && export AMENT_PREFIX_PATH=$VIRTUAL_ENV && "
         "colcon build --base-paths schemas/comms && . install/setup.sh`"
     )

@@ -155,7 +155,7 @@ def test_a_bad_table_is_told_as_validate_does(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_comparing_and_sending_exclude_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", "it.mcap", "--against", "new.yaml", "--rate", "2x"]) == 2
+    assert main(["replay", "it.mcap", "--against", "new.yaml", "--speed", "2x"]) == 2
     assert "--against sends nothing" in capsys.readouterr().err
 
 

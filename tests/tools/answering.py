@@ -1,4 +1,4 @@
-"""An HTTP server that has /metrics and nothing else."""
+"""An HTTP server that has /metrics and /healthz, and nothing else."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ COLLECTED_AT = 1_500_000_000.25
 
 
 @contextmanager
-def answering(text: str, address: tuple[str, int] = ("127.0.0.1", 0), status: int = 200) -> Iterator[str]:
+def answering(
+    text: str, address: tuple[str, int] = ("127.0.0.1", 0), status: int = 200, healthz: int = 200
+) -> Iterator[str]:
     """Yield its URL."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            self.send_response(status if self.path == "/metrics" else 404)
+            self.send_response({"/metrics": status, "/healthz": healthz}.get(self.path, 404))
             self.send_header("X-Collected-At", str(COLLECTED_AT))
             self.end_headers()
             self.wfile.write(text.encode())

@@ -419,7 +419,9 @@ def test_where_there_is_no_table_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["new", *RADIATION]) == BAD_TABLE
+    assert main(["new", *RADIATION]) == BAD_USAGE
+    assert "there is no routes/rover.yaml here" in capsys.readouterr().err
+    assert main(["new", *RADIATION, "-t", "routes/rover.yaml"]) == BAD_TABLE
     assert "nothing was written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 

@@ -21,7 +21,7 @@ def test_metrics_are_asked_for_at_the_router_and_no_proxy(monkeypatch: pytest.Mo
 
 
 def test_where_no_router_answers_is_a_network_fault() -> None:
-    says = r"no router answers at .*; is it running\? another table, or --url, names another router"
+    says = r"no router answers at .*; is it running\? -t TABLE or --url names another router"
     with pytest.raises(TransportError, match=says):
         metrics(f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}")
     with answering("starting", status=503) as url, pytest.raises(TransportError, match=r"/metrics: 503 starting"):

@@ -43,7 +43,7 @@ def played(wire: Wire, table: RouteTable, **options: Any) -> Iterator[tuple[Simu
     """A fast simulator, and the socket that its endpoints send to."""
     with (
         open_udp(reachable(table.listeners["rover"].address.value), "router") as router,
-        closing(Simulator(wire, table, seed=1, rate_scale=FAST, **options)) as simulator,
+        closing(Simulator(wire, table, seed=1, speed=FAST, **options)) as simulator,
     ):
         yield simulator, router
 

@@ -49,7 +49,7 @@ def test_datagrams_are_heard_in_order(wire: Wire) -> None:
         for data in (b"\x12\x00", b"", b"\x0a\x00"):
             board.sendto(data, tap.getsockname())
         hearing = listen(tap, wire, lambda peer: f"port {peer[1]}")
-        first, second, third = next(hearing), next(hearing), next(hearing)
+        [first], [second], [third] = next(hearing), next(hearing), next(hearing)
     assert first.decoded is not None
     assert third.decoded is not None
     assert (first.decoded.case.name, second.problem, third.decoded.case.name) == ("plain", "empty", "every_kind")

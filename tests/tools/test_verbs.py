@@ -1,4 +1,4 @@
-"""The verbs send, tap and sim as they are typed."""
+"""The verbs send, listen and sim as they are typed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_send_says_what_it_sent_once_or_at_a_rate_trimmed_or_padded(
     to = place(receiver)
     for words, sent, says in (
         (["value=1.5"], ["12050d0000c03f"], f"sent plain to {to}: 7 bytes 12050d0000c03f\n"),
-        (["--rate", "500", "--count", "4"], ["1200"] * 4, f"sent plain to {to} 4 times in "),
+        (["--rate", "500Hz", "--count", "4"], ["1200"] * 4, f"sent plain to {to} 4 times in "),
         (["--trim"], ["12"], f"sent plain to {to}: 1 bytes 12\n"),
         (["--pad", "5"], ["1200000000"], f"sent plain to {to}: 5 bytes 1200000000\n"),
     ):
@@ -91,10 +91,10 @@ def test_a_mistake_in_send_is_one_line_and_exit_code_2(
     assert capsys.readouterr().err == f"router send: {complaint}\n"
 
 
-def test_tap_prints_what_arrives(table_path: Callable[..., Path]) -> None:
+def test_listen_prints_the_envelopes_that_arrive(table_path: Callable[..., Path]) -> None:
     path = table_path()
     station = read_table(path).endpoints["station"].address.value
-    command = [sys.executable, "-m", "router", "tap", "station", "--table", str(path), "--count", "1"]
+    command = [sys.executable, "-m", "router", "listen", "envelope://station", "-t", str(path), "--count", "1"]
     with (
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as board,
@@ -123,8 +123,8 @@ def publishing(*messages: Point) -> Iterator[None]:
     context.shutdown()
 
 
-def test_tap_waits_for_a_topic_and_prints_what_it_carries() -> None:
-    command = [sys.executable, "-m", "router", "tap", "--topic", "tap_test", "--count", "2"]
+def test_listen_waits_for_a_topic_and_prints_what_it_carries() -> None:
+    command = [sys.executable, "-m", "router", "listen", "topic://tap_test", "--count", "2"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
         assert tap.stderr is not None
         assert tap.stderr.readline() == "waiting for a publisher of tap_test; Ctrl-C ends it\n"
@@ -137,8 +137,8 @@ def test_tap_waits_for_a_topic_and_prints_what_it_carries() -> None:
     ]
 
 
-def test_tap_that_waits_for_a_topic_ends_with_ctrl_c() -> None:
-    command = [sys.executable, "-m", "router", "tap", "--topic", "nobody_publishes_this"]
+def test_listen_that_waits_for_a_topic_ends_with_ctrl_c() -> None:
+    command = [sys.executable, "-m", "router", "listen", "topic://nobody_publishes_this"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
         assert tap.stderr is not None
         assert tap.stderr.readline() == "waiting for a publisher of nobody_publishes_this; Ctrl-C ends it\n"
@@ -150,31 +150,36 @@ def test_tap_that_waits_for_a_topic_ends_with_ctrl_c() -> None:
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--topic", "t", "--type", "Point"], "'Point' is no message type; they are written like std_msgs/msg/String"),
-        (["--topic", "t", "--type", "no/msg/Such"], "no/msg/Such is not installed"),
-        (["--topic", "no topic", "--type", "std_msgs/msg/String"], "topic 'no topic' cannot be listened to: "),
-        (["5000", "--type", "std_msgs/msg/String"], "--type belongs to --topic"),
-        (["5000", "--topic", "imu_data"], "either --topic imu_data or '5000'\n"),
+        (["topic://t", "--type", "Point"], "'Point' is no message type; they are written like std_msgs/msg/String"),
+        (["topic://t", "--type", "no/msg/Such"], "no/msg/Such is not installed"),
+        (["topic://no topic", "--type", "std_msgs/msg/String"], "topic 'no topic' cannot be listened to: "),
+        (["envelope://5000", "--type", "std_msgs/msg/String"], "--type belongs to topic://"),
+        (["topic://t", "--topic", "/t"], "--topic belongs to udp://, tcp://, ws://, zenoh://"),
+        (
+            ["5000"],
+            "'5000' does not say what it is: udp://5000 is where a gateway sends to, envelope://5000 where a router",
+        ),
+        (["mqtt://5000"], "'mqtt://5000' is not udp://[HOST:]PORT, "),
     ],
 )
-def test_a_mistake_in_tap_is_one_line_and_exit_code_2(
+def test_a_mistake_in_listen_is_one_line_and_exit_code_2(
     words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["tap", *words]) == 2
-    assert f"router tap: {complaint}" in capsys.readouterr().err
+    assert main(["listen", *words]) == 2
+    assert f"router listen: {complaint}" in capsys.readouterr().err
 
 
-def test_tap_of_a_topic_without_ros_says_what_is_missing() -> None:
+def test_listening_to_a_topic_without_ros_says_what_is_missing() -> None:
     program = (
-        "import sys; from router.cli import main; sys.modules['rclpy'] = None; sys.exit(main(['tap', '--topic', 't']))"
+        "import sys; from router.cli import main; sys.modules['rclpy'] = None; sys.exit(main(['listen', 'topic://t']))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
-    assert done.stderr.startswith("router tap: a topic needs ROS 2, which is not installed here (")
+    assert done.stderr.startswith("router listen: a topic needs ROS 2, which is not installed here (")
 
 
 def test_sim_ends_on_a_signal_with_its_final_statistics(table_path: Callable[..., Path]) -> None:
-    command = [sys.executable, "-m", "router", "sim", str(table_path()), "--json", "--rate-scale", "50"]
+    command = [sys.executable, "-m", "router", "sim", "-t", str(table_path()), "--json", "--speed", "50x"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as sim:
         assert sim.stdout is not None
         first = json.loads(sim.stdout.readline())
@@ -191,7 +196,7 @@ def test_sim_writes_lines_where_there_is_no_terminal(
     table_path: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    assert main(["sim", str(table_path()), "--duration", "0.1"]) == 0
+    assert main(["sim", "-t", str(table_path()), "--for", "100ms"]) == 0
     title, last = capsys.readouterr().out.splitlines()
     assert title.startswith("2 endpoints send 2 payload cases, 4/s, to 127.0.0.1:")
     assert "received 0" in last
@@ -202,7 +207,7 @@ def test_sim_writes_lines_where_there_is_no_terminal(
 def test_sim_tells_when_a_board_stops_and_what_it_cannot_read(table_path: Callable[..., Path]) -> None:
     path = table_path()
     board = read_table(path).endpoints["board"].address.value
-    command = [sys.executable, "-m", "router", "sim", str(path)]
+    command = [sys.executable, "-m", "router", "sim", "-t", str(path)]
     with (
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as sim,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as router,
@@ -225,5 +230,5 @@ def test_what_sim_cannot_use_is_told(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert capsys.readouterr().err == f"router sim: {complaint}\n"
     path = tmp_path / "bad.yaml"
     path.write_text("version: 1\nlisten: 5\n")
-    assert main(["sim", str(path)]) == 78
+    assert main(["sim", "-t", str(path)]) == 78
     assert "error[" in capsys.readouterr().err

@@ -1,0 +1,69 @@
+"""`router demo`: simulated boards and a router on this computer, until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Thread
+
+from router.assets import asset
+from router.cli import BAD_TABLE, OK, Subparsers, add_verb
+from router.cli.findings import is_coloured, print_findings
+from router.cli.init import FIRST_TABLE
+from router.cli.run import route
+from router.cli.tool_options import say
+from router.compiler import check_table
+from router.compiler.program import Program
+from router.engine.wire import Wire
+from router.log import configure_log
+from router.tools.simulator import Simulator
+
+_DESCRIPTION = """Play the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
+Nothing leaves this computer. The first lines say where to look with a browser or Foxglove; 'ros2 topic list' and the
+other verbs look at it as well. Where the rover's ROS messages are not installed, it is the table of 'router init'."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    add_verb(subparsers, "demo", _DESCRIPTION, "router demo", "router top -t routes/sim.yaml    # in another terminal")
+
+
+def run(args: argparse.Namespace) -> int:
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    configure_log(coloured=is_coloured(sys.stderr))
+    checked = check_table(_table())
+    print_findings(checked.diagnostics, sys.stderr)
+    if checked.program is None:
+        return BAD_TABLE
+    with _simulated(checked.program):
+        route(checked.program, [], os.environ)
+    return OK
+
+
+def _table() -> Path:
+    if find_spec("comms") is not None:
+        return asset("routes/sim.yaml")
+    say("the rover's ROS messages (comms) are not installed: this is the table that `router init` writes")
+    return FIRST_TABLE / "routes" / "rover.yaml"
+
+
+@contextmanager
+def _simulated(program: Program) -> Iterator[None]:
+    """Play the table's endpoints in a thread. Raises UsageError where an address is taken."""
+    simulator = Simulator(Wire(program.envelope), program.table, seed=1, deadmen=program.deadmen)
+    # The thread inherits this, and leaves the signals to the main thread.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1})
+    thread = Thread(target=simulator.run, args=(None, math.inf, lambda _: None), name="simulator")
+    thread.start()
+    try:
+        yield
+    finally:
+        simulator.stop()
+        thread.join()
+        simulator.close()

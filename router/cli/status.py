@@ -1,0 +1,66 @@
+"""`router status`: whether the router runs and is healthy, in one line and an exit code, for scripts."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from router.cli import BAD_USAGE, NETWORK_FAULT, OK, Subparsers, add_verb
+from router.cli.tool_options import add_router_options, running_url
+from router.errors import TransportError
+
+if TYPE_CHECKING:
+    from router.observe.snapshot import Snapshot
+
+DEGRADED = 3
+
+_DESCRIPTION = f"""Say in one line whether the router of a table runs, and what is wrong with it: a stuck receive
+thread, a reload that failed, boards that are silent, deadmen that send in place of commands.
+
+Exit code: {OK} it runs and is healthy, {NETWORK_FAULT} none runs, {DEGRADED} it runs and something is wrong,
+{BAD_USAGE} wrong usage. 'router doctor' says what to do about it."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    examples = ("router status", "router status --json", "until router status; do sleep 1; done")
+    parser = add_verb(subparsers, "status", _DESCRIPTION, *examples)
+    add_router_options(parser)
+    parser.add_argument("--json", action="store_true", help="a JSON object: state, url, problems, received")
+
+
+def run(args: argparse.Namespace) -> int:
+    from router.tools.running_router import is_receiving, metrics
+
+    url = running_url(args)
+    problems: list[str] = []
+    received = None
+    try:
+        found = metrics(url)
+        received = found.total("datagrams_received")
+        problems = [*([] if is_receiving(url) else ["the receive thread is stuck"]), *_problems(found)]
+        state, code = ("degraded", DEGRADED) if problems else ("running", OK)
+    except TransportError as error:
+        state, code, problems = "down", NETWORK_FAULT, [str(error)]
+    if args.json:
+        print(json.dumps({"state": state, "url": url, "problems": problems, "received": received}))
+    else:
+        details = [*problems, *([] if received is None else [f"{received} datagrams received"])]
+        print(f"{state}: {'; '.join(details)}")
+    return code
+
+
+def _problems(found: Snapshot) -> Iterator[str]:
+    if found.counts("config_last_reload_successful").get(()) == 0:
+        yield "its last reload failed"
+    sources = {source for _, source in found.counts("messages_received")}
+    limits = found.counts("endpoint_stale_after_seconds")
+    for (name,), seen in found.counts("endpoint_last_seen_timestamp_seconds").items():
+        if not seen or name not in sources or (name,) not in limits:
+            continue  # as for alerts: who never sent is switched off
+        if found.at - seen > limits[name,]:
+            yield f"{name} is silent for {found.at - seen:.0f} s"
+    for (route,), active in found.counts("deadman_active").items():
+        if active:
+            yield f"the deadman of {route} sends"

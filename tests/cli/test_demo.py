@@ -1,0 +1,49 @@
+"""`router demo` on a terminal: it says where to look, and ends with Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from router.cli import demo
+from router.cli.init import FIRST_TABLE
+
+PATIENCE = 60.0
+
+
+def test_without_the_rovers_messages_it_plays_the_first_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo, "find_spec", lambda _: None)
+    assert demo._table() == FIRST_TABLE / "routes" / "rover.yaml"
+    assert "comms" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("rclpy") is None or find_spec("comms") is None, reason="needs ROS 2 and comms")
+def test_it_says_where_to_look_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "RECORDINGS": str(tmp_path), "NO_COLOR": "1"}
+    command = [sys.executable, "-m", "router", "demo"]
+    with subprocess.Popen(
+        command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, start_new_session=True
+    ) as process:
+        os.close(theirs)
+        limit, seen = time.monotonic() + PATIENCE, ""
+        while "Foxglove " not in seen:
+            ready, _, _ = select.select([ours], [], [], limit - time.monotonic())
+            assert ready, seen
+            seen += os.read(ours, 65536).decode()
+        assert "status page        http://127.0.0.1:29108/" in seen
+        assert "gateway dashboard  http://127.0.0.1:28765/" in seen
+        process.send_signal(2)
+        assert process.wait(PATIENCE) == 0
+    os.close(ours)
