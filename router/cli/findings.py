@@ -82,16 +82,17 @@ def as_github(finding: Diagnostic, *, strict: bool) -> str:
 
 
 def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
-    """The one-line form, then the source line with a caret where the file still has it."""
+    """What is wrong, then the source line with a caret where the file still has it, then what to do about it."""
     level = severity(finding, strict=strict)
-    colour = _RED if level is Severity.ERROR else _YELLOW
-    hint = f"; {finding.hint}" if finding.hint else ""
-    if coloured:
-        head = f"{_BOLD}{finding.span}: {colour}{level.value}[{finding.code.value}]{_RESET}{_BOLD}: "
-        first = f"{head}{visible(finding.message)}{_RESET}{visible(hint)}"
-    else:
-        first = visible(f"{finding.span}: {level.value}[{finding.code.value}]: {finding.message}{hint}")
-    return "\n".join((first, *excerpt(finding.span, colour if coloured else "")))
+    colour, bold, cyan, reset = (_colour(level), _BOLD, _CYAN, _RESET) if coloured else ("", "", "", "")
+    place = visible(str(finding.span))
+    first = f"{bold}{place}: {colour}{level.value}[{finding.code.value}]{reset}{bold}: {visible(finding.message)}{reset}"
+    remedy = [f"{bold}{cyan}help:{reset} {visible(finding.hint)}"] if finding.hint else []
+    return "\n".join((first, *excerpt(finding.span, colour), *remedy))
+
+
+def _colour(level: Severity) -> str:
+    return _RED if level is Severity.ERROR else _YELLOW
 
 
 def is_coloured(out: TextIO) -> bool:
