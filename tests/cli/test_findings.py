@@ -33,12 +33,13 @@ def excerpt(name: str, line: str, start: int, end: int) -> list[str]:
     return as_text(finding, coloured=False, strict=False).splitlines()[1:]
 
 
-def test_text_is_one_line_and_the_source_with_a_caret() -> None:
+def test_text_is_what_is_wrong_the_source_with_a_caret_and_the_remedy() -> None:
     Path("t.yaml").write_text("a: 1\n  x: accel_q  # c\n")
     assert as_text(ERROR, coloured=False, strict=False) == (
-        "t.yaml:2:6: error[unknown-field]: no field 'accel_q'; did you mean 'accel_x'?\n"
+        "t.yaml:2:6: error[unknown-field]: no field 'accel_q'\n"
         "    2 |   x: accel_q  # c\n"
-        "      |      ^^^^^^^"
+        "      |      ^^^^^^^\n"
+        "help: did you mean 'accel_x'?"
     )
 
 

@@ -66,4 +66,6 @@ def test_there_is_nothing_to_test(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "no tests (*.test.yaml)" in capsys.readouterr().err
     (tmp_path / "only.test.yaml").write_text("tests: {a: {given: {case: ph_info, from: any}, expect: nothing}}\n")
     assert main(["test", "."]) == BAD_TABLE
-    assert "only.test.yaml:1:1: error[bad-file]: only.yaml has no routes; only routes are" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "only.test.yaml:1:1: error[bad-file]: only.yaml has no routes\n" in said
+    assert "\nhelp: only routes are tested" in said
