@@ -34,7 +34,7 @@ def table(place: Site, publishes: str, listens: str) -> dict[str, Any]:
     return {
         "version": 1,
         "envelope": {"protos": str(PROTOS), "message": "PBEnvelope", "oneof": "payload"},
-        "metrics": {"address": f"127.0.0.1:{place.metrics}"},
+        "http": {"address": f"127.0.0.1:{place.metrics}"},
         "listen": {"all": {"address": f"{ROUTER}:{place.listen}", "receive_buffer": "4MiB"}},
         "endpoints": {NEAR: {"address": f"{host}:{port}", "kind": "tool"}},
         "routes": {case.name: _routes(case, publishes, listens) for case in WIRE.envelope.cases.values()},
@@ -49,8 +49,7 @@ def _routes(case: PayloadCase, publishes: str, listens: str) -> list[dict[str, A
     return [
         {"source": NEAR, "topics": [{"topic": f"{publishes}/{case.name}", **kind, "fields": into_ros}]},
         {
-            "source": "ros",
-            "topics": [{"topic": f"{listens}/{case.name}", **kind}],
+            "source": {"topic": f"{listens}/{case.name}", **kind},
             "fields": {"auto": True, **renamed},
             "destinations": [NEAR],
         },
