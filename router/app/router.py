@@ -29,7 +29,6 @@ from router.observe.reports import Reporter
 from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
-from router.table.model import Gateway
 from router.threads import DaemonThread, background_threads
 
 if TYPE_CHECKING:  # prometheus_client would take a tenth of the time until the ports are bound
@@ -96,12 +95,9 @@ class Router:
             table=str(program.table.path),
             listening={name: listener.bound_to for name, listener in self.listeners.items()},
             routes=sum(not route.ignore for route in program.table.routes),
-            gateways={gateway.settings.name: _place(gateway.settings) for gateway in program.gateways},
             destinations=len(program.senders),
             published=len(program.publishers),
             subscribed=len(program.subscriptions),
-            metrics=str(self.metrics_address) if self.metrics_address else None,
-            foxglove=str(program.table.foxglove.value) if program.table.foxglove else None,
         )
         return self
 
@@ -234,12 +230,6 @@ def _datapath(program: Program, context: RouterContext, mirror: Mirror, subscrib
         else:
             return NativeDatapath(library, context, mirror)
     return PythonDatapath(context, mirror, subscribed)
-
-
-def _place(gateway: Gateway) -> str:
-    """`websocket 127.0.0.1:8765`."""
-    place = gateway.address or (gateway.zenoh.key if gateway.zenoh else None)
-    return f"{gateway.transport.value.value} {place.value if place else ''}"
 
 
 def _version() -> str:

@@ -85,8 +85,8 @@ def as_text(finding: Diagnostic, *, coloured: bool, strict: bool) -> str:
     """What is wrong, then the source line with a caret where the file still has it, then what to do about it."""
     level = severity(finding, strict=strict)
     colour, bold, cyan, reset = (_colour(level), _BOLD, _CYAN, _RESET) if coloured else ("", "", "", "")
-    place = visible(str(finding.span))
-    first = f"{bold}{place}: {colour}{level.value}[{finding.code.value}]{reset}{bold}: {visible(finding.message)}{reset}"
+    head = f"{bold}{visible(str(finding.span))}: {colour}{level.value}[{finding.code.value}]{reset}"
+    first = f"{head}{bold}: {visible(finding.message)}{reset}"
     remedy = [f"{bold}{cyan}help:{reset} {visible(finding.hint)}"] if finding.hint else []
     return "\n".join((first, *excerpt(finding.span, colour), *remedy))
 

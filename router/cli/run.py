@@ -94,12 +94,13 @@ def route(program: Program, ros_args: Sequence[str], environ: Mapping[str, str])
 
 
 def _show_places(router: Router) -> None:
-    """Say on a terminal where to look; elsewhere the log has the addresses, with "router started"."""
-    if not sys.stderr.isatty():
-        return
+    """Say where to look: a place a line on a terminal, elsewhere a record of the log."""
     found = dict(_places(router))
-    width = max(map(len, found), default=0)
-    logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
+    if found and not sys.stderr.isatty():
+        logger.info("where to look", **found)
+    elif found:
+        width = max(map(len, found))
+        logger.info("\n".join(["where to look:", *(f"  {name:{width}}  {place}" for name, place in found.items())]))
 
 
 def _places(router: Router) -> Iterator[tuple[str, str]]:

@@ -129,6 +129,19 @@ def test_a_ros_parameter_is_a_table_variable_and_wins_over_the_environment(table
 DEADMAN = "    deadman: {timeout: 500ms, send: {ph_info: {}}, to: [basestation]}\n"
 
 
+def test_the_log_says_where_to_look(table: Path) -> None:
+    pages = {name: f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}" for name in ("http", "foxglove")}
+    table.write_text(table.read_text() + "".join(f"{name}: {{address: {place}}}\n" for name, place in pages.items()))
+    process = start(MODULE, "run", table)
+    wait_for_start(process)
+    assert process.stderr
+    places = json.loads(process.stderr.readline())
+    assert places["event"] == "where to look"
+    assert places["status page"] == f"http://{pages['http']}/"
+    assert places["Foxglove"] == f"ws://{pages['foxglove']}"
+    end(process)
+
+
 def test_arguments_that_ros_refuses_end_it_before_deadmen_send(table: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2")
     text = table.read_text() + DEADMAN + TOPIC
