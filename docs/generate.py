@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 
-from benchmarks.versus.report import page
+from benchmarks.versus.report import page as figures
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
@@ -25,6 +25,8 @@ from router.compiler.metrics import (
     TOPIC_STATES,
 )
 from router.errors import Code
+from tests.bad_tables.corpus import HERE as CORPUS
+from tests.bad_tables.corpus import BadTable, good, sections
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parent / "benchmarks" / "results.json"
@@ -33,8 +35,8 @@ _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
 _COUNTERS = """\
 Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route
 and target, accepted = delivered + dropped + filtered + collected + waiting, and what the router holds back: open
-frames, the queue of a budget, what `on_limit: latest` holds. Delivered is sent or published. With `for_each`, each element
-is a message. What a deadman sends is in its own metrics alone, and its bytes in none."""
+frames, the queue of a `bandwidth`, what `on_limit: latest` holds. Delivered is sent or published. With `for_each`,
+each element is a message. What a deadman sends is in its own metrics alone, and its bytes in none."""
 _GATEWAYS = """\
 A [gateway](table.md#gateways) has its name as `listener` and as `route`. What it sends has `clients` as its target, and
 its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
@@ -113,16 +115,29 @@ def _reasons(metric: str, reasons: Mapping[str, str], label: str = "reason") -> 
 
 
 def findings_page() -> str:
-    """The closed list of codes."""
+    """The closed list of codes, each with a mistake and what to write in its place, of the tests' corpus."""
     lines = ["# Codes of findings", "", _MADE, "| code | severity | meaning |", "|---|---|---|"]
-    lines += [f"| `{code.value}` | {code.severity.value} | {code.meaning} |" for code in Code]
+    lines += [f"| [`{code.value}`](#{code.value}) | {code.severity.value} | {code.meaning} |" for code in Code]
+    for code in Code:
+        page = CORPUS / f"{code.value}.md"
+        mistake = next(sections(page))
+        kind, text = good(page)
+        lines += ["", f"## {code.value}", "", code.meaning, "", "```text", first_finding(mistake), "```", ""]
+        lines += ["Write instead:", "", f"```{kind}", text.removeprefix("extends: base/base.yaml\n").strip(), "```"]
     return "\n".join([*lines, ""])
+
+
+def first_finding(mistake: BadTable) -> str:
+    """What is said of the first mistake in a table, without the folder of the tests."""
+    lines = mistake.said.splitlines()
+    end = next(index for index, line in enumerate(lines) if index and not line.startswith((" ", "help: ")))
+    return "\n".join(lines[:end]).replace("bad_tables/", "")
 
 
 def figures_page() -> str:
     """What `make bench` measured."""
     found = json.loads(RESULTS.read_text(encoding="utf-8"))
-    return f"# Figures\n\n{_MADE}\n[How they were measured](performance.md).\n\n{page(found)}"
+    return f"# Figures\n\n{_MADE}\n[How they were measured](performance.md).\n\n{figures(found)}"
 
 
 PAGES = {

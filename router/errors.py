@@ -116,6 +116,10 @@ class Code(enum.Enum):
     DUPLICATE_FIELD = ("duplicate-field", "A mapping fills a field twice, or two fields that exclude each other.")
     NOTHING_MAPPED = ("nothing-mapped", "A mapping that fills no field at all.")
     EXPRESSION_SYNTAX = ("expression-syntax", "Not an expression.")
+    CUT_EXPRESSION = (
+        "cut-expression",
+        "A comment that is only a number, or an operator with a word, behind an expression.",
+    )
     FORBIDDEN_EXPRESSION = ("forbidden-expression", "Python that expressions do not have.")
     UNKNOWN_FUNCTION = ("unknown-function", "A function that is not listed in [functions](functions.md).")
     WRONG_ARGUMENTS = ("wrong-arguments", "A call with too many, too few or unsuitable arguments.")
@@ -132,7 +136,14 @@ class Code(enum.Enum):
 
 
 _WARNINGS = frozenset(
-    {Code.UNUSED_PROTO, Code.UNCOVERED_PAYLOAD_CASE, Code.UNUSED_LISTENER, Code.NOT_LOCKED, Code.NO_DEADMAN}
+    {
+        Code.UNUSED_PROTO,
+        Code.UNCOVERED_PAYLOAD_CASE,
+        Code.UNUSED_LISTENER,
+        Code.NOT_LOCKED,
+        Code.NO_DEADMAN,
+        Code.CUT_EXPRESSION,
+    }
 )
 
 
@@ -198,6 +209,15 @@ def shown_path(path: Path) -> str:
         return str(absolute.relative_to(Path.cwd()))
     except ValueError:
         return str(absolute)
+
+
+def nearest_path(path: Path) -> Path | None:
+    """The file or folder beside a path that is not there which it most likely stands for."""
+    try:
+        near = nearest(path.name, (other.name for other in path.parent.iterdir() if other != path))
+    except OSError:
+        return None
+    return path.with_name(near) if near else None
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

@@ -16,7 +16,7 @@ from router.compiler.mapping import build
 from router.compiler.payload import constant_envelope
 from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
-from router.errors import Code, Diagnostic, MappingError, SourceSpan
+from router.errors import Code, Diagnostic, MappingError, SourceSpan, did_you_mean
 from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, OnLimit, Route, RouteTable
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
@@ -105,12 +105,23 @@ def _successors(lookup: Lookup, route: Route, deadman: Deadman) -> tuple[str, ..
     served |= {name.removeprefix("routes/") for name in table.broken if name.startswith("routes/")}
     are_known = all(to.value in table.endpoints for to in deadman.to)  # else that is the mistake
     for name in deadman.disarmed_by:
-        if lookup.case(name) is not None and name.value not in served and are_known:
+        if name.value not in lookup.envelope.cases:
+            message = f"{lookup.envelope.name} has no payload case '{name.value}'"
+            hint = did_you_mean(name.value, _commanding(table, route, deadman) or lookup.envelope.cases)
+            lookup.report(name.span, Code.UNKNOWN_PAYLOAD_CASE, message, hint)
+        elif name.value not in served and are_known:
             to = " or ".join(f"'{to.value}'" for to in deadman.to)
             message = f"no other route sends '{name.value}' to {to}, so it cannot take over"
-            hint = "name a payload case that commands what the deadman stops"
+            hint = did_you_mean(name.value, _commanding(table, route, deadman)) or f"no other route commands {to}"
             lookup.report(name.span, Code.BAD_VALUE, message, hint)
     return tuple(each.name for each in found)
+
+
+def _commanding(table: RouteTable, route: Route, deadman: Deadman) -> set[str]:
+    """The payload cases of other routes to what the deadman stops."""
+    stopped = {to.value for to in deadman.to}
+    others = [each for each in table.routes if each.name != route.name]
+    return {each.case.value for each in others if stopped & {to.endpoint.value for to in each.destinations}}
 
 
 def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | None:

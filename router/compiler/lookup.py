@@ -12,7 +12,7 @@ from router.compiler.expressions import ExpressionError, Reads, Scope, Typed, ch
 from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest
-from router.table.model import Endpoint, EndpointKind, EnvelopeSettings, Expression, RouteTable, Topic
+from router.table.model import ROS, Endpoint, EndpointKind, EnvelopeSettings, Expression, RouteTable, Topic
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
 from router.types.proto_files import read_folder
@@ -89,6 +89,8 @@ class Lookup:
                 self.report(meant.span, Code.UNKNOWN_ENDPOINT, message, f"did you mean '{name.value}'?")
             else:
                 hint = did_you_mean(name.value, known)
+                if name.value == ROS:
+                    hint = "messages come from topics by their names: `source: {topic: NAME}`"
                 self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
         return found
 

@@ -50,6 +50,8 @@ def with_types(table: RouteTable, cases: Mapping[str, PayloadCase], findings: li
             return topic
         if table.package is not None:
             return replace(topic, type=Located(f"{table.package.value}/msg/{name}", topic.topic.span))
+        if "package" in table.broken:
+            return topic
         message = f"the topic '{topic.topic.value}' lacks the key 'type'"
         hint = f"say it, or `defaults: {{package: PACKAGE}}`, which makes it PACKAGE/msg/{name}"
         findings.append(Diagnostic(topic.topic.span, Code.MISSING_KEY, message, hint))

@@ -175,22 +175,28 @@ def _encoded(records: Iterable[McapRecord]) -> bytes:
     return encoded
 
 
+def _cannot_record(settings: RecordSettings, why: str | None) -> StartError:
+    there = settings.directory
+    remedy = f"make it for this user (sudo install -d -o $USER {there}), or give `record` another 'directory'"
+    return StartError(f"{settings.span}: cannot record to {there}: {why}; {remedy}")
+
+
 class RecordingDirectory:
     """The files `STEM_TIME[_REASON].mcap` below a table's `record.directory`; others are left alone.
 
-    They have at most `keep` bytes. Creates the directory; raises StartError.
+    They have at most `retention` bytes. Creates the directory; raises StartError.
     """
 
     def __init__(self, settings: RecordSettings, stem: str) -> None:
         try:
             settings.directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise StartError(f"{settings.span}: cannot record to {settings.directory}: {error.strerror}") from error
+            raise _cannot_record(settings, error.strerror) from error
         if not os.access(settings.directory, os.W_OK | os.X_OK):
-            raise StartError(f"{settings.span}: may not write to {settings.directory}; give `record` another directory")
+            raise _cannot_record(settings, "this user may not write there")
         self.path = settings.directory.resolve()
         self._stem = stem
-        self._keep = settings.retention
+        self._retention = settings.retention
 
     def new(self, reason: str, channels: Channels, about: Mapping[str, str]) -> RecordingFile:
         """Create a file. Equal names, as where the clock begins anew at each start, get numbers. Raises OSError."""
@@ -213,7 +219,7 @@ class RecordingDirectory:
         sizes = {path: size for path, size in recording_sizes(self.path, self._stem).items() if path != writing}
         total = sum(sizes.values())
         for path, size in sizes.items():
-            if total + coming <= self._keep:
+            if total + coming <= self._retention:
                 return
             path.unlink(missing_ok=True)
             total -= size
@@ -314,7 +320,7 @@ class ContinuousWriter:
         self.lost += chunk.datagrams
         if self._retry_at is None:
             where = str(self._file.path if self._file is not None else self._directory.path)
-            remedy = "make room, or give `record` a smaller `keep`"
+            remedy = "make room, or give `record` a smaller `retention`"
             logger.error("cannot record; trying again every 10 s", where=where, problem=error.strerror, remedy=remedy)
         self._retry_at = now + _RETRY
         if self._file is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from router.errors import Diagnostic, Severity, TableError
 from router.table.addresses import outside_findings
 from router.table.build import build_table
+from router.table.comments import cut_findings
 from router.table.extends import load_chain
 from router.table.model import RouteTable
 from router.table.schema import check_shape
@@ -29,6 +30,7 @@ def load_table(path: Path, environ: Mapping[str, str] | None = None) -> tuple[Ro
         root = load_chain(path, os.environ if environ is None else environ, sources, findings)
         shaped = written_out(check_shape(root, findings))
         table = build_table(shaped, sources, findings)
+        findings.extend(cut_findings(shaped, sources))
         if table is not None and table.networks is not None:
             findings.extend(outside_findings(shaped, table.networks, [source.file for source in sources]))
     except TableError as error:

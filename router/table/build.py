@@ -102,13 +102,14 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
     if (envelope is None or routes is None) and not _has_gateways_only(root):
         return None
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
+    defaults = root.get("defaults")
     return RouteTable(
         path=sources[0].path,
         files=tuple(source.path for source in sources),
         sha256=hashlib.sha256(b"".join(source.data for source in sources)).hexdigest(),
         envelope=envelope,
         node=builder.one(root, "node", _node) or NodeSettings(),
-        package=builder.one(root, "defaults", _package),
+        package=builder.one(defaults, "package", _name) if isinstance(defaults, MappingNode) else None,
         http=builder.one(root, "http", _address),
         listeners=builder.each(root, "listen", _named(Listener)),
         endpoints=builder.each(root, "endpoints", _named(Endpoint)),
@@ -253,8 +254,8 @@ def _address(entry: Entry) -> Located[Address]:
     return Located(parsed(parse_local, written), written.span)
 
 
-def _package(entry: Entry) -> Located[str] | None:
-    return optional_text(mapping(entry.value), "package")
+def _name(entry: Entry) -> Located[str]:
+    return located(entry.value)
 
 
 def _record(entry: Entry) -> RecordSettings:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import yaml
 
 from router.errors import Code, Diagnostic, SourceSpan, TableError
+from router.table.mistakes import explain
 from router.table.nodes import Entry, MappingNode, Node, Plain, ScalarNode, SequenceNode, TextPlace, cut_off, locate
 from router.table.source import Source, fill, has_variables, unusable_character
 
@@ -72,7 +73,7 @@ class _Composer:
             for event in yaml.parse(self._source.text, Loader=LOADER):
                 yield event
         except yaml.MarkedYAMLError as error:
-            raise TableError([_explain(error, self._source, self._open_quote(event), self._open_bracket())]) from error
+            raise TableError([explain(error, self._source, self._open_quote(event), self._open_bracket())]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
 
@@ -255,105 +256,3 @@ def resolve(text: str) -> Plain:
 def surprise(text: str) -> Surprise | None:
     """Why the plain scalar means different things to readers of YAML 1.1 and 1.2; None where it does not."""
     return next((found for pattern, found in _SURPRISES if pattern.fullmatch(text)), None)
-
-
-# Syntax errors
-
-
-class _Advice(NamedTuple):
-    """What is wrong and what to do. With `at_start` the place is where the construct begins."""
-
-    what: str
-    hint: str = ""
-    at_start: bool = False
-
-
-_TAB = _Advice("a tab indents this line", "indent with spaces")
-_OPEN_QUOTE = _Advice("this quote is not closed in its line", at_start=True)
-_NO_COLON = _Advice("this line has a key without ':'", at_start=True)
-_ADVICE = {
-    "did not find expected ',' or ']'": _Advice(
-        "this '[' is not closed by a ']', or a ',' is missing inside", at_start=True
-    ),
-    "did not find expected ',' or '}'": _Advice(
-        "this '{' is not closed by a '}', or a ',' is missing inside", at_start=True
-    ),
-    "found unexpected end of stream": _OPEN_QUOTE,
-    "found unexpected document indicator": _OPEN_QUOTE,
-    "found unknown escape character": _Advice(
-        "this backslash sequence does not exist", "single quotes take backslashes as they are"
-    ),
-    "mapping values are not allowed in this context": _Advice(
-        "a ':' cannot stand here", "indent keys of one mapping alike; quote text that has ': ' in it"
-    ),
-    "could not find expected ':'": _NO_COLON,
-    "did not find expected key": _Advice(
-        "no key begins here", "indent keys of one mapping alike; quote text that has special characters in it"
-    ),
-    "did not find expected '-' indicator": _Advice(
-        "this line does not begin with '-' as its neighbours do", "indent what belongs to the item above"
-    ),
-    "block sequence entries are not allowed in this context": _Advice(
-        "a '-' cannot begin an item here", "items of a sequence begin on lines of their own"
-    ),
-    "did not find expected node content": _Advice("a value is missing here"),
-    "did not find expected <document start>": _Advice(
-        "this line is indented less than the first key", "indent keys of one mapping alike"
-    ),
-    "found incompatible YAML document": _Advice("this is a YAML version that is not understood", "remove the line"),
-}
-_NOT_CLOSED = ("did not find expected ',' or ']'", "did not find expected ',' or '}'")
-_FOLLOW_A_BARE_WORD = ("mapping values are not allowed in this context", "did not find expected key")
-_COMMENT = re.compile(r"(?:^|\s)#.*")
-
-
-def _explain(
-    error: yaml.MarkedYAMLError, source: Source, open_quote: SourceSpan | None, open_bracket: SourceSpan | None
-) -> Diagnostic:
-    """The finding for one syntax error.
-
-    `open_quote` is where the quoted scalar before the error begins, if it goes over several lines: then
-    its closing quote is most likely the next one's opening quote. `open_bracket` is the innermost
-    bracket around the error: where the text ends within it, it lacks its counterpart.
-    """
-    line = error.problem_mark.line if error.problem_mark else 0
-    column = error.problem_mark.column if error.problem_mark else 0
-    advice = _advice(error, source, line, column)
-    if open_quote:
-        return Diagnostic(open_quote, Code.BAD_YAML, _OPEN_QUOTE.what)
-    if open_bracket and not any(text.strip() for text in source.lines[line:]):
-        return Diagnostic(open_bracket.part(0, 1), Code.BAD_YAML, "this bracket is never closed")
-    if error.problem in _FOLLOW_A_BARE_WORD and (bare := _line_without_colon(source, line)) is not None:
-        line, column = bare, _indent(source.lines[bare])
-        advice = _NO_COLON
-    elif advice.at_start and error.context_mark:
-        line, column = error.context_mark.line, error.context_mark.column
-    return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, advice.what, advice.hint)
-
-
-def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int) -> _Advice:
-    character = source.lines[line][column : column + 1] if line < len(source.lines) else ""
-    if character == "\t":
-        return _TAB
-    problem = error.problem or str(error)
-    if problem in _NOT_CLOSED and character in ("[", "{") and source.lines[line][:column][-1:].strip():
-        return _Advice(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
-    if problem == "found character that cannot start any token":
-        return _Advice(f"a value cannot begin with '{character}'", "put quotes around it")
-    passed_on = _Advice(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
-    return _ADVICE.get(problem, passed_on)
-
-
-def _line_without_colon(source: Source, line: int) -> int | None:
-    """The line before `line` if it is indented alike and lacks the ':' that makes it a key."""
-    before = line - 1
-    while before >= 0 and not _COMMENT.sub("", source.lines[before]).strip():
-        before -= 1
-    if before < 0 or _indent(source.lines[before]) != _indent(source.lines[line]):
-        return None
-    return None if ":" in _COMMENT.sub("", source.lines[before]) else before
-
-
-def _indent(text: str) -> int:
-    """How far in the first key of a line stands; the dash of an item counts as indentation."""
-    return len(text) - len(text.lstrip(" -"))

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from router.errors import Code, Diagnostic, TableError, nearest, shown_path
+from router.errors import Code, Diagnostic, TableError, nearest_path, shown_path
 from router.table.compose import compose
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
@@ -120,18 +120,10 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
             raise  # the file is there, a place in it is wrong
         what = f"'{reference.text}' cannot be extended: {found.message}"
-        near = nearest(path.name, _names_beside(path))
+        near = nearest_path(path)
         looked = f"looked for {shown_path(Path(os.path.realpath(path)))}"
-        hint = f"did you mean '{reference.text.removesuffix(path.name)}{near}'?" if near else looked
+        hint = f"did you mean '{reference.text.removesuffix(path.name)}{near.name}'?" if near else looked
         raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what, hint)]) from error
-
-
-def _names_beside(path: Path) -> list[str]:
-    """The tables where one was looked for; none where that cannot be known."""
-    try:
-        return [file.name for file in path.parent.iterdir() if file.is_file() and file != path]
-    except OSError:
-        return []
 
 
 def _refuse_cycle(path: Path, seen: list[str], reference: ScalarNode) -> None:

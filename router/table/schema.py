@@ -19,6 +19,7 @@ from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, nearest
 from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten, to_data
 from router.table.reading import mapping
+from router.table.units import nearest_quantity
 
 if TYPE_CHECKING:
     from jsonschema import ValidationError
@@ -163,11 +164,36 @@ def _rests(node: MappingNode) -> set[str]:
     return set(cut_off((name, entry.value) for name, entry in node.entries.items()))
 
 
+_ELSEWHERE = {
+    "topic": ("name",),
+    "type": ("msg", "message", "msg_type", "message_type"),
+    "queue_depth": ("queue", "queue_size", "depth"),
+    "source": ("src", "from", "sender"),
+    "destinations": ("dst", "dest", "target", "targets"),
+    "address": ("ip", "host", "port"),
+    "fields": ("map", "mapping"),
+    "when": ("if", "condition", "filter"),
+    "max_rate": ("rate", "hz", "frequency", "throttle"),
+    "http": ("metrics", "prometheus"),
+}
+"""Keys, and what people who know other programs call them."""
+
+
+def _meant(name: str, known: Iterable[str]) -> str | None:
+    """The key among `known` that a misspelt one stands for."""
+    known = list(known)
+    return nearest(name, known) or next((key for key in known if name in _ELSEWHERE.get(key, ())), None)
+
+
 def _unknown_keys(node: Node, path: Path, known: list[str]) -> Iterable[Diagnostic]:
     for name, entry in mapping(node).entries.items():
         if name not in known and not entry.key.broken:
-            elsewhere = "" if nearest(name, known) else _owners(name, path)
-            hint = elsewhere or did_you_mean(name, known)
+            if ":" in name:
+                hint = "a space is missing after ':'"
+            elif meant := _meant(name, known):
+                hint = f"did you mean '{meant}'?"
+            else:
+                hint = _owners(name, path) or did_you_mean(name, known)
             yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{subject(path)} has no key '{name}'", hint)
 
 
@@ -191,7 +217,7 @@ def _with_known_keys(node: Node, known: list[str]) -> Node:
     entries: dict[str, Entry] = {}
     broken = written.broken
     for name, entry in written.entries.items():
-        meant = name if name in known else nearest(name, [key for key in known if key not in written.entries])
+        meant = name if name in known else _meant(name, (key for key in known if key not in written.entries))
         if meant is None or (meant != name and meant in entries):
             broken = True  # what the key was to say is lost
         else:
@@ -213,7 +239,7 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     if keyword == "required":
         return _missing_key(error, tree)
     if keyword == "type":
-        return Diagnostic(span, Code.WRONG_TYPE, f"{name} {_expected(error)}, not {shown(error.value)}")
+        return Diagnostic(span, Code.WRONG_TYPE, f"{name} {_expected(error)}, not {shown(error.value)}", _remedy(error))
     if keyword == "pattern" and path[-1] in _ADDRESSES:
         return _bad_address(str(error.value), span)
     if keyword == "uniqueItems":
@@ -222,10 +248,28 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     if keyword == "maxProperties":
         return Diagnostic(span, code, f"{name} {_expected(error)}, and no other beside it")
     near = nearest(str(error.value), error.limit) if keyword == "enum" else None
+    if isinstance(error.value, str) and keyword in ("pattern", "anyOf", "oneOf"):
+        near = nearest_quantity(error.value)
+        near = None if near and near.replace(" ", "") == error.value.replace(" ", "") else near
     hint = f"did you mean '{near}'?" if near else ""
     if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
         return Diagnostic(span, code, f"{name} must not be empty")
     return Diagnostic(span, code, f"{name} {_expected(error)}, not {shown(error.value)}", hint)
+
+
+def _remedy(error: SchemaError) -> str:
+    """What to do about a value of the wrong type, where that is clear."""
+    name, value = str(error.path[-1]) if error.path else "", error.value
+    is_glued = isinstance(value, str) and "object" in error.limit and re.match(r"\w+:\S", value)
+    if is_glued or (value is None and ":" in name):
+        return "a space is missing after ':'"
+    if value is None and any(key in error.path for key in NAME_FIELDS):
+        return "a field that is left out keeps its default"
+    if error.path[:-1] == ("routes",) and value is None:
+        return "indent the keys of a route further than its payload case"
+    if error.path[:-1] == ("routes",) and name in table_schema()["definitions"]["route"]["properties"]:
+        return f"'{name}' is a key of a route: indent it further than the payload case that it is for"
+    return ""
 
 
 def shown(value: object) -> str:

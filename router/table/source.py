@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from router.assets import asset, is_installed
-from router.errors import Code, Diagnostic, SourceSpan, TableError, nearest, shown_path
+from router.errors import Code, Diagnostic, SourceSpan, TableError, nearest, nearest_path, shown_path
 
 MAX_BYTES = 4 << 20
 _LINE_END = re.compile(r"\r\n|\r|\n")
@@ -77,7 +77,9 @@ def _read(path: Path, file: str) -> bytes:
             what = f"the file is larger than {MAX_BYTES >> 20} MiB"
     except OSError as error:
         what = f"the file cannot be read: {(error.strerror or str(error)).lower()}"
-        if isinstance(error, FileNotFoundError) and not path.is_absolute():
+        if isinstance(error, FileNotFoundError) and (near := nearest_path(path)):
+            hint = f"did you mean '{shown_path(near)}'?"
+        elif isinstance(error, FileNotFoundError) and not path.is_absolute():
             hint = f"paths are relative to the working directory, here {Path.cwd()}"
             if is_installed(asset("routes")):
                 hint += "; `router init` writes example tables there"

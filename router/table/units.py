@@ -70,6 +70,28 @@ class Quantity:
     show: Callable[[Any], str]
 
 
+_WRITTEN = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-z]+(?:/s)?)")
+_UNITS = {
+    "m": "min",
+    "sec": "s",
+    "second": "s",
+    "minute": "min",
+    "hour": "h",
+    "msec": "ms",
+    "usec": "us",
+    "hertz": "Hz",
+}
+_UNITS |= {unit.lower(): unit for unit in (*_NANOSECONDS, *_DISK_BYTES, *_BYTES_PER_SECOND, "Hz")}
+
+
+def nearest_quantity(text: str) -> str | None:
+    """`200ms` for `200 MS`, `5 Hz` for `5 hz`: the number with the unit that was meant; None where it is unclear."""
+    match = _WRITTEN.fullmatch(text)
+    written = match[2].lower() if match else ""
+    unit = _UNITS.get(written) or _UNITS.get(written.removesuffix("s"))
+    return f"{match[1]}{' ' * (unit == 'Hz')}{unit}" if match and unit else None
+
+
 def parse_duration(text: str) -> int:
     """`500ms` as nanoseconds."""
     return _exact(text, _NANOSECONDS, "nanoseconds", MAX_DURATION)
@@ -95,7 +117,7 @@ def parse_rate(value: str | float) -> float:
     """`30 Hz` or a plain number as Hz."""
     if isinstance(value, str):
         if not (match := _HERTZ.fullmatch(value)):
-            raise ValueError(f"'{value}' is not a rate such as '30 Hz'")
+            raise ValueError(f"'{value}' is not a rate such as '30 Hz'{_meaning(value, 'Hz')}")
         value = float(match[1])
     if not 0 < value < math.inf:
         raise ValueError("a rate must be above zero")
@@ -110,10 +132,16 @@ def parse_topic_rate(value: str | float) -> int:
     return period
 
 
+def _meaning(text: str, *units: str) -> str:
+    """`; did you mean '200ms'?`, if that has one of the units."""
+    meant = nearest_quantity(text)
+    return f"; did you mean '{meant}'?" if meant and meant.endswith(units) and meant != text else ""
+
+
 def _exact(text: str, units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> int:
     match = _QUANTITY.fullmatch(text)
     if not match or match[3] not in units:
-        raise ValueError(f"'{text}' is not a number with a unit of {', '.join(units)}")
+        raise ValueError(f"'{text}' is not a number with a unit of {', '.join(units)}{_meaning(text, *units)}")
     fraction = match[2] or ""
     amount, rest = divmod(int(match[1] + fraction) * units[match[3]], int("1" + "0" * len(fraction)))
     if rest:

@@ -43,7 +43,8 @@ class TapRecording:
         except FileExistsError:
             raise UsageError(f"{path} exists; choose another name") from None
         except OSError as error:
-            raise UsageError(f"cannot write {path}: {error.strerror}") from error
+            remedy = f"make the folder {path.parent}" if isinstance(error, FileNotFoundError) else "see to its folder"
+            raise UsageError(f"cannot write {path}: {error.strerror}; {remedy}, or choose another by -o") from error
 
     @property
     def size(self) -> int:

@@ -124,7 +124,8 @@ def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: 
         return connection.getresponse()
     except (OSError, http.client.HTTPException) as error:
         remedy = "is it running? -t TABLE or --url names another router"
-        raise TransportError(f"no router answers at {url}: {error}; {remedy}") from error
+        why = getattr(error, "strerror", None) or error  # without the number that OSError shows
+        raise TransportError(f"no router answers at {url}: {why}; {remedy}") from error
 
 
 def _read(response: http.client.HTTPResponse, url: str) -> bytes:

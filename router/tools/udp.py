@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import itertools
 import socket
@@ -179,7 +180,9 @@ def send(sender: socket.socket, to: Address, data: bytes, count: int | None, rat
             sent.count += 1
             sent.seconds = elapsed
     except OSError as error:
-        raise TransportError(f"cannot send to {to}: {error.strerror}") from error
+        is_away = error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH)
+        remedy = "; is it switched on, and this computer in its network?" if is_away else ""
+        raise TransportError(f"cannot send to {to}: {error.strerror}{remedy}") from error
     if sender.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
         sent.refused += 1
 
@@ -189,6 +192,7 @@ def send_once(sender: socket.socket, data: bytes) -> int:
     try:
         sender.send(data)
     except ConnectionRefusedError:
-        sender.send(data)
+        with contextlib.suppress(ConnectionRefusedError):  # of another one, that came in between
+            sender.send(data)
         return 1
     return 0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, shown_path
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest_path, shown_path
 from router.types.lock_file import Lock
 
 PROTO = ".proto"
@@ -55,7 +55,9 @@ def read_folder(root: Path, blame: SourceSpan) -> Folder:
     What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder.
     """
     if not root.is_dir():
-        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {shown_path(root)}")])
+        near = nearest_path(root.resolve())
+        hint = f"did you mean '{shown_path(near)}'?" if near else "a path is relative to the table that it stands in"
+        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {root.resolve()}", hint)])
     found = {
         name: path
         for path in walk(root)

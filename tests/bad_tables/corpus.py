@@ -1,7 +1,9 @@
 """The corpus of bad tables: `CODE.md` has tables with one kind of finding, and what `router validate` says of each.
 
-Each section is named after its table, `bad_tables/NAME.yaml`, and has two blocks: the table, with its encoding if that
-is not UTF-8, and the exact text. Most tables extend `base/base.yaml`, which has nothing wrong in it.
+A page begins with what to write in place of its first table: a table that has no findings, or an envelope.proto. Each
+section is named after its table, `bad_tables/NAME.yaml`, and has two blocks: the table, with its encoding if that is
+not UTF-8, and the exact text. Most tables extend `base/base.yaml`, which has nothing wrong in it. docs/findings.md has
+the first section and what to write in its place.
 
 To write the texts of new or changed sections: `python -m tests.bad_tables.corpus`; then read them as if you had made
 the mistake.
@@ -28,6 +30,7 @@ _SECTION = re.compile(
     r"^## (?P<name>\S+)\n\n```yaml ?(?P<encoding>\S*)\n(?P<table>.*?)^```\n\n```text\n(?P<said>.*?)^```\n",
     re.MULTILINE | re.DOTALL,
 )
+_GOOD = re.compile(r"^```(?P<kind>yaml|proto) good\n(?P<text>.*?)^```\n", re.MULTILINE | re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,12 @@ def sections(page: Path) -> Iterator[BadTable]:
     for match in found:
         table = match["table"].encode(match["encoding"] or "utf-8")
         yield BadTable(page.stem, match["name"], table, match["said"])
+
+
+def good(page: Path) -> tuple[str, str]:
+    """What to write in place of a page's first table: `yaml` or `proto`, and the text."""
+    [(kind, text)] = _GOOD.findall(page.read_text(encoding="utf-8"))
+    return kind, text
 
 
 def unpack(folder: Path, tables: list[BadTable]) -> None:

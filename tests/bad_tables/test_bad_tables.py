@@ -8,9 +8,17 @@ import pytest
 
 from router.cli import BAD_TABLE, OK, main
 from router.errors import Code
-from tests.bad_tables.corpus import HERE, PAGES, sections, unpack, validate
+from tests.bad_tables.corpus import HERE, PAGES, good, sections, unpack, validate
 
 TABLES = {page.stem: list(sections(page)) for page in PAGES}
+GOOD_PROTO = """
+version: 1
+envelope: {{protos: protos/{protos}, message: PBEnvelope, oneof: payload}}
+listen: {{rover: {{address: 127.0.0.1:5000}}}}
+endpoints: {{board: {{address: 127.0.0.30:8, kind: board}}}}
+routes:
+  note: {{source: any, destinations: board, deadman: {{none: not part of this test}}}}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +40,22 @@ def test_a_bad_table_is_named_after_the_code_that_it_shows() -> None:
         for table in tables:
             assert table.name == table.code or table.name.startswith(f"{table.code}-")
             assert f"[{table.code}]" in table.said
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_what_to_write_in_its_place_has_nothing_wrong(
+    page: Path, unpacked: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kind, text = good(page)
+    table = unpacked / "bad_tables" / "good.yaml"
+    if kind == "proto":
+        protos = table.parent / "protos" / f"good-{page.stem}"
+        protos.mkdir()
+        (protos / "envelope.proto").write_text(text)
+        assert main(["schema", "lock", "--protos", str(protos)]) == OK
+        text = GOOD_PROTO.format(protos=protos.name)
+    table.write_text(text, encoding="utf-8")
+    assert main(["validate", "--strict", str(table)]) == OK, capsys.readouterr().out
 
 
 def test_what_the_bad_tables_extend_has_nothing_wrong(capsys: pytest.CaptureFixture[str]) -> None:

@@ -98,7 +98,7 @@ def test_aliases_repeat_a_node_with_its_place(tmp_path: Path) -> None:
         ("a:\n  b c  # d: e\n  f: 1\n", Code.BAD_YAML, (2, 3)),
         ("a:\n\tb: 1\n", Code.BAD_YAML, (2, 1)),
         ("a: @b\n", Code.BAD_YAML, (1, 4)),
-        ("a: 1\n  b: 2\n", Code.BAD_YAML, (2, 4)),
+        ("a: 1\n  b: 2\n", Code.BAD_YAML, (2, 3)),
         ("a: !!int 1\n", Code.BAD_YAML, (1, 4)),
         ("a: !x {b: 1}\n", Code.BAD_YAML, (1, 4)),
         ("a: 1\n---\nb: 2\n", Code.BAD_YAML, (2, 1)),

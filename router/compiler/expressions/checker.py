@@ -7,7 +7,7 @@ import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from router.compiler.expressions import operators
+from router.compiler.expressions import operators, spellings
 from router.compiler.expressions.functions import FUNCTIONS, HAS, NOT_FINITE, Function
 from router.compiler.expressions.kinds import BoolKind, EnumKind, FloatKind, IntKind, MessageKind, StringKind, TimeKind
 from router.compiler.expressions.operators import constant
@@ -207,7 +207,12 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
     known = [*scope.field_names(), *scope.given, *values]
     if text.lower() in NOT_FINITE:
         known = [text.lower()]
-    hint = _of_an_enum(text, scope) or did_you_mean(text, known) or "only constants can stand here"
+    hint = (
+        _of_an_enum(text, scope)
+        or spellings.NAMES.get(text)
+        or did_you_mean(text, known)
+        or "only constants can stand here"
+    )
     if isinstance(expected, String):
         close = nearest(text, known)
         hint = (f"did you mean the field '{close}'? " if close else "") + f"as text it is {{text: {text}}}"
@@ -256,7 +261,7 @@ def constant_of(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
     holders = scope.holders(holder_name)
     if not holders:
         message = f"{scope.message} has no field or enum '{holder_name}'"
-        hint = did_you_mean(holder_name, scope.holder_names() | set(scope.field_names()))
+        hint = _without_root(path, scope) or did_you_mean(holder_name, scope.holder_names() | set(scope.field_names()))
         raise ExpressionError(text.span(node.value), Code.UNKNOWN_FIELD, message, hint)
     found = [(holder, constants[node.attr]) for holder in holders if node.attr in (constants := _constants(holder))]
     if not found:
@@ -270,6 +275,13 @@ def constant_of(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
     holder, value = found[0]
     literal = constant(value, text.span(node))
     return Typed(EnumKind(holder), literal.node, literal.span) if isinstance(holder, Enum) else literal
+
+
+def _without_root(path: tuple[str, ...], scope: Scope) -> str:
+    """A hint for `msg.accel_x` and `math.pi`, which stand here without what they belong to elsewhere."""
+    if path[1] in scope.field_names():
+        return f"write {'.'.join(path[1:])}: a name is a field of the message"
+    return spellings.NAMES.get(path[-1], "")
 
 
 def _constants(holder: Enum | MessageType) -> Mapping[str, object]:
@@ -303,7 +315,9 @@ def presence(path: tuple[str, ...], field_span: SourceSpan, span: SourceSpan, sc
 def called_name(node: ast.Call, text: Parsed) -> str:
     """The name in front of the brackets. Raises ExpressionError for calls of another shape than `name(a, b)`."""
     if not isinstance(node.func, ast.Name):
-        hint = did_you_mean("", FUNCTIONS)
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
+        known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name)
+        hint = known or did_you_mean("", FUNCTIONS)
         raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only listed functions are called", hint)
     if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
         message = f"{node.func.id}() takes its arguments by position"
@@ -314,7 +328,7 @@ def called_name(node: ast.Call, text: Parsed) -> str:
 def function_named(name: str, span: SourceSpan) -> Function:
     function = FUNCTIONS.get(name)
     if function is None:
-        hint = did_you_mean(name, [*FUNCTIONS, HAS])
+        hint = spellings.FUNCTIONS.get(name) or did_you_mean(name, [*FUNCTIONS, HAS])
         raise ExpressionError(span, Code.UNKNOWN_FUNCTION, f"there is no function '{name}'", hint)
     return function
 
@@ -354,4 +368,5 @@ def _want_accepted(function: Function, arguments: Sequence[Typed]) -> None:
     for parameter, argument in zip([*function.parameters, *repeated], arguments, strict=True):
         if not isinstance(argument.kind, parameter.accepts):
             message = f"{function.name}() takes {parameter.wanted} as '{parameter.name}', not {argument.kind}"
-            raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message)
+            hint = spellings.INTEGERS if function.name == "int" and isinstance(argument.kind, FloatKind) else ""
+            raise ExpressionError(argument.span, Code.WRONG_ARGUMENTS, message, hint)

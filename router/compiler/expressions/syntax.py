@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import warnings
 
+from router.compiler.expressions import spellings
 from router.compiler.expressions.scope import ExpressionError
 from router.errors import Code, SourceSpan
 from router.table.model import Expression
@@ -31,11 +32,8 @@ class Parsed:
                 return ast.parse(text, mode="eval").body
         except SyntaxError as error:
             span, reason = self._blamed(error), (error.msg or "cannot be read").removesuffix(" (<unknown>, line 1)")
-            may_be_cut = self._expression.place.is_whole_line and "never closed" in reason
-            hint = "quote the expression: inside {} a comma ends it" if may_be_cut else ""
-            if text.lower().lstrip("+-") in (".nan", ".inf"):  # YAML's
-                hint = f"write {text.lower().replace('.', '')}"
-            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"not an expression: {reason}", hint) from None
+            message = f"not an expression: {reason}"
+            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, spellings.of_syntax(text)) from None
         except (ValueError, RecursionError, MemoryError) as error:
             raise ExpressionError(
                 self._expression.span, Code.EXPRESSION_SYNTAX, f"not an expression: {error}"
@@ -82,7 +80,11 @@ def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
 
 
 _HINTS: dict[type[ast.AST], str] = {
-    ast.Constant: "literals are numbers, strings, True and False",
+    ast.Constant: f"literals are numbers, strings, True and False; {spellings.LEFT_OUT}",
+    ast.BitXor: spellings.POWER,
+    ast.BitAnd: "write `and`",
+    ast.BitOr: "write `or`",
+    ast.Invert: "write `not`",
     ast.Lambda: "expressions have no lambda",
     ast.ListComp: "expressions have no loops",
     ast.GeneratorExp: "expressions have no loops",
@@ -90,7 +92,7 @@ _HINTS: dict[type[ast.AST], str] = {
     ast.DictComp: "expressions have no loops",
     ast.NamedExpr: "expressions assign nothing",
     ast.JoinedStr: "join strings with + and str()",
-    ast.Tuple: "write a list, [a, b]",
+    ast.Tuple: "write a list, [a, b]; a decimal number has a point, 9.81",
     ast.Is: "use ==",
     ast.IsNot: "use ==",
 }
