@@ -131,7 +131,8 @@ def first_finding(mistake: BadTable) -> str:
     """What is said of the first mistake in a table, without the folder of the tests."""
     lines = mistake.said.splitlines()
     end = next(index for index, line in enumerate(lines) if index and not line.startswith((" ", "help: ")))
-    return "\n".join(lines[:end]).replace("bad_tables/", "")
+    severity = Code(mistake.code).severity.value  # the tests take warnings as errors
+    return "\n".join(lines[:end]).replace("bad_tables/", "").replace(": error[", f": {severity}[")
 
 
 def figures_page() -> str:

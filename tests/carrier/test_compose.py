@@ -25,7 +25,7 @@ from router.types.wire import delimited
 from tests.carrier.compositions import FILTERED, MAPPING_ERROR, Composer, Misfit, both
 from tests.carrier.messages import payloads, some_payloads
 from tests.compiler.comparing import same as same_value
-from tests.compiler.compiling import AUTO, Published, field_map
+from tests.compiler.compiling import AUTO, Published, chosen, field_map
 from tests.compiler.generated_types import EACH_TYPE, defaults
 from tests.compiler.payloads import Wire, made_wire, wire_of
 from tests.compiler.test_expressions import filled_fields, texts
@@ -272,6 +272,13 @@ CALLS = ["abs(i32)", "min(i32, 3, single)", "max(i32, u32)", "round(clamp(real, 
          "float32(real)", "float64(u64)", "int(flag) + int(rock)", "len(text)", "i32 * u32 - 7", "i64 // 7 % 5",
          "u64 // 3", "i32 ** 2", "single ** 3", "real // single", "real % single", "i32 / 8 if flag else 1 / i32",
          "wrap(round(real), 0, 359)", "clamp(round(real), -5, 5)", "i32 % i32", "i32 // i32", "real / u32"]  # fmt: skip
+CHOICES = [
+    chosen("rock", {"ROCK_GREEN": "1", "ROCK_BLUE": "i32"}, "3"),
+    chosen("rock", {"ROCK_BLUE": "1", "ROCK_UNKNOWN": "2", "ROCK_GREEN": "3"}),
+    chosen("flag", {"true": "i32", "false": "0 - i32"}),
+    chosen("i32", {"0": "7", "-1": "8"}, "u32"), chosen("text", {"": "1", "a": "2"}, "3"),
+]  # fmt: skip
+LOWERED += [(SCALARS, field_map(it=choice), target_of(it=I64)) for choice in CHOICES]
 LOWERED += [(SCALARS, field_map(it=f"float64({text})"), target_of(it=F64)) for text in CALLS]
 
 

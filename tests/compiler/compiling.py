@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from router.compiler.cdr import write_message
@@ -14,9 +14,9 @@ from router.compiler.source import Source
 from router.engine.binding import bind
 from router.engine.delivery import MAPPING_FAILURES
 from router.engine.freshness import Freshness
-from router.errors import Diagnostic, SourceSpan
+from router.errors import Diagnostic, Located, SourceSpan
 from router.rehearsal.cdr import serialize as cdr
-from router.table.model import Expression, FieldEntry, FieldMap
+from router.table.model import Choices, Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Enum, MessageType, Type
 from tests.engine.rig import Rig
@@ -36,12 +36,18 @@ def written(text: str) -> Expression:
     return Expression(text, TextPlace(span, ((0, span),)))
 
 
-def field_map(auto: bool = False, /, **entries: str) -> FieldMap:
+def chosen(subject: str, values: Mapping[str, str], otherwise: str | None = None) -> Expression:
+    """The expression `{map: subject, **values, else: otherwise}`."""
+    listed = tuple((Located(name, SPAN), written(text)) for name, text in values.items())
+    choices = Choices(written(subject), listed, None if otherwise is None else written(otherwise))
+    return Expression("", TextPlace(SPAN), choices=choices)
+
+
+def field_map(auto: bool = False, /, **entries: str | Expression) -> FieldMap:
     """`header__stamp="received_at"` is the entry `header.stamp: received_at`."""
-    paths = {tuple(name.split("__")): text for name, text in entries.items()}
-    return FieldMap(
-        SPAN, auto, tuple(FieldEntry(path, (SPAN,) * len(path), written(text)) for path, text in paths.items())
-    )
+    paths = {tuple(name.split("__")): value for name, value in entries.items()}
+    values = {path: written(value) if isinstance(value, str) else value for path, value in paths.items()}
+    return FieldMap(SPAN, auto, tuple(FieldEntry(path, (SPAN,) * len(path), value) for path, value in values.items()))
 
 
 AUTO = field_map(True)
@@ -57,9 +63,11 @@ def context_of(
     return Context(View(message, declared), SOURCE, RECEIVED_AT, enums, ros_types)
 
 
-def compiled(text: str, scope: Scope, expected: Type | None = None) -> tuple[Typed, Callable[[Any], Any]]:
+def compiled(
+    expression: str | Expression, scope: Scope, expected: Type | None = None
+) -> tuple[Typed, Callable[[Any], Any]]:
     """A checked expression, and as a function of the message. Raises ExpressionError."""
-    typed = check(written(text), scope, expected)
+    typed = check(written(expression) if isinstance(expression, str) else expression, scope, expected)
     out = Source()
     with out.block("def evaluate(m, source, received_at):", SPAN):
         scope.reads.write(out, SPAN)

@@ -26,7 +26,17 @@ from router.table.model import Expression, FieldEntry, FieldMap
 from router.table.nodes import TextPlace
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
 from router.types.protobuf import PayloadCase
-from tests.compiler.compiling import AUTO, RECEIVED_AT, SPAN, context_of, field_map, findings_of, outcome, scope_of
+from tests.compiler.compiling import (
+    AUTO,
+    RECEIVED_AT,
+    SPAN,
+    chosen,
+    context_of,
+    field_map,
+    findings_of,
+    outcome,
+    scope_of,
+)
 from tests.compiler.generated_types import EACH_TYPE, mirror, payload_sources, values
 from tests.compiler.payloads import (
     Wire,
@@ -143,6 +153,12 @@ def test_an_enum_takes_numbers_and_names(expression: str, number: int) -> None:
         wrapped=(MessageType("made/msg/State", (Field("state", U8),)), SimpleNamespace(state=5)),
     )
     assert payload.rock == number
+
+
+@pytest.mark.parametrize(("color", "number"), [(0, 0), (7, 1), (8, -3), (9, 5)])
+def test_a_map_makes_an_enum_of_a_number(color: int, number: int) -> None:
+    rock = chosen("color", {"0": "ROCK_UNKNOWN", "7": "ROCK_GREEN", "8": "Rock.ROCK_BLUE"}, "5")
+    assert made("scalars", field_map(rock=rock), color=(U8, color)).rock == number
 
 
 def test_names_of_an_enum_stand_in_lists() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 from router.compiler.expressions.functions import FUNCTIONS, NOT_FINITE
 from router.compiler.expressions.kinds import TIME_TYPES
 from router.errors import MappingError
-from router.table.model import Expression
+from router.table.model import Choices, Expression
 from router.types.model import Enum, Int, List, MessageType, Type
 
 NS = 1_000_000_000
@@ -79,11 +79,26 @@ def evaluate(expression: Expression, context: Context, expected: Type | None = N
     """
     if expression.items is not None:
         return [evaluate(item, context, _element(expected)) for item in expression.items]
+    if expression.literal:
+        return expression.text
+    if expression.choices is not None:
+        return evaluate(_chosen(expression.choices, context), context, expected)
     syntax = ast.parse(expression.text.replace("\n", " ").strip(), mode="eval").body
     try:
         return _Evaluator(context).visit(syntax, expected)
     except (ArithmeticError, ValueError, LookupError) as error:
         raise MappingError(str(error)) from error
+
+
+def _chosen(choices: Choices, context: Context) -> Expression:
+    subject = evaluate(choices.subject, context)
+    for name, value in choices.values:
+        named = [number for enum in context.enums for each, number in enum.values if each == name.value]
+        if subject == (name.value if isinstance(subject, str) else (named or [ast.literal_eval(name.value)])[0]):
+            return value
+    if choices.otherwise is None:
+        raise MappingError(f"the map has no value for {subject}")
+    return choices.otherwise
 
 
 def _element(expected: Type | None) -> Type | None:

@@ -113,6 +113,30 @@ gateways:
     inbound:
       - {topic: /cmd_vel, type: geometry_msgs/msg/Twist, deadman: {timeout: 300ms, send: {}}}
 """
+SHORT = """\
+# yaml-language-server: $schema=../schemas/route-table.schema.json
+version: 1
+envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}
+defaults: {package: comms, queue_depth: 10, qos: sensor_data, ttl: 1s, deadman: {timeout: 500ms, repeat: 100ms}}
+listen: {rover: {address: 0.0.0.0:5000}}
+endpoints: {basestation: {address: 192.168.0.10:9000, kind: basestation}}
+routes:
+  arm_pos: {source: basestation, destinations: basestation, topic: arm_pos}
+  gps_info:
+    source: basestation
+    topics:
+      - gps_data
+      - topic: gps/fix
+        type: sensor_msgs/msg/NavSatFix
+        qos: sensor_data
+        fields:
+          header: {stamp: received_at, frame_id: {text: gps_link}}
+          status.status: {map: fix_quality, GPS_FIX: 0, 7: 1, else: -1}
+  drive_motor:
+    source: [{topic: drive_motor}, {topic: drive_motor_2, queue_depth: 3}]
+    destinations: basestation
+    deadman: {send: {manual_brake: {brake: true}}, to: basestation, disarmed_by: arm_pos}
+"""
 COMPLETE_PARTS = {
     "version": "version: 1\n",
     "envelope": "envelope: {protos: ../protos, message: PBEnvelope, oneof: payload}\n",
@@ -148,6 +172,12 @@ def test_good_tables_are_underlined_nowhere(editor: LanguageServer) -> None:
         assert editor.open(new_table(), text) == []
     for table in sorted(ROUTES.glob("*.yaml")):
         assert editor.open(table, table.read_text(encoding="utf-8")) == [], table.name
+
+
+def test_short_forms_are_as_good(editor: LanguageServer) -> None:
+    assert editor.open(new_table(), SHORT) == []
+    found = editor.open(new_table(), SHORT.replace("qos: sensor_data, ttl", "qos: sensors, ttl"))
+    assert found
 
 
 def test_gateways_alone_need_nothing_beside_them_and_routes_do(editor: LanguageServer) -> None:
