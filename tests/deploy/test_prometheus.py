@@ -87,8 +87,8 @@ def test_what_rules_ask_of_each_other_is_recorded(name: str) -> None:
 def test_an_alert_says_how_bad_it_is_what_it_is_and_where_to_read_on(name: str) -> None:
     alert = ALERTS[name]
     assert alert["labels"]["severity"] in ("critical", "warning", "info")
-    assert set(alert["annotations"]) == {"summary", "runbook"}
-    assert alert["annotations"]["runbook"] == f"docs/monitoring.md#{name.lower()}"
+    assert set(alert["annotations"]) == {"summary", "runbook_url"}
+    assert alert["annotations"]["runbook_url"] == f"{{{{ $externalLabels.docs }}}}/monitoring.md#{name.lower()}"
     assert f"\n### {name}\n" in PAGE.read_text()
 
 
