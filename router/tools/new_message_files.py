@@ -255,8 +255,10 @@ def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str =
     """The text with another entry below one, under a heading of its own where `section` says so."""
     lines = text.split("\n")
     indent = " " * after.indent
+    stanza = list(stanza)
     head = ["", f"{indent}# ---- {section} ".ljust(_SECTION_WIDTH, "-")] if section else []
-    return "\n".join([*lines[: after.end], *head, "", *(indent + line for line in stanza), *lines[after.end :]])
+    gap = [""] if head or len(stanza) > 1 or after.end - after.first > 1 else []
+    return "\n".join([*lines[: after.end], *head, *gap, *(indent + line for line in stanza), *lines[after.end :]])
 
 
 def _in_table(text: str, message: NewMessage, site: Site) -> str:
@@ -270,17 +272,14 @@ def _in_table(text: str, message: NewMessage, site: Site) -> str:
 
 def _route(message: NewMessage, site: Site, width: int) -> list[str]:
     receivers = _basestations(message, site.table)
-    destinations = [f"  destinations: [{', '.join(receivers)}]"] if receivers else []
+    names = receivers[0] if len(receivers) == 1 else f"[{', '.join(receivers)}]"
     package = site.messages.parent.name
-    keys = [f"topic: {message.case}", f"type: {package}/msg/{message.name}", "queue_depth: 10", "fields: auto"]
-    topic = f"{{{', '.join(keys)}}}"
-    layouts = (
-        [f"  topics: [{topic}]"],
-        ["  topics:", f"    - {topic}"],
-        ["  topics:", f"    - {keys[0]}", *(f"      {key}" for key in keys[1:])],
-    )
-    topics = next((each for each in layouts if max(map(len, each)) <= width), layouts[-1])
-    return [f"{message.case}:", f"  source: {message.board}", *destinations, *topics]
+    topic = f"topic: {message.case}"
+    if site.table.package is None or site.table.package.value != package:
+        topic = f"topics: {{{topic}, type: {package}/msg/{message.name}}}"
+    keys = [f"source: {message.board}", *([f"destinations: {names}"] if receivers else []), topic]
+    line = f"{message.case}: {{{', '.join(keys)}}}"
+    return [line] if len(line) <= width else [f"{message.case}:", *(f"  {key}" for key in keys)]
 
 
 _ONE_LINE = re.compile(r" *\w+: +(\{.*\}) *$")

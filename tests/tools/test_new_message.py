@@ -19,10 +19,7 @@ from router.compiler import Checked
 RADIATION = ("SensorBoardRadiationInfo", "--number", "27", "--board", "sensor")
 FIELDS = ("--fields", "dose_rate:float # microsievert per hour", "state:SensorState status:SensorStatus")
 ROUTE = """\
-  radiation_info:
-    source: sensor_board
-    destinations: [basestation]
-    topics: [{topic: radiation_info, type: comms/msg/SensorBoardRadiationInfo, queue_depth: 10, fields: auto}]
+  radiation_info: {source: sensor_board, destinations: basestation, topic: radiation_info}
 
 """
 TEST = """\
@@ -36,6 +33,7 @@ TEST = """\
       published: {radiation_info: unchanged}
 
 """
+DEFAULTS = "defaults: {package: comms}\n\n"
 PAGE = Path(__file__).parents[2] / "docs" / "adding-a-message.md"
 SITE = Path(__file__).parent / "new_message_site"
 LOCK = "protos/envelope.lock.json"
@@ -173,10 +171,16 @@ def test_what_the_basestation_sends_goes_to_ros_alone(site: Path) -> None:
     assert main(["new", "BasestationHorn", "--number", "29", "--board", "basestation", "--fields", "is_on:bool"]) == OK
     assert added(before, contents(site))["routes/rover.yaml"] == [
         "",
-        "  horn:",
-        "    source: basestation",
-        "    topics: [{topic: horn, type: comms/msg/BasestationHorn, queue_depth: 10, fields: auto}]",
+        "  horn: {source: basestation, topic: horn}",
     ]
+
+
+def test_without_a_package_for_all_topics_the_route_says_its_type(site: Path) -> None:
+    rewrite(site / "routes/rover.yaml", DEFAULTS, "")
+    assert main(["new", *RADIATION]) == OK
+    text = (site / "routes/rover.yaml").read_text(encoding="utf-8")
+    assert "topics: {topic: radiation_info, type: comms/msg/SensorBoardRadiationInfo}" in text
+    assert_clean()
 
 
 def test_a_board_without_routes_gets_a_section_at_the_end(site: Path) -> None:
@@ -184,7 +188,7 @@ def test_a_board_without_routes_gets_a_section_at_the_end(site: Path) -> None:
     assert main(["new", "ContainerBoardLid", "--number", "31", "--board", "container"]) == OK
     lines = added(before, contents(site))["routes/rover.yaml"]
     assert lines[1].startswith("  # ---- container board ----")
-    assert lines[3] == "  lid:"
+    assert lines[3] == "  lid: {source: container_board, destinations: basestation, topic: lid}"
     assert_clean()
 
 
