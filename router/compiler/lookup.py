@@ -89,6 +89,8 @@ class Lookup:
                 self.report(meant.span, Code.UNKNOWN_ENDPOINT, message, f"did you mean '{name.value}'?")
             else:
                 hint = did_you_mean(name.value, known)
+                if "," in name.value:
+                    hint = f"write a list: [{name.value}]"
                 if name.value == ROS:
                     hint = "messages come from topics by their names: `source: {topic: NAME}`"
                 self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)

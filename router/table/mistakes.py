@@ -74,8 +74,8 @@ def explain(
         return Diagnostic(open_bracket.part(0, 1), Code.BAD_YAML, "this bracket is never closed")
     written = source.lines[line] if line < len(source.lines) else ""
     if not open_bracket and written[column : column + 1] != "\t":
-        context = error.context_mark.line if error.problem == _NO_KEY_ENDS and error.context_mark else line
-        if (bare := _bare_line(source, context)) is not None:
+        begun = error.context_mark.line if error.problem == _NO_KEY_ENDS and error.context_mark else None
+        if (bare := _bare_line(source, line) if begun is None else begun) is not None:
             return _without_colon(source, bare)
         if (neighbours := _neighbours(source, line)) and not _SEPARATOR.search(written[:column]):
             return _misplaced(source, line, neighbours)
@@ -92,7 +92,9 @@ def _advice(error: yaml.MarkedYAMLError, line: str, column: int) -> _Advice:
     problem = error.problem or str(error)
     if problem in _NOT_CLOSED and character in ("[", "{") and before[-1:].strip():
         return _Advice(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
-    if problem == "found character that cannot start any token":
+    if problem == "did not find expected key" and character == "-":
+        return _Advice("an item of a list stands among keys", "remove the '-', or indent the item below its key")
+    if problem in ("found character that cannot start any token", "did not find expected node content") and character:
         return _Advice(f"a value cannot begin with '{character}'", "put quotes around it")
     if " ? " in before:
         return _Advice("a ':' cannot stand here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
@@ -107,7 +109,8 @@ def _bare_line(source: Source, line: int) -> int | None:
         text = _text(source, number)
         if not text or _SEPARATOR.search(text):
             continue
-        if _WITHOUT_SPACE.match(text) or (number < line and _keys_at(source, number) == _keys_at(source, line)):
+        is_above = number < line and _keys_at(source, number) == _keys_at(source, line)
+        if _WITHOUT_SPACE.match(text) or is_above or (number < line and text.strip().isidentifier()):
             return number
     return None
 

@@ -175,6 +175,8 @@ _ELSEWHERE = {
     "when": ("if", "condition", "filter"),
     "max_rate": ("rate", "hz", "frequency", "throttle"),
     "http": ("metrics", "prometheus"),
+    "endpoints": ("boards", "devices", "hosts"),
+    "kind": ("type",),
 }
 """Keys, and what people who know other programs call them."""
 
@@ -265,8 +267,10 @@ def _remedy(error: SchemaError) -> str:
         return "a space is missing after ':'"
     if value is None and any(key in error.path for key in NAME_FIELDS):
         return "a field that is left out keeps its default"
-    if error.path[:-1] == ("routes",) and value is None:
-        return "indent the keys of a route further than its payload case"
+    if value is None and "object" in error.limit:
+        return "indent what belongs to it further than it"
+    if isinstance(value, str) and error.path[:1] in (("listen",), ("endpoints",)):
+        return f"write `{name}: {{address: {value}}}`"
     if error.path[:-1] == ("routes",) and name in table_schema()["definitions"]["route"]["properties"]:
         return f"'{name}' is a key of a route: indent it further than the payload case that it is for"
     return ""

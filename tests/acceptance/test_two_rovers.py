@@ -43,7 +43,7 @@ routes:
     source: {{topic: drive, type: comms/msg/DrivingBoardMotorMessage}}
     fields: auto
     destinations: [driving_board]
-    deadman: {none: a test of names alone}
+    deadman: {{none: a test of names alone}}
 gateways:
   page:
     transport: {{websocket: "127.0.0.1:${{PAGE}}"}}

@@ -117,7 +117,8 @@ def test_a_table_is_chosen_also_where_the_settings_name_none(running: Machine) -
     running.shell(f"{ROOT}/deploy/install-service.sh {SIM}")
     assert running.shell(f"grep ^ROUTER_TABLE= {settings}").strip() == f"ROUTER_TABLE={SIM}"
     assert "A=b\n" in running.shell(f"cat {settings}")
-    assert SIM in running.shell("xargs -0 < /proc/$(systemctl show -P MainPID rover-router)/cmdline")
+    environment = running.shell("xargs -0 -n 1 < /proc/$(systemctl show -P MainPID rover-router)/environ")
+    assert f"ROUTER_TABLE={SIM}" in environment.splitlines()
     running.shell(f"cp /opt/settings {settings}; systemctl restart rover-router")
 
 
