@@ -14,7 +14,7 @@ from router.compiler.conversion import convert, same_named, unset
 from router.compiler.expressions import ExpressionError, Scope, Typed, check
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
-from router.table.model import Expression, FieldEntry, FieldMap
+from router.table.model import TEXT, Expression, FieldEntry, FieldMap
 from router.types.model import Field, MessageType, String, Type
 
 
@@ -36,9 +36,6 @@ class FieldMapping:
     plan: Record
     rows: list[Row] = field(default_factory=list)
     findings: list[Diagnostic] = field(default_factory=list)
-
-
-TEXT = "text"
 
 
 def _in_long(entry: FieldEntry, target: MessageType) -> FieldEntry:

@@ -21,6 +21,7 @@ from router.table.addresses import LOCAL, REMOTE, Address, parse_local
 from router.table.keys import Key, keys_of
 from router.table.model import (
     ROS,
+    TEXT,
     Choices,
     Deadman,
     Destination,
@@ -398,9 +399,11 @@ def _choices(node: MappingNode, span: SourceSpan) -> Expression:
 
 
 def _expression(node: Node, span: SourceSpan) -> Expression:
-    """A scalar as it was written, a list of expressions, or a choice."""
+    """A scalar as it was written, a list of expressions, a choice, or the text that one makes."""
     if isinstance(node, MappingNode):
-        return _choices(node, span)
+        if MAP in node.entries:
+            return _choices(node, span)
+        return replace(_expression(node.entries[TEXT].value, span), literal=True)
     if isinstance(node, SequenceNode):
         return Expression("", TextPlace(node.span), tuple(_expression(item, item.span) for item in node.items))
     found = scalar(node)

@@ -181,6 +181,10 @@ class Expression:
         return self.text if self.items is None else f"[{', '.join(map(str, self.items))}]"
 
 
+TEXT = "text"
+"""The key of text that stands for itself: `{text: imu_link}`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Choices:
     """`{map: fix_quality, GPS_FIX: 1, else: 0}`: the value of `subject` chooses among `values`, by its name."""

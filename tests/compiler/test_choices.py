@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from router.compiler import check_table
 from router.compiler.expressions import ExpressionError
 from router.compiler.mapping import build
 from router.engine.delivery import MAPPING_FAILURES
@@ -14,6 +16,7 @@ from router.errors import Code
 from router.table.model import Expression, FieldEntry, FieldMap
 from router.types.model import Bool, Enum, Field, Float, Int, MessageType, String
 from tests.compiler.compiling import SPAN, chosen, compiled, field_map, scope_of, serializer, written
+from tests.tables import ROUTES
 
 GEAR = Enum("Gear", (("PARK", 0), ("DRIVE", 1), ("REVERSE", -1), ("GO", 1)))
 SOURCE = MessageType(
@@ -86,6 +89,32 @@ def test_wrong_maps_are_findings(chooser: Expression, code: Code, said: str) -> 
         compiled(chooser, scope_of(SOURCE, [GEAR]))
     assert refused.value.diagnostic.code is code
     assert said in f"{refused.value.diagnostic.message} {refused.value.diagnostic.hint}"
+
+
+TABLE = """
+extends: {rover}
+routes:
+  imu_info:
+    topics:
+      - topic: mode
+        type: std_msgs/msg/Header
+        fields:
+          frame_id: {{map: state, SENSOR_ERROR: {{text: not a field}}, SENSOR_IDLE: "'idle'", else: {{text: "4"}}}}
+          stamp.sec: {{map: is_calibrated, true: 1, false: 0}}
+      - {{topic: word, type: std_msgs/msg/String, fields: {{data: {{map: source, text: {{text: map}}, else: source}}}}}}
+"""
+
+
+def test_maps_and_texts_of_a_table_become_expressions(tmp_path: Path) -> None:
+    path = tmp_path / "table.yaml"
+    path.write_text(TABLE.format(rover=ROUTES / "rover.yaml"))
+    checked = check_table(path)
+    assert not checked.diagnostics
+    [route] = [each for each in checked.routes if each.case.name == "imu_info"]
+    rows = {row.target: row.expression for target in route.targets for row in target.rows}
+    assert rows["frame_id"] == "{map: state, SENSOR_ERROR: 'not a field', SENSOR_IDLE: 'idle', else: '4'}"
+    assert rows["stamp.sec"] == "{map: is_calibrated, true: 1, false: 0}"
+    assert rows["data"] == "{map: source, text: 'map', else: source}"
 
 
 def test_the_longest_map_is_compiled() -> None:

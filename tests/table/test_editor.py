@@ -132,6 +132,7 @@ routes:
         fields:
           header: {stamp: received_at, frame_id: {text: gps_link}}
           status.status: {map: fix_quality, GPS_FIX: 0, 7: 1, else: -1}
+          name: {map: fix_quality, GPS_FIX: {text: fixed}, else: {text: none}}
   drive_motor:
     source: [{topic: drive_motor}, {topic: drive_motor_2, queue_depth: 3}]
     destinations: basestation
