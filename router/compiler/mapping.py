@@ -15,7 +15,7 @@ from router.compiler.expressions import ExpressionError, Scope, Typed, check
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
 from router.table.model import TEXT, Expression, FieldEntry, FieldMap
-from router.types.model import Field, MessageType, String, Type
+from router.types.model import Field, MessageType, Type
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +38,15 @@ class FieldMapping:
     findings: list[Diagnostic] = field(default_factory=list)
 
 
-def _in_long(entry: FieldEntry, target: MessageType) -> FieldEntry:
-    """The entry, or for `{text: imu_link}` of a string one with the literal."""
+def _nested(entry: FieldEntry, target: MessageType) -> FieldEntry:
+    """The entry, or where `{text: value}` is for a message with a field `text`, the entry for that field."""
     holder: Type | None = target
-    for name in entry.path[:-1]:
+    for name in entry.path:
         member = holder.field(name) if isinstance(holder, MessageType) else None
         holder = member.type if member else None
-    if not isinstance(holder, String) or entry.path[-1] != TEXT or entry.value.items or entry.value.choices:
+    if not entry.value.literal or not isinstance(holder, MessageType) or holder.field(TEXT) is None:
         return entry
-    return FieldEntry(entry.path[:-1], entry.path_spans[:-1], replace(entry.value, literal=True))
+    return FieldEntry((*entry.path, TEXT), (*entry.path_spans, entry.value.span), replace(entry.value, literal=False))
 
 
 @dataclass(slots=True)
@@ -132,7 +132,7 @@ class _Builder:
     def sort(self, entries: Sequence[FieldEntry], target: MessageType) -> _Branch:
         """The entries by field. Unknown fields and fields that are given twice are reported and left out."""
         root = _Branch(target)
-        for entry in map(functools.partial(_in_long, target=target), entries):
+        for entry in map(functools.partial(_nested, target=target), entries):
             if holders := self._holders(entry, target):
                 self._insert(root, entry, holders)
         return root

@@ -20,6 +20,8 @@ from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
 from router.table.addresses import LOCAL, REMOTE, Address, parse_local
 from router.table.keys import Key, keys_of
 from router.table.model import (
+    ELSE,
+    MAP,
     ROS,
     TEXT,
     Choices,
@@ -65,6 +67,8 @@ from router.table.reading import (
     InvalidValueError,
     beside,
     boolean,
+    is_choice,
+    is_text,
     located,
     mapping,
     optional_text,
@@ -375,14 +379,6 @@ def _with_timeout(deadman: Entry) -> MappingNode:
     return settings
 
 
-MAP, ELSE = "map", "else"
-
-
-def _is_choice(node: MappingNode) -> bool:
-    """Whether a mapping under a field chooses its value, rather than fill a message field by field."""
-    return isinstance(node.get(MAP), ScalarNode)
-
-
 def _choices(node: MappingNode, span: SourceSpan) -> Expression:
     values = tuple(
         (located(entry.key), _expression(entry.value, entry.key.span))
@@ -399,10 +395,10 @@ def _choices(node: MappingNode, span: SourceSpan) -> Expression:
 
 
 def _expression(node: Node, span: SourceSpan) -> Expression:
-    """A scalar as it was written, a list of expressions, a choice, or the text that one makes."""
+    """A scalar as it was written, a list of expressions, a choice, or text that stands for itself."""
+    if is_choice(node):
+        return _choices(mapping(node), span)
     if isinstance(node, MappingNode):
-        if MAP in node.entries:
-            return _choices(node, span)
         return replace(_expression(node.entries[TEXT].value, span), literal=True)
     if isinstance(node, SequenceNode):
         return Expression("", TextPlace(node.span), tuple(_expression(item, item.span) for item in node.items))
@@ -428,7 +424,7 @@ def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[Sour
     for name, entry in fields.entries.items():
         inner = (*path, *name.split("."))
         inner_spans = (*spans, *_part_spans(entry.key))
-        if isinstance(entry.value, MappingNode) and not _is_choice(entry.value):
+        if isinstance(entry.value, MappingNode) and not is_choice(entry.value) and not is_text(entry.value):
             yield from _field_entries(entry.value, inner, inner_spans)
         else:
             yield FieldEntry(inner, inner_spans, _expression(entry.value, entry.key.span))

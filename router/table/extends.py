@@ -1,6 +1,7 @@
 """`extends`: the chain of files that a table is made of, merged into one tree.
 
-Mappings merge key by key, everything else replaces. These mappings replace as well: a route or gateway that one of the
+Mappings merge key by key, everything else replaces. These mappings replace as well: what may be one or a list, such as
+the topics of a route; a quality of service, which may be a name; a `map` of values; a route or gateway that one of the
 two files ignores, a route from topics one from endpoints, a deadman that one of the files says there is none of, the
 payload that a deadman sends, and the transport of a gateway. `topic` and `topics` of a route replace each other. Every
 node keeps the span of the file where it was written.
@@ -17,6 +18,7 @@ from router.errors import Code, Diagnostic, TableError, nearest_path, shown_path
 from router.table.compose import compose
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
+from router.table.reading import is_choice
 from router.table.source import Source, read_source
 
 KEY = "extends"
@@ -27,6 +29,8 @@ _WORDS_FOR_NONE: Mapping[Steps, str] = {(): IGNORE, ("deadman",): "none"}
 """How a route or gateway, or a part of it, says that there is none."""
 _ALTERNATIVES = {"topic": "topics", "topics": "topic"}
 """Keys of a route that exclude each other."""
+_WHOLE = ("source", "destinations", *_ALTERNATIVES)
+"""Keys of a route that take one or a list."""
 _OF_ONE_KIND = {"routes": ("deadman", "send"), "gateways": ("transport",)}
 """What of a route or gateway has one key, which says what kind it is."""
 
@@ -74,9 +78,13 @@ def merge(base: MappingNode, over: MappingNode, here: Steps = ()) -> MappingNode
 
 
 def _replaces(over: MappingNode, base: MappingNode, path: Steps) -> bool:
-    """Nothing to merge: what one of the two says there is none of; other kinds of source, payload or transport."""
+    """Nothing to merge: what is whole, what one of the two says there is none of, other kinds of source or payload."""
+    if path == ("defaults", "qos") or is_choice(over) or is_choice(base):
+        return True
     if path[0] not in _OF_ONE_KIND:
         return False
+    if path[0] == "routes" and len(path) == _DEPTH + 1 and path[-1] in _WHOLE:
+        return True
     if path[_DEPTH:] == _OF_ONE_KIND[path[0]]:
         return over.entries.keys() != base.entries.keys()
     word = _WORDS_FOR_NONE.get(path[_DEPTH:]) if len(path) >= _DEPTH else None

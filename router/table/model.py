@@ -160,7 +160,7 @@ class Expression:
     """The text of an expression, not yet parsed.
 
     `place` tells where each character of it stands. A YAML sequence becomes `items`, a mapping with the key `map`
-    becomes `choices`; both have empty text. `literal` text stands for itself.
+    becomes `choices`; both have empty text. `literal` text stands for itself: `{text: imu_link}`.
     """
 
     text: str
@@ -181,8 +181,8 @@ class Expression:
         return self.text if self.items is None else f"[{', '.join(map(str, self.items))}]"
 
 
-TEXT = "text"
-"""The key of text that stands for itself: `{text: imu_link}`."""
+MAP, ELSE, TEXT = "map", "else", "text"
+"""The keys of values that are mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
 
 
 @dataclass(frozen=True, slots=True)

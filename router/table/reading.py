@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.addresses import BadAddressError
+from router.table.model import MAP, TEXT
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 V = TypeVar("V")
@@ -40,6 +41,16 @@ def mapping(node: Node | None) -> MappingNode:
     if not isinstance(node, MappingNode):
         raise TypeError(f"a mapping, not {node!r}")
     return node
+
+
+def is_choice(node: Node) -> bool:
+    """Whether it is `{map: fix_quality, ...}`, a value that is chosen."""
+    return isinstance(node, MappingNode) and isinstance(node.get(MAP), ScalarNode)
+
+
+def is_text(node: Node) -> bool:
+    """Whether it is `{text: imu_link}`."""
+    return isinstance(node, MappingNode) and [*node.entries] == [TEXT] and isinstance(node.get(TEXT), ScalarNode)
 
 
 def scalar(node: Node | None) -> ScalarNode:

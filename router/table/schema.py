@@ -254,6 +254,8 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
         near = nearest_quantity(error.value)
         near = None if near and near.replace(" ", "") == error.value.replace(" ", "") else near
     hint = f"did you mean '{near}'?" if near else ""
+    if keyword == "minProperties" and "errorMessage" in error.schema:
+        return Diagnostic(span, code, f"{name} {_expected(error)}")
     if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
         return Diagnostic(span, code, f"{name} must not be empty")
     return Diagnostic(span, code, f"{name} {_expected(error)}, not {shown(error.value)}", hint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -56,6 +57,7 @@ def test_two_names_of_a_number_are_one_value() -> None:
     [
         (chosen("ready", {"true": "'on'", "false": "'off'"}), {"ready": True}, "on"),
         (chosen("ready", {"true": "'on'", "false": "'off'"}), {"ready": False}, "off"),
+        (chosen("ready", {"False": "'off'", "True": "'on'"}), {"ready": True}, "on"),
         (chosen("ready", {"true": "1"}, "0"), {"ready": False}, 0),
         (chosen("name", {"imu": "1", "a b": "2"}, "3"), {"name": "a b"}, 2),
         (chosen("name", {"imu": "1"}, "3"), {"name": "gps"}, 3),
@@ -71,6 +73,8 @@ def test_other_subjects_choose_by_constants(chooser: Expression, fields: dict[st
 @pytest.mark.parametrize(
     ("chooser", "code", "said"),
     [
+        (chosen("gear", {"DRIVE": "1", "GO": "2"}, "0"), Code.DUPLICATE_KEY, "'GO' is the same value as 'DRIVE'"),
+        (chosen("level", {"0x2": "1", "2": "2"}, "0"), Code.DUPLICATE_KEY, "'2' is the same value as '0x2'"),
         (chosen("gear", {"PRAK": "1"}, "2"), Code.UNKNOWN_ENUM_VALUE, "did you mean 'PARK'"),
         (chosen("gear", {"PARK": "1", "GO": "2"}), Code.MISSING_ENUM_VALUE, "REVERSE"),
         (chosen("ready", {"true": "1"}), Code.MISSING_ENUM_VALUE, "more values"),
@@ -101,6 +105,7 @@ routes:
         fields:
           frame_id: {{map: state, SENSOR_ERROR: {{text: not a field}}, SENSOR_IDLE: "'idle'", else: {{text: "4"}}}}
           stamp.sec: {{map: is_calibrated, true: 1, false: 0}}
+      - {{topic: names, type: sensor_msgs/msg/JointState, fields: {{name: [source, {{text: source}}]}}}}
       - {{topic: word, type: std_msgs/msg/String, fields: {{data: {{map: source, text: {{text: map}}, else: source}}}}}}
 """
 
@@ -114,6 +119,7 @@ def test_maps_and_texts_of_a_table_become_expressions(tmp_path: Path) -> None:
     rows = {row.target: row.expression for target in route.targets for row in target.rows}
     assert rows["frame_id"] == "{map: state, SENSOR_ERROR: 'not a field', SENSOR_IDLE: 'idle', else: '4'}"
     assert rows["stamp.sec"] == "{map: is_calibrated, true: 1, false: 0}"
+    assert rows["name"] == "[source, 'source']"
     assert rows["data"] == "{map: source, text: 'map', else: source}"
 
 
@@ -128,8 +134,8 @@ def test_what_a_map_chooses_has_to_fit_its_target() -> None:
     assert [finding.code for finding in mapping.findings] == [Code.LOSSY_CONVERSION]
 
 
-def text(word: str, path: tuple[str, ...] = ("word", "text")) -> FieldMap:
-    return FieldMap(SPAN, False, (FieldEntry(path, (SPAN,) * len(path), written(word)),))
+def text(word: str, field: str = "word") -> FieldMap:
+    return field_map(**{field: replace(written(word), literal=True)})
 
 
 @pytest.mark.parametrize("word", ["imu_link", "level", "'quoted'", "two words", "1 + 1", ""])
@@ -146,5 +152,11 @@ def test_a_bare_word_is_an_error_that_says_both_readings() -> None:
 
 
 def test_text_is_for_strings_alone() -> None:
-    [finding] = build(text("imu_link", ("level", "text")), TARGET, scope_of(SOURCE), SPAN).findings
-    assert finding.code is Code.UNKNOWN_FIELD
+    [finding] = build(text("imu_link", "level"), TARGET, scope_of(SOURCE), SPAN).findings
+    assert finding.code is Code.TYPE_MISMATCH
+
+
+def test_a_message_with_a_field_called_text_is_filled_by_an_expression() -> None:
+    note = MessageType("made/msg/Note", (Field("text", String()),))
+    mapping = build(text("name", "note"), MessageType("made/msg/Holder", (Field("note", note),)), scope_of(SOURCE), SPAN)
+    assert [(row.target, row.expression) for row in mapping.rows] == [("note.text", "name")]

@@ -57,18 +57,19 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
         raise ExpressionError(span, Code.EXPRESSION_SYNTAX, f"a map has at most {MOST_CHOICES} values")
     subject = check(choices.subject, scope)
     keys = [_key(name, subject, scope) for name, _ in choices.values]
+    _want_different(choices, keys)
     values = [check(value, scope, expected) for _, value in choices.values]
     if choices.otherwise is not None:
         made = check(choices.otherwise, scope, expected)
     else:
-        _want_all(choices, subject, span)
-        made, last = values[-1], keys[-1]
+        _want_all(subject, keys, span)
+        made, last = replace(values[-1], node=copy.deepcopy(values[-1].node)), keys[-1]
         if isinstance(subject.kind, EnumKind):
             fitted = call("fit", copy.deepcopy(subject.node), copy.deepcopy(last.node), copy.deepcopy(last.node))
             keys[-1] = Typed.at(last.span, last.kind, fitted)
     for (name, _), key, value in reversed(list(zip(choices.values, keys, values, strict=True))):
         test = operators.comparison([ast.Eq()], [replace(subject, node=copy.deepcopy(subject.node)), key], name.span)
-        made = operators.choice(test, value, replace(made, node=copy.deepcopy(made.node)), value.span)
+        made = operators.choice(test, value, made, value.span)
     return replace(made, span=span)
 
 
@@ -91,17 +92,25 @@ def _key(name: Located[str], subject: Typed, scope: Scope) -> Typed:
     return key
 
 
-def _want_all(choices: Choices, subject: Typed, span: SourceSpan) -> None:
+def _want_different(choices: Choices, keys: Sequence[Typed]) -> None:
+    """Refuse a map in which two keys are one value, such as two names of an enum's number."""
+    names: dict[object, str] = {}
+    for (name, _), key in zip(choices.values, keys, strict=True):
+        first = names.setdefault(key.constant, name.value)
+        if first != name.value:
+            message = f"'{name.value}' is the same value as '{first}'"
+            raise ExpressionError(name.span, Code.DUPLICATE_KEY, message, "remove one of the two")
+
+
+def _want_all(subject: Typed, keys: Sequence[Typed], span: SourceSpan) -> None:
     """Refuse a map without `else` that leaves out values, or whose subject has no list of them."""
     hint = "list them, or say what they become: `else: VALUE`"
-    if isinstance(subject.kind, BoolKind) and {name.value for name, _ in choices.values} >= {"true", "false"}:
+    covered = {key.constant for key in keys}
+    if isinstance(subject.kind, BoolKind) and covered == {True, False}:
         return
     if not isinstance(subject.kind, EnumKind):
         message = f"a {subject.kind} has more values than those of this map"
         raise ExpressionError(span, Code.MISSING_ENUM_VALUE, message, hint)
-    listed = {name.value for name, _ in choices.values}
-    numbers = dict(subject.kind.enum.values)
-    covered = {numbers[name] for name in listed}
     missing = [name for name, number in subject.kind.enum.values if number not in covered]
     if missing:
         names = ", ".join(missing)
