@@ -94,7 +94,7 @@ def measure(hertz: int, seconds: int, folder: Path) -> dict[str, Arrivals]:
     hosts = {"sensor_board": HOSTS["sensor_board"]} | dict.fromkeys(DESTINATIONS, HOSTS["basestation"])
     with site(folder, hosts) as place:
         place.table(TABLE)
-        table = folder / "budget.yaml"
+        table = folder / "bandwidth.yaml"
         table.write_text(WITH_BUDGET)
         with RouterProcess(folder, table):
             # A second longer than what is measured.

@@ -27,7 +27,8 @@ from router.tools.simulator import Simulator
 
 _DESCRIPTION = """Play the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
 Nothing leaves this computer. The first lines say where to look with a browser or Foxglove; 'ros2 topic list' and the
-other verbs look at it as well. Where the rover's ROS messages are not installed, it is the table of 'router init'."""
+other verbs look at it as well. What is recorded is in ./recordings. Where the rover's ROS messages are not installed,
+it is the table of 'router init'."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -36,6 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # not in the installation, where the table is
     configure_log(coloured=is_coloured(sys.stderr))
     checked = check_table(_table())
     print_findings(checked.diagnostics, sys.stderr)
@@ -55,11 +57,23 @@ def _table() -> Path:
 
 @contextmanager
 def _simulated(program: Program) -> Iterator[None]:
-    """Play the table's endpoints in a thread. Raises UsageError where an address is taken."""
+    """Play the table's endpoints in a thread; an error there ends the process as SIGTERM does, and is raised here.
+
+    Raises UsageError where an address is taken.
+    """
+    failures: list[Exception] = []
+
+    def play() -> None:
+        try:
+            simulator.run(None, math.inf, lambda _: None)
+        except Exception as error:  # noqa: BLE001 - raised by the main thread
+            failures.append(error)
+            os.kill(os.getpid(), signal.SIGTERM)
+
     simulator = Simulator(Wire(program.envelope), program.table, seed=1, deadmen=program.deadmen)
     # The thread inherits this, and leaves the signals to the main thread.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1})
-    thread = Thread(target=simulator.run, args=(None, math.inf, lambda _: None), name="simulator")
+    thread = Thread(target=play, name="simulator")
     thread.start()
     try:
         yield
@@ -67,3 +81,5 @@ def _simulated(program: Program) -> Iterator[None]:
         simulator.stop()
         thread.join()
         simulator.close()
+    if failures:
+        raise failures[0]

@@ -51,6 +51,8 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.seconds is not None and not args.live:
         raise UsageError("--for belongs to --live")
+    if args.diff is not None and (args.names or args.table or args.code or args.live):
+        raise UsageError("--diff compares its two tables, whole; nothing else goes with it")
     return _diff(*args.diff) if args.diff is not None else _explain(args)
 
 

@@ -223,7 +223,7 @@ class RecordingDirectory:
                 return
             path.unlink(missing_ok=True)
             total -= size
-            logger.info("removed the oldest recording, to keep within 'keep'", file=str(path), bytes=size)
+            logger.info("removed the oldest recording, to keep within 'retention'", file=str(path), bytes=size)
 
 
 def recording_sizes(path: Path, stem: str) -> dict[Path, int]:

@@ -48,7 +48,7 @@ def check_arguments(ros_args: Sequence[str]) -> None:
     try:
         context.init(list(ros_args), initialize_logging=False)
     except RCL_ERRORS as error:
-        raise StartError(f"the ROS node cannot be created: {error}") from error
+        raise StartError(f"ROS does not take these arguments: {error}") from error
     context.try_shutdown()
 
 

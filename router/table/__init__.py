@@ -9,8 +9,8 @@ from pathlib import Path
 from router.errors import Diagnostic, Severity, TableError
 from router.table.addresses import outside_findings
 from router.table.build import build_table
-from router.table.comments import cut_findings
 from router.table.extends import load_chain
+from router.table.mistakes import cut_findings
 from router.table.model import RouteTable
 from router.table.schema import check_shape
 from router.table.shorthand import written_out

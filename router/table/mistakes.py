@@ -1,13 +1,20 @@
-"""What is wrong with text that is no YAML, in words that say what to do, at the line that has the mistake."""
+"""Mistakes in writing YAML, in words that say what to do, at the line that has the mistake.
+
+Some make the text no YAML (`explain`). One is YAML and means something else than it seems to: a comment that looks like
+the rest of an expression, as in `x # 1000` (`cut_findings`).
+"""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import yaml
 
 from router.errors import Code, Diagnostic, SourceSpan
+from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.table.reading import is_text
 from router.table.source import Source
 
 
@@ -165,3 +172,35 @@ def _keys_at(source: Source, line: int) -> int:
 
 def _indent(text: str) -> int:
     return len(text) - len(text.lstrip(" "))
+
+
+# Comments
+
+
+_EXPRESSIONS = ("fields", "send", "when", "for_each", "by", "count", "order")
+"""Keys of routes below which expressions stand."""
+_REST = re.compile(r"\s+#\s*(?:[-+*/%<>]\s*\w[\w.]*|\d+(?:\.\d*)?(?:e-?\d+)?)\s*")
+
+
+def cut_findings(root: MappingNode, sources: Sequence[Source]) -> Iterator[Diagnostic]:
+    """A warning for each expression of the routes before a comment that is only a number, or an operator and a word."""
+    lines = {source.file: source.lines for source in sources}
+    for node in _expressions(root.get("routes"), is_expression=False):
+        span = node.span
+        comment = lines[span.file][span.line - 1][span.end_column - 1 :] if node.place.is_whole_line else ""
+        if _REST.fullmatch(comment):
+            what = f"the comment '{comment.strip()}' is no part of the expression before it"
+            hint = "write an operator in place of '#', or say in the comment what it is about"
+            yield Diagnostic(span, Code.CUT_EXPRESSION, what, hint)
+
+
+def _expressions(node: Node | None, *, is_expression: bool) -> Iterator[ScalarNode]:
+    if isinstance(node, ScalarNode):
+        if is_expression:
+            yield node
+    elif isinstance(node, SequenceNode):
+        for item in node.items:
+            yield from _expressions(item, is_expression=is_expression)
+    elif isinstance(node, MappingNode) and not is_text(node):
+        for key, entry in node.entries.items():
+            yield from _expressions(entry.value, is_expression=is_expression or key in _EXPRESSIONS)

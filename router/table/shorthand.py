@@ -60,7 +60,7 @@ class _Shorthand:
         return _changed(self._topic(node), "deadman", self._deadman)
 
     def _topic(self, node: Node) -> Node:
-        """A mapping with 'topic'. A profile has a depth of its own, which a default for the queue does not change."""
+        """A mapping with 'topic'. Its own 'qos' or 'queue_depth' wins over the depth that the defaults say."""
         if not isinstance(node, MappingNode):
             return node
         if "qos" in node.entries:

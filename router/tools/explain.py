@@ -282,9 +282,9 @@ def _inbound(entry: InboundPlan) -> Iterator[str]:
         yield f"    {phrases(inbound.topic)['max_rate']}"
     if inbound.deadman is not None and entry.deadman is not None:
         deadman = inbound.deadman
-        fields = [f"{'.'.join(each.path)} {each.value.text}" for each in deadman.fields.entries]
+        sent = str(deadman.fields) if deadman.fields.entries else "all fields at their defaults"
         yield (
-            f"    deadman: {', '.join(fields) or 'all fields at their defaults'} when no message came for "
+            f"    deadman: {sent} when no message came for "
             f"{duration(deadman.timeout.value)}, again every {duration(deadman.repeat.value)}, "
             f"{_at_start(deadman.at_start)}"
         )

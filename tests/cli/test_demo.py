@@ -41,7 +41,10 @@ def test_it_says_where_to_look_and_ends_with_ctrl_c(tmp_path: Path) -> None:
         while "Foxglove " not in seen:
             ready, _, _ = select.select([ours], [], [], limit - time.monotonic())
             assert ready, seen
-            seen += os.read(ours, 65536).decode()
+            try:
+                seen += os.read(ours, 65536).decode()
+            except OSError:  # the terminal is closed
+                pytest.fail(f"it ended: {seen}")
         assert "status page        http://127.0.0.1:29108/" in seen
         assert "gateway dashboard  http://127.0.0.1:28765/" in seen
         process.send_signal(2)

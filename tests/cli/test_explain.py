@@ -278,7 +278,7 @@ def test_a_gateway_is_told_with_its_patterns_what_they_match_and_what_it_lets_in
         "    qos: reliability reliable, durability volatile, history keep_last, depth 10, liveliness system_default\n"
         "    dropped when older than 300 ms\n"
         "    at most 20 Hz\n"
-        "    deadman: linear.x 0.0 when no message came for 500 ms, again every 100 ms, "
+        "    deadman: {linear.x: 0.0} when no message came for 500 ms, again every 100 ms, "
         "and once when the router starts\n"
         "\n"
         f"  from clients /stop: std_msgs/msg/Empty  ({gateways}:16:10)\n"

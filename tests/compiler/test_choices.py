@@ -14,7 +14,7 @@ from router.compiler.expressions import ExpressionError
 from router.compiler.mapping import build
 from router.engine.delivery import MAPPING_FAILURES
 from router.errors import Code
-from router.table.model import Expression, FieldEntry, FieldMap
+from router.table.model import Expression, FieldMap
 from router.types.model import Bool, Enum, Field, Float, Int, MessageType, String
 from tests.compiler.compiling import SPAN, chosen, compiled, field_map, scope_of, serializer, written
 from tests.tables import ROUTES
@@ -158,5 +158,6 @@ def test_text_is_for_strings_alone() -> None:
 
 def test_a_message_with_a_field_called_text_is_filled_by_an_expression() -> None:
     note = MessageType("made/msg/Note", (Field("text", String()),))
-    mapping = build(text("name", "note"), MessageType("made/msg/Holder", (Field("note", note),)), scope_of(SOURCE), SPAN)
+    holder = MessageType("made/msg/Holder", (Field("note", note),))
+    mapping = build(text("name", "note"), holder, scope_of(SOURCE), SPAN)
     assert [(row.target, row.expression) for row in mapping.rows] == [("note.text", "name")]

@@ -150,3 +150,53 @@ def test_what_a_table_and_all_that_it_extends_lack_is_missing(base: Path, text: 
     assert [(found.code, found.message) for found in findings] == [
         (Code.MISSING_KEY, f"'{owner}' lacks the key '{key}'")
     ]
+
+
+def test_one_target_replaces_as_a_list_does(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(
+        GOOD
+        + """\
+  gps_info:
+    source: any
+    topics: {topic: a, type: std_msgs/msg/Int32, max_rate: 1 Hz, when: satellites > 3, fields: {data: satellites}}
+    destinations: {endpoint: basestation, when: satellites > 3}
+  arm_ctrl: {source: {topic: a, type: comms/msg/A}, destinations: basestation}
+"""
+    )
+    text = """\
+extends: base.yaml
+routes:
+  gps_info: {topics: {topic: b, type: std_msgs/msg/Int32}, destinations: {endpoint: sensor_board}}
+  arm_ctrl: {source: {topic: b, type: comms/msg/A}, destinations: basestation}
+"""
+    routes = {route.name: route for route in good(tmp_path, text).routes}
+    [topic], [destination] = routes["gps_info"].topics, routes["gps_info"].destinations
+    assert (topic.topic.value, topic.max_rate, topic.when, topic.fields) == ("b", None, None, None)
+    assert (destination.endpoint.value, destination.when) == ("sensor_board", None)
+    assert [topic.topic.value for topic in routes["arm_ctrl"].source_topics] == ["b"]
+
+
+def test_a_map_of_values_and_a_quality_of_service_replace(tmp_path: Path) -> None:
+    (tmp_path / "base.yaml").write_text(
+        GOOD
+        + """\
+  arm_ctrl:
+    source: {topic: a, type: comms/msg/A}
+    destinations: basestation
+    fields: {a: {map: mode, ONE: 1, else: 0}, b: {text: base}, c: {x: 1, y: 2}}
+defaults: {qos: {profile: sensor_data, depth: 7}}
+"""
+    )
+    text = """\
+extends: base.yaml
+routes:
+  arm_ctrl: {fields: {a: {map: other, TWO: 2, else: 0}, b: {map: mode, ONE: {text: over}, else: source}, c: {y: 3}}}
+defaults: {qos: {reliability: best_effort}}
+"""
+    route = good(tmp_path, text).routes[-1]
+    assert str(route.fields) == (
+        "{a: {map: other, TWO: 2, else: 0}, b: {map: mode, ONE: 'over', else: source}, c.x: 1, c.y: 3}"
+    )
+    [topic] = route.source_topics
+    assert topic.qos is not None
+    assert (topic.qos.profile, topic.qos.depth) == (None, None)

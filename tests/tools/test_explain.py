@@ -180,11 +180,11 @@ def test_a_deadman_of_a_gateway_shows(tmp_path: Path) -> None:
     new = INBOUND.replace("TIME", "2s, at_start: silent").replace("data: 1", "data: 2")
     assert told(tmp_path, new, INBOUND.replace("TIME", "500ms")) == [
         (
-            "gateway dashboard: -deadman: data 1 when no message came for 500 ms, again every 100 ms, "
+            "gateway dashboard: -deadman: {data: 1} when no message came for 500 ms, again every 100 ms, "
             "and once when the router starts"
         ),
         (
-            "gateway dashboard: +deadman: data 2 when no message came for 2 s, again every 100 ms, "
+            "gateway dashboard: +deadman: {data: 2} when no message came for 2 s, again every 100 ms, "
             "but not when the router starts"
         ),
     ]
