@@ -74,6 +74,8 @@ def _to_message(value: Typed, target: MessageType, scope: Scope) -> Plan:
     if len(target.fields) == 1:
         (only,) = target.fields
         return Record(target, ((only, convert(value, only.type, scope)),), value.span)
+    if isinstance(value.kind, (IntKind, FloatKind)) and target.name in _TIMES:
+        raise mismatch(value, target, "time_from_milliseconds(x) and time_from_seconds(x) make a time of a number")
     raise mismatch(value, target, "map its fields one by one")
 
 
@@ -170,6 +172,8 @@ def mismatch(value: Typed, target: Type, hint: str = "") -> ExpressionError:
 def _to_bool(value: Typed, target: Bool) -> ast.expr:
     if isinstance(value.kind, BoolKind):
         return value.node
+    if value.constant in (0, 1):
+        raise mismatch(value, target, f"write {'true' if value.constant else 'false'}")
     raise mismatch(value, target, "compare it, as in x != 0" if isinstance(value.kind, (IntKind, FloatKind)) else "")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from router.compiler.expressions import ExpressionError, Reads, Scope, Typed, ch
 from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest
-from router.table.model import ROS, Endpoint, EndpointKind, EnvelopeSettings, Expression, RouteTable, Topic
+from router.table.model import ANY, ROS, Endpoint, EndpointKind, EnvelopeSettings, Expression, Route, RouteTable, Topic
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
 from router.types.proto_files import read_folder
@@ -52,6 +53,8 @@ class Definitions:
         return ros_interfaces()
 
 
+_ALIKE = 0.8
+"""How near the names of two endpoints are for one to be suggested in place of the other: commands go there."""
 NO_NAMES: Mapping[str, Typed] = {}
 
 
@@ -82,18 +85,15 @@ class Lookup:
         found = self.table.endpoints.get(name.value)
         if found is None and f"endpoints/{name.value}" not in self.table.broken:
             known = [*self.table.endpoints, *also]
-            used = [used for route in self.table.routes for used in route.endpoint_names]
-            meant = self.table.endpoints.get(nearest(name.value, known) or "")
-            if meant and meant.name not in used and used.count(name.value) > 1:  # its declaration is misspelt
-                message = f"no route names the endpoint '{meant.name}', several name '{name.value}'"
-                self.report(meant.span, Code.UNKNOWN_ENDPOINT, message, f"did you mean '{name.value}'?")
-            else:
-                hint = did_you_mean(name.value, known)
-                if "," in name.value:
-                    hint = f"write a list: [{name.value}]"
-                if name.value == ROS:
-                    hint = "messages come from topics by their names: `source: {topic: NAME}`"
-                self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
+            hint = did_you_mean(name.value, known, _ALIKE)
+            if "," in name.value:
+                names = [each.strip() for each in name.value.split(",") if each.strip()]
+                hint = f"write a list: [{', '.join(names)}]" if len(names) > 1 else "remove the ','"
+            elif also and name.value == ROS:
+                hint = "a topic is written `source: {topic: NAME}`"
+            elif also and not nearest(name.value, known, _ALIKE):
+                hint += f"; a topic is written `source: {{topic: {name.value}}}`"
+            self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
         return found
 
     def recipient(self, case: PayloadCase, name: Located[str], sources: AbstractSet[str]) -> Endpoint | None:
@@ -119,8 +119,16 @@ class Lookup:
             self.findings += error.diagnostics
             return None
         if found is None:
-            hint = _ros_type_hint(name, self.definitions.interfaces.names())
-            if topic.type.span == topic.topic.span:
+            known = self.definitions.interfaces.names()
+            packages = {full.partition("/")[0] for full in known}
+            package, hint = self.table.package, _ros_type_hint(name, known)
+            if package is not None and topic.type.span == topic.topic.span:
+                if package.value not in packages:
+                    near = nearest(package.value, packages)
+                    hint = f"did you mean '{near}'?" if near else "build and source it, or name another one"
+                    message = f"no package '{package.value}' has ROS messages"
+                    self.report(package.span, Code.UNKNOWN_ROS_TYPE, message, hint)
+                    return None
                 hint = f"that is what `defaults.package` makes of the payload; say its 'type' ({hint})"
             self.report(topic.type.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name}'", hint)
         return found
@@ -131,10 +139,16 @@ class Lookup:
         reads: Reads,
         ros_type: MessageType | None = None,
         names: Mapping[str, Typed] = NO_NAMES,
+        route: Route | None = None,
     ) -> Scope:
-        """The scope of expressions over `message`, with the constants of `ros_type` and of the types in it."""
+        """The scope of expressions over `message`, with the constants of `ros_type` and of the types in it.
+
+        `route` takes `message` from endpoints, or is None.
+        """
         nested = tuple(nested_types(ros_type)) if ros_type else ()
-        return Scope(message, tuple(self.schema.enums.values()), nested, reads, names)
+        sources = tuple(source.value for source in route.sources) if route else ()
+        known = () if ANY in sources else sources
+        return Scope(message, tuple(self.schema.enums.values()), nested, reads, names, sources=known)
 
     def value(
         self, expression: Expression, scope: Scope, kinds: tuple[type[Kind], ...], wanted: str, hint: str = ""
@@ -177,7 +191,8 @@ def layout(message: MessageType) -> dict[str, tuple[tuple[str, str], ...]]:
 
 def _ros_type_hint(name: str, known: Collection[str]) -> str:
     """Types of that name in whatever package, else what its package has, else where types come from."""
-    package, short = name.partition("/")[0], name.rpartition("/")[2]
+    parts = [part for part in re.split(r"[/:.]+", name) if part] or [name]
+    package, short = parts[0], parts[-1]
     namesakes = [full for full in known if full.rpartition("/")[2] == short]
     siblings = [full for full in known if full.partition("/")[0] == package]
     source = Path("schemas", package, "msg", f"{short}.msg")

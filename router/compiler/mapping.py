@@ -14,7 +14,7 @@ from router.compiler.conversion import convert, same_named, unset
 from router.compiler.expressions import ExpressionError, Scope, Typed, check
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
-from router.table.model import TEXT, Expression, FieldEntry, FieldMap
+from router.table.model import TEXT, Choices, Expression, FieldEntry, FieldMap
 from router.types.model import Field, MessageType, Type
 
 
@@ -126,6 +126,7 @@ class _Builder:
         self.origin = origin
         self.rows: list[Row] = []
         self.findings: list[Diagnostic] = []
+        self._whole = set[tuple[str, ...]]()
 
     # entries by field
 
@@ -141,10 +142,14 @@ class _Builder:
         """The message types along the path of an entry, empty if it leads to no field."""
         holders: list[MessageType] = []
         holder: Type = target
-        for name, span in zip(entry.path, entry.path_spans, strict=True):
+        for depth, (name, span) in enumerate(zip(entry.path, entry.path_spans, strict=True)):
             if not isinstance(holder, MessageType):
-                message, hint = f"a {holder} has no fields", "give the whole of it one value"
-                self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, message, hint))
+                path = entry.path[:depth]
+                if path not in self._whole:
+                    self._whole.add(path)
+                    message = f"{holder} has no fields"
+                    hint = "give the whole of it one value, or choose one: {map: FIELD, VALUE: ..., else: ...}"
+                    self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, message, hint))
                 return []
             member = holder.field(name)
             if member is None:
@@ -195,10 +200,23 @@ class _Builder:
             typed = check(entry.value, self.scope, member.type)
             plan = convert(typed, member.type, self.scope)
         except ExpressionError as error:
-            self.findings.append(error.diagnostic)
+            found = error.diagnostic
+            if entry.value.choices is not None and found.span == entry.value.span:
+                found = self._chosen_finding(member, entry.value.choices) or found
+            self.findings.append(found)
             return unset(member, entry.value.span)
         self.rows.append(Row(path, str(member.type), _text(entry.value), str(typed.kind), automatic=False))
         return plan
+
+    def _chosen_finding(self, member: Field, choices: Choices) -> Diagnostic | None:
+        """The finding for the first value of a map that does not fill the field by itself."""
+        values = [value for _, value in choices.values]
+        for value in values if choices.otherwise is None else [*values, choices.otherwise]:
+            try:
+                convert(check(value, self.scope, member.type), member.type, self.scope)
+            except ExpressionError as error:
+                return error.diagnostic
+        return None
 
     def _automatic(self, member: Field, source: Typed, path: str) -> Plan:
         try:

@@ -15,6 +15,7 @@ from router.compiler.mapping import build
 from router.compiler.source import load
 from router.compiler.topics import qos_findings, resolved, topic_name_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, nearest
+from router.table.keys import are_same
 from router.table.model import (
     ANY,
     Collect,
@@ -123,9 +124,11 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
     targets = [_forward(lookup, route, case, to, endpoint) for to, endpoint in destinations(lookup, route, case)]
     names = _frame_names(case, route.collect.span) if route.collect else {}
     for topic in route.topics:
+        if any(are_same(topic, other) for other in route.topics[: route.topics.index(topic)]):
+            lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{topic.topic.value}' stands here twice", "name it once")
         ros_type = lookup.ros_type(topic)
         if ros_type is not None:
-            targets.append(_publish(lookup, case, topic, ros_type, names))
+            targets.append(_publish(lookup, route, case, topic, ros_type, names))
     collect = _collect(lookup, route, case, route.collect) if route.collect else None
     return CheckedRoute(route, case, tuple(targets), collect=collect)
 
@@ -137,7 +140,7 @@ def _forward(
         message, hint = "a datagram is forwarded unchanged", "'fields' is for messages that come from a topic"
         lookup.report(destination.fields.span, Code.UNKNOWN_KEY, message, hint)
     reads = ParsedReads()
-    when = lookup.when(destination.when, lookup.scope(case.type, reads))
+    when = lookup.when(destination.when, lookup.scope(case.type, reads, route=route))
     return CheckedTarget(
         destination,
         endpoint=endpoint,
@@ -149,10 +152,10 @@ def _forward(
 
 
 def _publish(
-    lookup: Lookup, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Typed]
+    lookup: Lookup, route: Route, case: PayloadCase, topic: Topic, ros_type: MessageType, names: dict[str, Typed]
 ) -> CheckedTarget:
     reads = ParsedReads()
-    scope = lookup.scope(case.type, reads, ros_type, names)
+    scope = lookup.scope(case.type, reads, ros_type, names, route)
     when = lookup.when(topic.when, scope)
     mapping = build(topic.fields, ros_type, scope, topic.topic.span, ros_type=ros_type)
     lookup.findings += mapping.findings

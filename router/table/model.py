@@ -365,14 +365,6 @@ class Route:
         """The topics that it publishes on or takes messages from."""
         return (*self.topics, *self.source_topics)
 
-    @property
-    def endpoint_names(self) -> tuple[str, ...]:
-        """What it names as sources and destinations, `any` among them."""
-        return (
-            *(source.value for source in self.sources),
-            *(destination.endpoint.value for destination in self.destinations),
-        )
-
 
 class Transport(enum.Enum):
     """How a gateway reaches its clients."""

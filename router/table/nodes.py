@@ -211,6 +211,8 @@ _INDISPENSABLE = frozenset(
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
 """Sets of keys each of which gives a mapping a meaning, whatever else it lacks or has too much."""
 
+_OF_ONE_PIECE = {"map", "text"}
+"""Keys of values that are mappings, which mean nothing without one of their parts."""
 _USES_NAMES_OF = {"collect": ("topics",)}
 """Where a route's expressions use names (`items`) that there are only with this key."""
 
@@ -233,6 +235,8 @@ def _valid_part(node: Node) -> Node | None:
 
 def _valid_mapping(node: MappingNode) -> MappingNode | None:
     if node.broken and not _has_meaning(node):
+        return None
+    if _OF_ONE_PIECE & node.entries.keys() and not is_valid(node):
         return None
     invalid = {key for key, entry in node.entries.items() if not is_valid(entry.value)}
     if invalid & _INDISPENSABLE:

@@ -106,7 +106,9 @@ routes:
           frame_id: {{map: state, SENSOR_ERROR: {{text: not a field}}, SENSOR_IDLE: "'idle'", else: {{text: "4"}}}}
           stamp.sec: {{map: is_calibrated, true: 1, false: 0}}
       - {{topic: names, type: sensor_msgs/msg/JointState, fields: {{name: [source, {{text: source}}]}}}}
-      - {{topic: word, type: std_msgs/msg/String, fields: {{data: {{map: source, text: {{text: map}}, else: source}}}}}}
+      - topic: word
+        type: std_msgs/msg/String
+        fields: {{data: {{map: str(state), text: {{text: map}}, else: source}}}}
 """
 
 
@@ -120,7 +122,7 @@ def test_maps_and_texts_of_a_table_become_expressions(tmp_path: Path) -> None:
     assert rows["frame_id"] == "{map: state, SENSOR_ERROR: 'not a field', SENSOR_IDLE: 'idle', else: '4'}"
     assert rows["stamp.sec"] == "{map: is_calibrated, true: 1, false: 0}"
     assert rows["name"] == "[source, 'source']"
-    assert rows["data"] == "{map: source, text: 'map', else: source}"
+    assert rows["data"] == "{map: str(state), text: 'map', else: source}"
 
 
 def test_the_longest_map_is_compiled() -> None:
@@ -131,7 +133,7 @@ def test_the_longest_map_is_compiled() -> None:
 def test_what_a_map_chooses_has_to_fit_its_target() -> None:
     scope = scope_of(SOURCE, [GEAR])
     mapping = build(field_map(level=chosen("gear", {"PARK": "1"}, "1000")), TARGET, scope, SPAN)
-    assert [finding.code for finding in mapping.findings] == [Code.LOSSY_CONVERSION]
+    assert [finding.code for finding in mapping.findings] == [Code.OUT_OF_RANGE]
 
 
 def text(word: str, field: str = "word") -> FieldMap:

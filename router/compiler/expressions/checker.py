@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from router.compiler.expressions import operators, spellings
@@ -80,9 +80,12 @@ def _key(name: Located[str], subject: Typed, scope: Scope) -> Typed:
         if name.value in values:
             return Typed.at(name.span, subject.kind, ast.Constant(values[name.value]))
         message = f"'{subject.kind.enum.name}' has no value '{name.value}'"
-        raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, did_you_mean(name.value, values))
+        raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, _key_hint(name.value, values))
     if isinstance(subject.kind, StringKind):
-        return Typed.at(name.span, StringKind(), ast.Constant(name.value))
+        key = Typed.at(name.span, StringKind(), ast.Constant(name.value))
+        if is_source(subject):
+            want_sources([key], scope)
+        return key
     if name.value in scope.message.constants:
         return constant(scope.message.constants[name.value], name.span)
     key = check(Expression(name.value, TextPlace(name.span)), scope)
@@ -90,6 +93,15 @@ def _key(name: Located[str], subject: Typed, scope: Scope) -> Typed:
         message = f"'{name.value}' is no constant"
         raise ExpressionError(name.span, Code.TYPE_MISMATCH, message, "the keys of a map are values, not fields")
     return key
+
+
+def _key_hint(name: str, values: Mapping[str, int]) -> str:
+    """What to write for a key that is no name of an enum with these values."""
+    short = name.replace("::", ".").rpartition(".")[2]
+    named = [short] if short in values else [value for value, number in values.items() if str(number) == name]
+    if named:
+        return f"did you mean '{named[0]}'?"
+    return "write `else` for all other values" if name in ("default", "_", "*", "other") else did_you_mean(name, values)
 
 
 def _want_different(choices: Choices, keys: Sequence[Typed]) -> None:
@@ -163,6 +175,8 @@ class _Checker:
                 return operators.boolean(node.op, [self.check(value) for value in node.values], span)
             case ast.Compare():
                 operands = [self.check(operand) for operand in (node.left, *node.comparators)]
+                if any(is_source(operand) for operand in operands):
+                    want_sources(operands, self.scope)
                 return operators.comparison(node.ops, operands, span)
             case ast.IfExp():
                 test = self.check(node.test)
@@ -218,7 +232,7 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
         known = [text.lower()]
     hint = (
         _of_an_enum(text, scope)
-        or spellings.NAMES.get(text)
+        or spellings.NAMES.get(text.lower())
         or did_you_mean(text, known)
         or "only constants can stand here"
     )
@@ -229,17 +243,37 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
 
 
 def _of_an_enum(text: str, scope: Scope) -> str:
-    """A hint for an enum value without its enum; enums of the message's own fields come first."""
+    """A hint for a value without its enum or ROS type; enums of the message's own fields come first."""
     homes = [enum for enum in scope.enums if text in dict(enum.values)]
     types = [member.type for member in scope.message.fields]
     own = [home for home in homes if home in types] or homes
-    return f"did you mean '{own[0]}.{text}'?" if own else ""
+    names = [enum.name for enum in own] or [ros.short_name for ros in scope.ros_types if text in ros.constants]
+    if names:
+        return f"did you mean '{names[0]}.{text}'?"
+    values = {value: enum for enum in types if isinstance(enum, Enum) for value, _ in enum.values}
+    near = nearest(text, values, 0.8) if text.isupper() else None
+    return f"did you mean '{values[near]}.{near}'?" if near else ""
 
 
 def _given(text: str, span: SourceSpan, scope: Scope) -> Typed:
     if text == MESSAGE:
         return scope.whole_message(span)
     return Typed.at(span, StringKind() if text == SOURCE else TimeKind(), load(text))
+
+
+def is_source(operand: Typed) -> bool:
+    """Whether an operand is the name of the endpoint that sent the message."""
+    return isinstance(operand.node, ast.Name) and operand.node.id == SOURCE
+
+
+def want_sources(operands: Iterable[Typed], scope: Scope) -> None:
+    """Refuse texts that are compared with the name of the sender and that no sender of the message has."""
+    for operand in operands:
+        want_sources(operand.items or (), scope)
+        if isinstance(operand.constant, str) and scope.sources and operand.constant not in scope.sources:
+            message = f"'{operand.constant}' is no source of this route"
+            hint = did_you_mean(operand.constant, scope.sources)
+            raise ExpressionError(operand.span, Code.UNKNOWN_ENDPOINT, message, hint)
 
 
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
@@ -255,7 +289,7 @@ def field_of(holder: Typed, node: ast.Attribute, text: Parsed, scope: Scope) -> 
     span = text.span(node)
     if not isinstance(holder.kind, MessageKind):
         hint = "only messages have fields"
-        raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"'.{node.attr}' of a {holder.kind}", hint)
+        raise ExpressionError(span, Code.FORBIDDEN_EXPRESSION, f"{holder.kind} has no '.{node.attr}'", hint)
     member = holder.kind.type.field(node.attr)
     if member is None:
         hint = did_you_mean(node.attr, [known.name for known in holder.kind.type.fields])
@@ -276,7 +310,9 @@ def constant_of(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
     if not found:
         known = {value for holder in holders for value in _constants(holder)}
         message = f"'{holder_name}' has no value '{node.attr}'"
-        raise ExpressionError(text.last_span(node), Code.UNKNOWN_ENUM_VALUE, message, did_you_mean(node.attr, known))
+        hint = did_you_mean(node.attr, known) if nearest(node.attr, known) else _of_an_enum(node.attr, scope)
+        hint = hint or did_you_mean(node.attr, known)
+        raise ExpressionError(text.last_span(node), Code.UNKNOWN_ENUM_VALUE, message, hint)
     if len({value for _, value in found}) > 1:
         names = ", ".join(sorted(holder.name for holder, _ in found))
         message = f"'{holder_name}.{node.attr}' may be of {names}"
@@ -290,7 +326,7 @@ def _without_root(path: tuple[str, ...], scope: Scope) -> str:
     """A hint for `msg.accel_x` and `math.pi`, which stand here without what they belong to elsewhere."""
     if path[1] in scope.field_names():
         return f"write {'.'.join(path[1:])}: a name is a field of the message"
-    return spellings.NAMES.get(path[-1], "")
+    return spellings.NAMES.get(path[-1].lower(), "")
 
 
 def _constants(holder: Enum | MessageType) -> Mapping[str, object]:
@@ -325,19 +361,20 @@ def called_name(node: ast.Call, text: Parsed) -> str:
     """The name in front of the brackets. Raises ExpressionError for calls of another shape than `name(a, b)`."""
     if not isinstance(node.func, ast.Name):
         name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
-        known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name)
+        known = f"write {FUNCTIONS[name].signature}" if name in FUNCTIONS else spellings.FUNCTIONS.get(name.lower())
         hint = known or did_you_mean("", FUNCTIONS)
         raise ExpressionError(text.span(node.func), Code.FORBIDDEN_EXPRESSION, "only listed functions are called", hint)
     if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
         message = f"{node.func.id}() takes its arguments by position"
-        raise ExpressionError(text.span(node), Code.WRONG_ARGUMENTS, message)
+        hint = f"write {FUNCTIONS[node.func.id].signature}" if node.func.id in FUNCTIONS else ""
+        raise ExpressionError(text.span(node), Code.WRONG_ARGUMENTS, message, hint)
     return node.func.id
 
 
 def function_named(name: str, span: SourceSpan) -> Function:
     function = FUNCTIONS.get(name)
     if function is None:
-        hint = spellings.FUNCTIONS.get(name) or did_you_mean(name, [*FUNCTIONS, HAS])
+        hint = spellings.FUNCTIONS.get(name.lower()) or did_you_mean(name, [*FUNCTIONS, HAS])
         raise ExpressionError(span, Code.UNKNOWN_FUNCTION, f"there is no function '{name}'", hint)
     return function
 

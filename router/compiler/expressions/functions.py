@@ -212,10 +212,9 @@ class Function:
 
     @property
     def signature(self) -> str:
-        names = [parameter.name for parameter in self.parameters]
-        required = len(names) - self.optional
-        shown = names[:required] + [f"{name}=..." for name in names[required:]] + ["..."] * self.variadic
-        return f"{self.name}({', '.join(shown)})"
+        """A call with all arguments: `clamp(x, low, high)`."""
+        names = [parameter.name for parameter in self.parameters] + ["..."] * self.variadic
+        return f"{self.name}({', '.join(names)})"
 
 
 def _number(name: str = "x") -> Parameter:

@@ -186,7 +186,8 @@ def _power(base: Kind, exponent: Typed) -> Kind:
     value = exponent.constant
     if not isinstance(value, int) or not 0 <= value <= LARGEST_EXPONENT:
         message = f"an exponent is a literal integer from 0 to {LARGEST_EXPONENT}"
-        raise ExpressionError(exponent.span, Code.FORBIDDEN_EXPRESSION, message, "use sqrt() for roots")
+        hint = "sqrt(x) is the root, 1 / x ** 2 has a negative exponent"
+        raise ExpressionError(exponent.span, Code.FORBIDDEN_EXPRESSION, message, hint)
     number = as_int(base)
     if number is None:
         return FloatKind(float_bits(base))

@@ -140,7 +140,8 @@ class Scope:
 
     `enums` are the protobuf enums by full name, `ros_types` the ROS types whose constants are visible. `names` are
     variables beside the message's fields; they win over fields of the same name. `given` are those of
-    MESSAGE, SOURCE and RECEIVED_AT that can be named.
+    MESSAGE, SOURCE and RECEIVED_AT that can be named. `sources` are the values that SOURCE can have, empty if they are
+    not known.
     """
 
     message: MessageType
@@ -149,6 +150,7 @@ class Scope:
     reads: Reads
     names: Mapping[str, Typed] = field(default_factory=dict)
     given: Collection[str] = (MESSAGE, SOURCE, RECEIVED_AT)
+    sources: Collection[str] = ()
 
     def field_names(self) -> list[str]:
         """The fields of the message and the names beside them."""

@@ -10,16 +10,32 @@ ARRIVAL = "write received_at, the time of arrival"
 INTEGERS = "round(x), trunc(x), floor(x) and ceil(x) make an integer of it"
 POWER = "write x ** 2"
 
+SQUARE = "write x ** 2; there is no power of bits"
+BITS = "there are no operations on bits; `{}` is for bools"
+FLOAT = "write float64(x), or float32(x)"
+
 _SYNTAX = (
+    (r"\?\?|\?\.", LEFT_OUT),
     (r"\?", f"{CONDITIONAL} for `a ? b : c`"),
     (r"&&", "write `and` for `&&`"),
     (r"\|\|", "write `or` for `||`"),
+    (r"===", "write `==`"),
+    (r"<>", "write `!=`"),
     (r"!(?!=)", "write `not` for `!`"),
+    (r"::", "write `.` for `::`; functions have no namespace"),
+    (r"<\w+>\s*\(|\((?:unsigned )?(?:float|double|int|u?int\d+_t)\)\s*\w", f"{FLOAT}, round(x) or int(x) for a cast"),
+    (r"\d[fFuUlL]\b", "write the number without its suffix"),
+    (r"^\s*return\b", "write the value alone, without `return`"),
+    (r"//.*\w\s+\w", "a comment begins with `#`, after a space and outside of quotes"),
+    (r";\s*$", "remove the `;`"),
+    ("[\u00d7\u00b7]", "write `*`"),
+    ("[\u2212\u2013]", "write `-`"),
     (r"^\s*if\b", f"{CONDITIONAL} for `if a then b else c`"),
     (r"\bif\b(?!.*\belse\b)", CONDITIONAL),
     (r"(?<![<>=!])=(?!=)", "`==` compares; an expression assigns nothing"),
     (r"^\s*[-+]?\.(?:nan|inf)\s*$", "write nan, inf or -inf"),
     (r"\$\w", "write the field's name without `$`"),
+    (r"^[^(]*\)", "a bracket is closed that was not opened"),
     (r"\w\s+\w", "an operator is missing there, or the brackets of a function: abs(x)"),
 )
 """What to search in an expression that Python cannot parse, in this order."""
@@ -27,32 +43,39 @@ _SYNTAX = (
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 
 NAMES = {
-    **dict.fromkeys(("null", "nil", "NULL", "undefined"), LEFT_OUT),
-    "pi": "write 3.141592653589793; radians(x) and degrees(x) turn angles",
-    "now": ARRIVAL,
-    "time": ARRIVAL,
+    **dict.fromkeys(("null", "nil", "undefined"), LEFT_OUT),
+    **dict.fromkeys(("pi", "m_pi"), "write 3.141592653589793; radians(x) and degrees(x) turn angles"),
+    **dict.fromkeys(("now", "time", "stamp", "timestamp"), ARRIVAL),
+    **dict.fromkeys(("infinity", "infinityf"), "write inf"),
+    "static_cast": FLOAT,
+    "header": ARRIVAL,
 }
-"""Names that are neither fields nor constants."""
+"""Names, in lower case, that are neither fields nor constants."""
 
 FUNCTIONS = {
-    "pow": POWER,
-    "square": POWER,
+    **dict.fromkeys(("pow", "square", "sqr"), POWER),
     "fabs": "write abs(x)",
     "mod": "write x % y",
     "fmod": "write x % y",
-    "float": "write float64(x), or float32(x)",
+    "float": FLOAT,
     "double": "write float64(x)",
+    "isnan": "x != x is true where x is NaN",
+    "sign": "write 1 if x > 0 else -1 if x < 0 else 0",
+    "atan": "write atan2(y, x)",
+    "asin": "write atan2(x, sqrt(1 - x * x))",
+    "acos": "write atan2(sqrt(1 - x * x), x)",
+    "map": "values are chosen by {map: FIELD, VALUE: ..., else: ...}",
+    "text": "text is {text: WORD}, or in quotes",
+    "received_at": "write it without brackets",
     "bool": "compare: x != 0",
     "constrain": "write clamp(x, low, high)",
-    "rad": "write radians(x)",
-    "deg2rad": "write radians(x)",
-    "deg": "write degrees(x)",
-    "rad2deg": "write degrees(x)",
+    **dict.fromkeys(("rad", "deg2rad", "to_radians", "degtorad"), "write radians(x)"),
+    **dict.fromkeys(("deg", "rad2deg", "to_degrees", "radtodeg"), "write degrees(x)"),
     "to_string": "write str(x)",
     "now": ARRIVAL,
     "time": ARRIVAL,
 }
-"""Functions by their names elsewhere, after the module's name where there is one."""
+"""Functions by their names elsewhere, in lower case, after the module's name where there is one."""
 
 
 def of_syntax(text: str) -> str:

@@ -6,7 +6,10 @@ Anything that Python can parse passes here; `forbidden` words the finding for wh
 from __future__ import annotations
 
 import ast
+import io
+import tokenize
 import warnings
+from contextlib import suppress
 
 from router.compiler.expressions import spellings
 from router.compiler.expressions.scope import ExpressionError
@@ -25,6 +28,13 @@ class Parsed:
         self.tree = self._parse(text.strip())
 
     def _parse(self, text: str) -> ast.expr:
+        if "#" in text and (at := _comment(text)) is not None:
+            span, message = (
+                self._expression.place.part(at, at + 1),
+                "a '#' ends the expression, and the rest is not used",
+            )
+            hint = "remove it: in quotes, and in a text of several lines, '#' begins no comment of YAML"
+            raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, hint)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", SyntaxWarning)
@@ -60,6 +70,15 @@ class Parsed:
         return self._indent + len(self._encoded[:offset].decode(errors="replace"))
 
 
+def _comment(text: str) -> int | None:
+    """Where a comment of Python begins in the text, outside of its quotes."""
+    with suppress(tokenize.TokenError, SyntaxError):
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type == tokenize.COMMENT:
+                return token.start[1]
+    return None
+
+
 def dotted(node: ast.expr) -> tuple[str, ...] | None:
     """`a.b.c` as its parts, None for anything else."""
     parts: list[str] = []
@@ -82,9 +101,9 @@ def forbidden(node: ast.AST, span: SourceSpan) -> ExpressionError:
 _HINTS: dict[type[ast.AST], str] = {
     ast.Constant: f"literals are numbers, strings, True and False; {spellings.LEFT_OUT}",
     ast.BitXor: spellings.POWER,
-    ast.BitAnd: "write `and`",
-    ast.BitOr: "write `or`",
-    ast.Invert: "write `not`",
+    ast.BitAnd: spellings.BITS.format("and"),
+    ast.BitOr: spellings.BITS.format("or"),
+    ast.Invert: spellings.BITS.format("not"),
     ast.Lambda: "expressions have no lambda",
     ast.ListComp: "expressions have no loops",
     ast.GeneratorExp: "expressions have no loops",
