@@ -72,13 +72,20 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
             raise UsageError(f"nothing is sent that '{silence.name}' could silence; {hint}")
 
 
+FEEDS = 5
+"""How often a command is sent at least within the timeout of its deadman."""
+
+
 def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[Stream]:
     """The streams of the table's UDP sources, in the order of the table. Raises UsageError for an unknown name."""
     for route in table.routes:
         if not route.sources:
             continue
         case = wire.case(route.case.value)
-        rate = RATES.get(case.name, USUAL_RATE) * speed
+        rate = RATES.get(case.name, USUAL_RATE)
+        if route.deadman is not None:
+            rate = max(rate, FEEDS * 1e9 / route.deadman.timeout.value)
+        rate *= speed
         for source in route.sources:
             sender = STRANGER if source.value == ANY else source.value
             if sender != STRANGER and sender not in table.endpoints:

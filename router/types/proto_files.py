@@ -49,15 +49,27 @@ class Folder:
         return digest.hexdigest()
 
 
+def _meant(root: Path, blame: SourceSpan) -> str:
+    """What to write for a folder that is not there, in the table at `blame`."""
+    path = root.resolve()
+    if path.is_file():
+        return "that is a file: name its folder"
+    beside_table = path.parent.parent / path.name  # of a table in routes/
+    near = next((each for each in (nearest_path(path), beside_table) if each is not None and each.is_dir()), None)
+    if near is None:
+        return "a path is relative to the table that it stands in"
+    return f"did you mean '{Path(os.path.relpath(near, Path(blame.file).resolve().parent)).as_posix()}'?"
+
+
 def read_folder(root: Path, blame: SourceSpan) -> Folder:
     """The `.proto` and `.options` files below `root`; hidden ones are left alone.
 
     What is wrong with the folder itself, or with a file's name, is blamed on `blame`. Raises TableError for the folder.
     """
     if not root.is_dir():
-        near = nearest_path(root.resolve())
-        hint = f"did you mean '{shown_path(near)}'?" if near else "a path is relative to the table that it stands in"
-        raise TableError([Diagnostic(blame, Code.BAD_FILE, f"there is no folder {root.resolve()}", hint)])
+        raise TableError(
+            [Diagnostic(blame, Code.BAD_FILE, f"there is no folder {root.resolve()}", _meant(root, blame))]
+        )
     found = {
         name: path
         for path in walk(root)

@@ -116,6 +116,14 @@ def test_rates_and_offsets_follow_from_seed_and_scale(wire: Wire, table: RouteTa
     assert [stream.rate for stream in first] == [4.0, 4.0]
 
 
+def test_a_command_is_sent_often_enough_for_its_deadman(wire: Wire, table_path: Callable[..., Path]) -> None:
+    path = table_path()
+    deadman = "deadman: {timeout: 200ms, send: {plain: {}}, to: [board]}"
+    path.write_text(path.read_text().replace("plain: {source: station,", f"plain: {{source: station, {deadman},"))
+    rates = {stream.case.name: stream.rate for stream in streams(wire, read_table(path), 5, 2.0)}
+    assert rates == {"every_kind": 4.0, "plain": 50.0}
+
+
 def test_a_silent_endpoint_sends_nothing_and_others_go_on(wire: Wire, table: RouteTable) -> None:
     silences = [Silence("station", 0.0, math.inf)]
     with played(wire, table, silences=silences) as (simulator, _):

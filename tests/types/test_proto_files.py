@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from router.errors import Code, Located, SourceSpan, TableError
+from router.types.proto_files import read_folder
 from router.types.protobuf import load_protos
 from tests.types.conftest import Refused, Write, refusal, settings
 
@@ -58,3 +59,19 @@ def test_proto_without_syntax_is_a_finding(refused: Refused, text: str) -> None:
     assert [str(finding) for finding in refused({"a.proto": text})] == [
         'a.proto:1:1: error[bad-proto]: the file does not say its syntax; begin it with `syntax = "proto3";`'
     ]
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [("../proto", "'../protos'"), ("protos", "'../protos'"), ("../protos/a.proto", "name its folder"), ("x", "relative")],
+)
+def test_a_folder_that_is_not_there_is_told_with_what_is(tmp_path: Path, written: str, meant: str) -> None:
+    (tmp_path / "protos").mkdir()
+    (tmp_path / "protos" / "a.proto").touch()
+    (tmp_path / "routes").mkdir()
+    table = tmp_path / "routes" / "table.yaml"
+    with pytest.raises(TableError) as refused:
+        read_folder(table.parent / written, SourceSpan(str(table), 1))
+    [finding] = refused.value.diagnostics
+    assert str((table.parent / written).resolve()) in finding.message
+    assert meant in finding.hint
