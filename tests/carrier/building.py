@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from ctypes import c_bool, c_int, c_int64, c_void_p
 from pathlib import Path
+
+import pytest
 
 from router.carrier.build import NATIVE, build, compile_c, sources
 
@@ -53,6 +56,8 @@ def program(output: Path, main: Path, flags: Sequence[str], compiler: str | None
 
 def run_program(name: str, folder: Path, *arguments: object, sanitizers: str = "") -> None:
     """Make `programs/NAME.c` in `folder`, and run it. Fails if the program does, or a sanitizer finds something."""
+    if sanitizers and shutil.which("clang") is None:
+        pytest.skip("needs clang")
     flags = sanitizing(sanitizers) if sanitizers else ["-O2"]
     main = Path(__file__).parent / "programs" / f"{name}.c"
     made = program(folder / name, main, flags, "clang" if sanitizers else None)
