@@ -152,10 +152,29 @@ def _neighbours(source: Source, line: int) -> list[int]:
 
 def _misplaced(source: Source, line: int, neighbours: list[int]) -> Diagnostic:
     own = _indent(source.lines[line])
+    if (odd := _odd_line_above(source, line)) is not None:
+        line, own, neighbours = odd, _indent(source.lines[odd]), [own]
     spaces = f"{own} space{'s' * (own != 1)}"
     what = f"this line is indented by {spaces}, its neighbours by {' or '.join(map(str, neighbours))}"
     hint = "indent the keys of one mapping alike, and the items of one list"
     return Diagnostic(source.span(line, own, line, own + 1), Code.BAD_YAML, what, hint)
+
+
+def _odd_line_above(source: Source, line: int) -> int | None:
+    """The one line that is indented by a space more or less than this line and the next one; None without."""
+    own = _indent(source.lines[line])
+    written = [(number, _indent(text)) for number, text in enumerate(source.lines) if _text(source, number)]
+    if own != next((indent for number, indent in written if number > line and indent <= own), None):
+        return None
+    for near in (own + 1, own - 1):
+        odd = list[int]()
+        for number, indent in reversed(written):
+            if number < line and indent < min(own, near):
+                break
+            odd += [number] if number < line and indent == near else []
+        if len(odd) == 1:
+            return odd[0]
+    return None
 
 
 def _text(source: Source, line: int) -> str:

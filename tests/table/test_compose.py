@@ -129,6 +129,26 @@ def test_one_mistake_is_one_finding_in_its_line(
         assert (finding.span.line, finding.span.column) == place
 
 
+@pytest.mark.parametrize(
+    ("text", "place", "message", "hint"),
+    [
+        ("r:\n a: 1\n  b: {}\n  c: {}\n", (2, 2), "indented by 1 space, its neighbours by 2", "alike"),
+        ("r:\n   a: {}\n  b: {}\n  c: {}\n", (2, 4), "indented by 3 spaces, its neighbours by 2", "alike"),
+        ("r:\n a: {}\n  b: {}\n", (3, 3), "indented by 2 spaces, its neighbours by 1", "alike"),
+        ("r:\n  a: {}\n b: {}\n  c: {}\n", (3, 2), "indented by 1 space, its neighbours by 2 or 0", "alike"),
+    ],
+)  # fmt: skip
+def test_a_syntax_error_names_the_mistake_and_the_remedy(
+    tmp_path: Path, text: str, place: tuple[int, int], message: str, hint: str, request: pytest.FixtureRequest
+) -> None:
+    _, findings = composed(tmp_path, text)
+    if "pure Python" not in request.node.name:  # its sentences and places are its own
+        [finding] = findings
+        assert (finding.span.line, finding.span.column) == place
+        assert message in finding.message
+        assert hint in finding.hint
+
+
 @pytest.mark.parametrize("text", ["[" * 100_000, "a: " + "{b: " * 100_000, "- " * 100_000, "[" * 50 + "]" * 50])
 def test_deep_nesting_is_one_finding(tmp_path: Path, text: str) -> None:
     root, [finding] = composed(tmp_path, text)
