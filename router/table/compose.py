@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import yaml
@@ -160,7 +160,8 @@ class _Composer:
         broken = collection.broken
         pairs = list(zip(collection.children[::2], collection.children[1::2], strict=True))
         rests = set(cut_off((key.text, value) for key, value in pairs if isinstance(key, ScalarNode)))
-        for key, value in pairs:
+        for written, value in pairs:
+            key = written if isinstance(written, ScalarNode) and written.text in rests else self._without_slip(written)
             if not isinstance(key, ScalarNode):
                 broken = self._report(key.span, "a key must be a word, not a mapping or a sequence", "")
             elif key.text == "<<" and key.value == "<<":
@@ -174,6 +175,15 @@ class _Composer:
             else:
                 entries[key.text] = Entry(key, value)
         return MappingNode(collection.span, entries, broken)
+
+    def _without_slip(self, key: Node) -> Node:
+        """The key that is meant, with a finding if it is another one."""
+        if isinstance(key, ScalarNode) and key.place.is_whole_line:
+            for pattern, what, hint in _KEY_SLIPS:
+                if match := pattern.fullmatch(key.text):
+                    self._report(key.place.part(*match.span("slip")), what, hint)
+                    return replace(key, text=match["key"], value=match["key"])
+        return key
 
     def _has_tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent, span: SourceSpan) -> bool:
         if event.tag is None:
@@ -200,6 +210,16 @@ def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
         raise TypeError("the parser sets marks on every event")
     return start.line, start.column, end.line, end.column
 
+
+_KEY_SLIPS = (
+    (re.compile(r"(?P<key>.*?[^\s:])\s*(?P<slip>:+)"), "this ':' is one too many", "remove it"),
+    (
+        re.compile(r"(?P<slip>-)(?P<key>[A-Za-z_][\w.]*)"),
+        "a space is missing after '-'",
+        "begin items of a list with '- '; a key has no '-'",
+    ),
+)
+"""What a plain key ends or begins with by mistake: a pattern, what is wrong, and what to do."""
 
 # Plain scalars
 

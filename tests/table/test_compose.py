@@ -188,6 +188,28 @@ def test_a_syntax_error_names_the_mistake_and_the_remedy(
         assert hint in finding.hint
 
 
+@pytest.mark.parametrize(
+    ("text", "column", "message", "key"),
+    [
+        ("a:: 1\n", 2, "this ':' is one too many", "a"),
+        ("{a:: 1}\n", 3, "this ':' is one too many", "a"),
+        ("-a: 1\n", 1, "a space is missing after '-'", "a"),
+    ],
+)
+def test_a_misspelt_key_is_one_finding_and_the_key_that_is_meant(
+    tmp_path: Path, text: str, column: int, message: str, key: str
+) -> None:
+    root, [finding] = composed(tmp_path, text)
+    assert (finding.code, finding.span.column, finding.message) == (Code.BAD_YAML, column, message)
+    assert isinstance(root, MappingNode)
+    assert [*root.entries] == [key]
+
+
+@pytest.mark.parametrize("key", ["'a:'", "'-a'", "-1", "a:b", "a-b"])
+def test_quoted_keys_and_numbers_are_not_misspelt(tmp_path: Path, key: str) -> None:
+    assert composed(tmp_path, f"{{{key}: 1}}\n")[1] == []
+
+
 @pytest.mark.parametrize("text", ["[" * 100_000, "a: " + "{b: " * 100_000, "- " * 100_000, "[" * 50 + "]" * 50])
 def test_deep_nesting_is_one_finding(tmp_path: Path, text: str) -> None:
     root, [finding] = composed(tmp_path, text)
