@@ -101,7 +101,7 @@ class _Composer:
         if event.anchor not in self._anchors:
             recursive = any(collection.event.anchor == event.anchor for collection in self._open)
             what = f"the alias '*{event.anchor}' " + ("stands inside what it repeats" if recursive else "has no anchor")
-            raise self._fatal(self._span(event), what, "")
+            raise self._fatal(self._span(event), what, "" if recursive else "quote text that begins with '*'")
         node, size = self._anchors[event.anchor]
         self._add(node, size, None)
 
@@ -136,7 +136,7 @@ class _Composer:
         if found := surprise(text):
             # A variable by its name: its value may be secret.
             what = f"'{event.value}' is {found.meaning} to some YAML readers and something else to others"
-            hint = (f"{found.remedy}, or " if found.remedy else "") + f'quote it: "{event.value}"'
+            hint = (f"{found.remedy}, or, for text, " if found.remedy else "") + f'quote it: "{event.value}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
         return ScalarNode(span, text, resolve(text), place, broken)
@@ -163,7 +163,11 @@ class _Composer:
         for written, value in pairs:
             key = written if isinstance(written, ScalarNode) and written.text in rests else self._without_slip(written)
             if not isinstance(key, ScalarNode):
-                broken = self._report(key.span, "a key must be a word, not a mapping or a sequence", "")
+                broken = self._report(
+                    key.span,
+                    "a key must be a word, not a mapping or a sequence",
+                    "quote text that begins with '{' or '['",
+                )
             elif key.text == "<<" and key.value == "<<":
                 broken = self._report(key.span, "merge keys ('<<') have no place in a table", "write the keys out")
             elif key.text in entries and key.text in rests:
@@ -189,7 +193,10 @@ class _Composer:
         if event.tag is None:
             return False
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
-        return self._report(span, f"the tag '{name}' has no place in a table", "remove it; quotes make a value text")
+        hint = "remove it; quotes make a value text"
+        if re.fullmatch(r"![a-z]\w*", name):
+            hint = f"write `not {name[1:]}` in an expression; elsewhere, remove it"
+        return self._report(span, f"the tag '{name}' has no place in a table", hint)
 
     def _report(self, span: SourceSpan, what: str, hint: str) -> bool:
         """Add a finding; True, because what has one is broken."""
