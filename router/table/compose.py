@@ -68,12 +68,14 @@ class _Composer:
         return self._root
 
     def _events(self) -> Iterator[yaml.Event]:
-        event: yaml.Event | None = None
+        last: yaml.Event | None = None  # that is written: an unclosed quote is taken for a key without a value
         try:
             for event in yaml.parse(self._source.text, Loader=LOADER):
+                if not isinstance(event, yaml.ScalarEvent) or event.value or event.style:
+                    last = event
                 yield event
         except yaml.MarkedYAMLError as error:
-            raise TableError([explain(error, self._source, self._open_quote(event), self._open_bracket())]) from error
+            raise TableError([explain(error, self._source, self._open_quote(last), self._open_bracket())]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
 

@@ -149,6 +149,7 @@ def test_one_mistake_is_one_finding_in_its_line(
         ("a: ['b' 'c']\n", (1, 9), "a ',' or ']' is missing before this", ""),
         ("a: [b, c}\n", (1, 9), "a ',' or ']' is missing before this", "write ']'"),
         ("a: {b: c\n d: e}\n", (1, 4), "this '{' is not closed", "no further than line 2"),
+        ("a: {b: c, 'd: e}\nf: {g: 'h'}\n", (1, 11), "this quote is not closed in its line", ""),
         ("a: {b: {}, , c: d}\n", (1, 12), "a value is missing before this ','", "remove the ','"),
         ("a: [\n  - b]\n", (2, 3), "an item in brackets does not begin with '-'", "remove the '-'"),
         ("r:\n a: 1\n  b: {}\n  c: {}\n", (2, 2), "indented by 1 space, its neighbours by 2", "alike"),
