@@ -72,8 +72,9 @@ _NO_BEGINNING = (
     "mapping keys are not allowed in this context",
     "did not find expected comment or line break",
     "did not find expected alphabetic or numeric character",
+    "did not find expected whitespace or line break",
 )
-"""Problems with the sign that a value begins with. The last two are found behind it."""
+"""Problems with the sign that a value begins with. The last three are found behind it."""
 _UNBEGUN = {
     ",": _Advice("a value is missing before this ','", "remove the ','"),
     "-": _Advice("an item in brackets does not begin with '-'", "remove the '-', or the brackets"),
@@ -106,7 +107,7 @@ _FOREIGN = re.compile(
 )
 """Blanks, quotes and dashes of word processors where a value or key begins; wide signs after plain characters."""
 _ASCII = str.maketrans("\u2013\u2014\u2018\u2019\u201c\u201d", "--''\"\"")
-_HIDDEN = re.compile(r"""(?<!\w)("(?:\\.|[^"\\])*"|'(?:''|[^'])*')|(?:^|(?<=\s))#.*""")
+_HIDDEN = re.compile(r"""(?<!\w)("(?:\\.|[^"\\])*"|'(?:''|[^'])*')|(?:^|(?<=[ \t]))#.*""")
 _SEPARATOR = re.compile(r":(?=[ \t]|$)")
 _WITHOUT_SPACE = re.compile(r"[ -]*[A-Za-z_]\w*:(?=\S)")
 _WITHOUT_COLON = re.compile(r"(?!(?:if|else|and|or|not|in)\b)([\w./]+)(?: *[=:]>? *(.+)| +(\S+))?")
@@ -172,12 +173,13 @@ def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int)
         return _TAB
     if problem in _NOT_CLOSED and character in ("[", "{") and before[-1:].strip():
         return _Advice(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
-    if problem in _NOT_CLOSED and start and start.line != line:
+    if problem in _NOT_CLOSED and start and start.line != line and (character in ":]}" or not before.strip()):
         return _ADVICE[problem]._replace(hint=f"YAML gets no further than line {line + 1}")
     if character == ":" and (advice := _colon(problem, before, written[column + 1 :])):
         return advice
-    if problem in _NO_BEGINNING and character:
-        return _no_beginning(written, start.column if start and start.line == line else column)
+    begun = start.column if start and start.line == line else column
+    if problem in _NO_BEGINNING and begun < len(written):
+        return _no_beginning(written, begun)
     if problem == _NO_KEY and character == "-" and not before.strip():
         return _Advice(_ITEM_AMONG_KEYS, "remove the '-', or indent the item below its key")
     if problem == _NO_DASH and start and _is_only_item(source, start.line, line):
@@ -317,7 +319,7 @@ def _text(source: Source, line: int) -> str:
     """The line without its comment, and with quotes in place of quoted text; empty where there is nothing else."""
     text = source.lines[line] if line < len(source.lines) else ""
     text = _HIDDEN.sub(lambda match: '"' * len(match[1] or ""), text).rstrip(" \t")
-    return text if text.strip() else ""
+    return text if text.strip(" ") else ""
 
 
 def _keys_at(source: Source, line: int) -> int:
