@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import yaml
@@ -68,12 +68,14 @@ class _Composer:
         return self._root
 
     def _events(self) -> Iterator[yaml.Event]:
-        event: yaml.Event | None = None
+        last: yaml.Event | None = None  # that is written: an unclosed quote is taken for a key without a value
         try:
             for event in yaml.parse(self._source.text, Loader=LOADER):
+                if not isinstance(event, yaml.ScalarEvent) or event.value or event.style:
+                    last = event
                 yield event
         except yaml.MarkedYAMLError as error:
-            raise TableError([explain(error, self._source, self._open_quote(event), self._open_bracket())]) from error
+            raise TableError([explain(error, self._source, self._open_quote(last), self._open_bracket())]) from error
         except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: escapes, pure Python parser
             raise self._fatal(SourceSpan(self._source.file), f"this is not YAML: {error}", "") from error
 
@@ -101,7 +103,7 @@ class _Composer:
         if event.anchor not in self._anchors:
             recursive = any(collection.event.anchor == event.anchor for collection in self._open)
             what = f"the alias '*{event.anchor}' " + ("stands inside what it repeats" if recursive else "has no anchor")
-            raise self._fatal(self._span(event), what, "")
+            raise self._fatal(self._span(event), what, "" if recursive else "quote text that begins with '*'")
         node, size = self._anchors[event.anchor]
         self._add(node, size, None)
 
@@ -136,7 +138,7 @@ class _Composer:
         if found := surprise(text):
             # A variable by its name: its value may be secret.
             what = f"'{event.value}' is {found.meaning} to some YAML readers and something else to others"
-            hint = (f"{found.remedy}, or " if found.remedy else "") + f'quote it: "{event.value}"'
+            hint = (f"{found.remedy}, or, for text, " if found.remedy else "") + f'quote it: "{event.value}"'
             self._findings.append(Diagnostic(span, Code.AMBIGUOUS_SCALAR, what, hint))
             broken = True
         return ScalarNode(span, text, resolve(text), place, broken)
@@ -160,9 +162,14 @@ class _Composer:
         broken = collection.broken
         pairs = list(zip(collection.children[::2], collection.children[1::2], strict=True))
         rests = set(cut_off((key.text, value) for key, value in pairs if isinstance(key, ScalarNode)))
-        for key, value in pairs:
+        for written, value in pairs:
+            key = written if isinstance(written, ScalarNode) and written.text in rests else self._without_slip(written)
             if not isinstance(key, ScalarNode):
-                broken = self._report(key.span, "a key must be a word, not a mapping or a sequence", "")
+                broken = self._report(
+                    key.span,
+                    "a key must be a word, not a mapping or a sequence",
+                    "quote text that begins with '{' or '['",
+                )
             elif key.text == "<<" and key.value == "<<":
                 broken = self._report(key.span, "merge keys ('<<') have no place in a table", "write the keys out")
             elif key.text in entries and key.text in rests:
@@ -175,11 +182,23 @@ class _Composer:
                 entries[key.text] = Entry(key, value)
         return MappingNode(collection.span, entries, broken)
 
+    def _without_slip(self, key: Node) -> Node:
+        """The key that is meant, with a finding if it is another one."""
+        if isinstance(key, ScalarNode) and key.place.is_whole_line:
+            for pattern, what, hint in _KEY_SLIPS:
+                if match := pattern.fullmatch(key.text):
+                    self._report(key.place.part(*match.span("slip")), what, hint)
+                    return replace(key, text=match["key"], value=match["key"])
+        return key
+
     def _has_tag(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent, span: SourceSpan) -> bool:
         if event.tag is None:
             return False
         name = event.tag.replace("tag:yaml.org,2002:", "!!")
-        return self._report(span, f"the tag '{name}' has no place in a table", "remove it; quotes make a value text")
+        hint = "remove it; quotes make a value text"
+        if re.fullmatch(r"![a-z]\w*", name):
+            hint = f"write `not {name[1:]}` in an expression; elsewhere, remove it"
+        return self._report(span, f"the tag '{name}' has no place in a table", hint)
 
     def _report(self, span: SourceSpan, what: str, hint: str) -> bool:
         """Add a finding; True, because what has one is broken."""
@@ -200,6 +219,16 @@ def _marks(event: yaml.Event) -> tuple[int, int, int, int]:
         raise TypeError("the parser sets marks on every event")
     return start.line, start.column, end.line, end.column
 
+
+_KEY_SLIPS = (
+    (re.compile(r"(?P<key>.*?[^\s:])\s*(?P<slip>:+)"), "this ':' is one too many", "remove it"),
+    (
+        re.compile(r"(?P<slip>-)(?P<key>[A-Za-z_][\w.]*)"),
+        "a space is missing after '-'",
+        "begin items of a list with '- '; a key has no '-'",
+    ),
+)
+"""What a plain key ends or begins with by mistake: a pattern, what is wrong, and what to do."""
 
 # Plain scalars
 

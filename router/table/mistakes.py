@@ -7,6 +7,7 @@ the rest of an expression, as in `x # 1000` (`cut_findings`).
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -28,40 +29,89 @@ class _Advice(NamedTuple):
 
 _TAB = _Advice("a tab indents this line", "indent with spaces")
 _OPEN_QUOTE = _Advice("this quote is not closed in its line", at_start=True)
-_NO_COLON = _Advice("this line has a key without ':'", at_start=True)
 _NO_KEY_ENDS = "could not find expected ':'"
+_NO_KEY = "did not find expected key"
+_NO_DASH = "did not find expected '-' indicator"
+_NO_DOCUMENT = "did not find expected <document start>"
+_NOT_CLOSED = {
+    "did not find expected ',' or ']'": ("[", "]"),
+    "did not find expected ',' or '}'": ("{", "}"),
+}
+_BETWEEN_KEYS = (_NO_KEY, _NO_DASH, _NO_DOCUMENT)
+_ITEM_AMONG_KEYS = "an item of a list stands among keys"
 _QUOTE_COLONS = "quote text that has ': ' in it"
 _ADVICE = {
-    "did not find expected ',' or ']'": _Advice(
-        "this '[' is not closed by a ']', or a ',' is missing inside", at_start=True
-    ),
-    "did not find expected ',' or '}'": _Advice(
-        "this '{' is not closed by a '}', or a ',' is missing inside", at_start=True
-    ),
+    **{
+        problem: _Advice(f"this '{opening}' is not closed by a '{closing}', or a ',' is missing inside", at_start=True)
+        for problem, (opening, closing) in _NOT_CLOSED.items()
+    },
     "found unexpected end of stream": _OPEN_QUOTE,
     "found unexpected document indicator": _OPEN_QUOTE,
     "found unknown escape character": _Advice(
         "this backslash sequence does not exist", "single quotes take backslashes as they are"
     ),
-    "mapping values are not allowed in this context": _Advice("a ':' cannot stand here", _QUOTE_COLONS),
-    _NO_KEY_ENDS: _NO_COLON,
-    "did not find expected key": _Advice("no key begins here", "quote text that has special characters in it"),
-    "did not find expected '-' indicator": _Advice(
-        "this line does not begin with '-' as its neighbours do", "indent what belongs to the item above"
+    "mapping values are not allowed in this context": _Advice(
+        "a ':' cannot stand here", f"{_QUOTE_COLONS}; keys of a mapping begin on lines of their own"
+    ),
+    "found unexpected ':'": _Advice("a ':' cannot stand here", "remove it, or quote text that has it"),
+    _NO_KEY: _Advice("no key begins here", "quote text that has special characters in it"),
+    _NO_DASH: _Advice(
+        "this line does not begin with '-' as its neighbours do",
+        "begin an item with '- ', or indent what belongs to the item above",
     ),
     "block sequence entries are not allowed in this context": _Advice(
         "a '-' cannot begin an item here", "items of a sequence begin on lines of their own"
     ),
     "did not find expected node content": _Advice("a value is missing here"),
-    "did not find expected <document start>": _Advice(
-        "this line is indented less than the first key", "indent keys of one mapping alike"
-    ),
+    _NO_DOCUMENT: _Advice("this line is indented less than the first key", "indent keys of one mapping alike"),
     "found incompatible YAML document": _Advice("this is a YAML version that is not understood", "remove the line"),
 }
-_NOT_CLOSED = ("did not find expected ',' or ']'", "did not find expected ',' or '}'")
-_COMMENT = re.compile(r"(?:^|\s)#.*")
-_SEPARATOR = re.compile(r":(?=\s|$)")
+_NO_BEGINNING = (
+    "found character that cannot start any token",
+    "did not find expected node content",
+    "mapping keys are not allowed in this context",
+    "did not find expected comment or line break",
+    "did not find expected alphabetic or numeric character",
+    "did not find expected whitespace or line break",
+)
+"""Problems with the sign that a value begins with. The last three are found behind it."""
+_UNBEGUN = {
+    ",": _Advice("a value is missing before this ','", "remove the ','"),
+    "-": _Advice("an item in brackets does not begin with '-'", "remove the '-', or the brackets"),
+}
+_COMMENT_SIGN = _Advice("a comment begins with '#'", "write '#' in its place")
+_SLIPS = (
+    (
+        re.compile(r"(<{7}|={7}|>{7}|\|{7})(?: |$)"),
+        _Advice("a merge conflict is not resolved", "keep one version, and remove '<<<<<<<', '=======' and '>>>>>>>'"),
+    ),
+    (re.compile(r" *(//|/\*|--(?!\S))"), _COMMENT_SIGN),
+    (re.compile(r" *(-)[A-Za-z_]"), _Advice("a space is missing after '-'", "begin items of a list with '- '")),
+)
+"""What begins a line only by mistake. YAML often fails no earlier than in the next line."""
+_AFTER_VALUE = (
+    (re.compile(r"//|/\*|--(?!\S)"), _COMMENT_SIGN),
+    (
+        re.compile(r"""(?<=["'])\w"""),
+        _Advice("the quoted text ends before this", "put quotes of the other kind around the text"),
+    ),
+    (
+        re.compile(r"[-+*/%<>=!&|.(?]|(?:if|else|and|or|in|is|not)\b"),
+        _Advice("the value ends before this", "quote the whole expression, as in \"'gps_' + str(index)\""),
+    ),
+)
+"""What stands behind a value that is quoted or in brackets as if it went on."""
+_FOREIGN = re.compile(
+    r"(?:^|[-:,?{}\[\]])\s*?(?P<at_start>[^\S \t]|[\u200b-\u200d\u2060\u2013\u2014\u2018-\u201f])"
+    r"|(?<=[!-~])(?P<inside>[\uff0c\uff1a\uff1b\uff3b\uff3d\uff5b\uff5d])"
+)
+"""Blanks, quotes and dashes of word processors where a value or key begins; wide signs after plain characters."""
+_ASCII = str.maketrans("\u2013\u2014\u2018\u2019\u201c\u201d", "--''\"\"")
+_HIDDEN = re.compile(r"""(?<!\w)("(?:\\.|[^"\\])*"|'(?:''|[^'])*')|(?:^|(?<=[ \t]))#.*""")
+_SEPARATOR = re.compile(r":(?=[ \t]|$)")
 _WITHOUT_SPACE = re.compile(r"[ -]*[A-Za-z_]\w*:(?=\S)")
+_WITHOUT_COLON = re.compile(r"(?!(?:if|else|and|or|not|in)\b)([\w./]+)(?: *[=:]>? *(.+)| +(\S+))?")
+_WITHOUT_COMMA = re.compile(r"[:,{\[] *([^\s,;:]+);? +([\w.]+) *$")
 
 
 def explain(
@@ -77,47 +127,130 @@ def explain(
     column = error.problem_mark.column if error.problem_mark else 0
     if open_quote:
         return Diagnostic(open_quote, Code.BAD_YAML, _OPEN_QUOTE.what)
+    if slip := _slip(source, line):
+        return slip
     if open_bracket and not any(text.strip() for text in source.lines[line:]):
         return Diagnostic(open_bracket.part(0, 1), Code.BAD_YAML, "this bracket is never closed")
     written = source.lines[line] if line < len(source.lines) else ""
+    start = error.context_mark
     if not open_bracket and written[column : column + 1] != "\t":
-        begun = error.context_mark.line if error.problem == _NO_KEY_ENDS and error.context_mark else None
+        begun = start.line if error.problem == _NO_KEY_ENDS and start else None
         if (bare := _bare_line(source, line) if begun is None else begun) is not None:
             return _without_colon(source, bare)
         if (neighbours := _neighbours(source, line)) and not _SEPARATOR.search(written[:column]):
             return _misplaced(source, line, neighbours)
-    advice = _advice(error, written, column)
-    if advice.at_start and error.context_mark:
-        line, column = error.context_mark.line, error.context_mark.column
+    advice = _advice(error, source, line, column)
+    if advice.at_start and start:
+        line, column = start.line, start.column
+    return _finding(source, line, column, advice)
+
+
+def _finding(source: Source, line: int, column: int, advice: _Advice) -> Diagnostic:
     return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, advice.what, advice.hint)
 
 
-def _advice(error: yaml.MarkedYAMLError, line: str, column: int) -> _Advice:
-    before, character = line[:column], line[column : column + 1]
+def _slip(source: Source, line: int) -> Diagnostic | None:
+    """The finding for what has no place in the line, or in the one before it, and makes YAML fail."""
+    for number in (*_line_before(source, line), line):
+        text = _text(source, number)
+        for pattern, advice in _SLIPS:
+            if match := pattern.match(text):
+                return _finding(source, number, match.start(1), advice)
+        if match := _FOREIGN.search(text):
+            character = match[match.lastgroup or 0]
+            plain = unicodedata.normalize("NFKC", character.translate(_ASCII))
+            what = f"the character U+{ord(character):04X} ({unicodedata.name(character, '').lower()}) cannot stand here"
+            hint = f"write '{plain}' in its place" if plain.isascii() else "remove it"
+            return _finding(source, number, match.start(match.lastgroup or 0), _Advice(what, hint))
+    return None
+
+
+def _advice(error: yaml.MarkedYAMLError, source: Source, line: int, column: int) -> _Advice:
+    written = source.lines[line] if line < len(source.lines) else ""
+    before, character = written[:column], written[column : column + 1]
+    problem, start = error.problem or str(error), error.context_mark
     if character == "\t":
         return _TAB
-    problem = error.problem or str(error)
     if problem in _NOT_CLOSED and character in ("[", "{") and before[-1:].strip():
         return _Advice(f"a '{character}' cannot stand in a word here", "put quotes around text with brackets in it")
-    if problem == "did not find expected key" and character == "-":
-        return _Advice("an item of a list stands among keys", "remove the '-', or indent the item below its key")
-    if problem in ("found character that cannot start any token", "did not find expected node content") and character:
-        return _Advice(f"a value cannot begin with '{character}'", "put quotes around it")
-    if " ? " in before:
-        return _Advice("a ':' cannot stand here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
+    if problem in _NOT_CLOSED and start and start.line != line and (character in ":]}" or not before.strip()):
+        return _ADVICE[problem]._replace(hint=f"YAML gets no further than line {line + 1}")
+    if character == ":" and (advice := _colon(problem, before, written[column + 1 :])):
+        return advice
+    begun = start.column if start and start.line == line else column
+    if problem in _NO_BEGINNING and begun < len(written):
+        return _no_beginning(written, begun)
+    if problem == _NO_KEY and character == "-" and not before.strip():
+        return _Advice(_ITEM_AMONG_KEYS, "remove the '-', or indent the item below its key")
+    if problem == _NO_DASH and start and _is_only_item(source, start.line, line):
+        return _Advice(
+            _ITEM_AMONG_KEYS, "remove the '-', or indent the keys below that belong to the item", at_start=True
+        )
+    if problem in _NOT_CLOSED or (problem in _BETWEEN_KEYS and before.strip()):
+        return _behind_value(written, column, _NOT_CLOSED.get(problem, ("", ""))[1])
     passed_on = _Advice(f"this is not YAML: {problem}" + (f" {error.context}" if error.context else ""))
     return _ADVICE.get(problem, passed_on)
 
 
+def _colon(problem: str, before: str, after: str) -> _Advice | None:
+    if " ? " in before:
+        return _Advice("a ':' cannot stand here", f"write `b if a else c` for `a ? b : c`; {_QUOTE_COLONS}")
+    if problem in _NOT_CLOSED and (words := _WITHOUT_COMMA.search(before)):
+        return _Advice(f"a ',' is missing before '{words[2]}'", f"write `{words[1]}, {words[2]}:`")
+    if problem in _NOT_CLOSED:
+        return _Advice("a ':' cannot stand here", f"{_QUOTE_COLONS}, or put braces around the inner mapping")
+    if after[:1] in ("[", "{"):
+        return _Advice("a space is missing after ':'", f"write `: {after[:1]}`")
+    if before.rstrip().endswith(":") or (_SEPARATOR.search(before) and not _HIDDEN.sub("", after).strip()):
+        return _Advice("this ':' is one too many", "remove it")
+    return None
+
+
+def _no_beginning(written: str, column: int) -> _Advice:
+    """For the first character of a value, and for one behind a value that could begin another one."""
+    character = written[column]
+    if written[:column].rstrip()[-1:] in {*"\"'])}"}:
+        return _behind_value(written, column, "")._replace(at_start=True)
+    return _UNBEGUN.get(character) or _Advice(
+        f"a value cannot begin with '{character}'", "put quotes around the value", at_start=True
+    )
+
+
+def _behind_value(written: str, column: int, closing: str) -> _Advice:
+    """For what follows a value, where only the end of the line, or ',' or `closing`, can."""
+    character = written[column : column + 1]
+    for pattern, advice in _AFTER_VALUE:
+        if pattern.match(written, column):
+            return advice
+    if closing:
+        hint = f"write '{closing}' in its place, or remove it" if character in ("]", "}") else ""
+        return _Advice(f"a ',' or '{closing}' is missing before this", hint)
+    if character and character in ")]},;":
+        return _Advice(f"this '{character}' is one too many", "remove it")
+    if not _SEPARATOR.search(written[:column]):
+        return _Advice("a ':' is missing before this")
+    return _Advice("the value ends before this", "put quotes around the whole value")
+
+
+def _is_only_item(source: Source, first: int, line: int) -> bool:
+    """Whether the list that begins in line `first` has one item, a mapping, and `line` is a key beside it."""
+    dash = f"{' ' * _indent(source.lines[line])}-"
+    items = [text for text in source.lines[first:line] if text.startswith(dash)]
+    return len(items) == 1 and bool(_SEPARATOR.search(_text(source, first)))
+
+
+def _line_before(source: Source, line: int) -> list[int]:
+    """The last line before it that has more than a comment; empty if there is none."""
+    return next(([number] for number in reversed(range(line)) if _text(source, number)), [])
+
+
 def _bare_line(source: Source, line: int) -> int | None:
     """The line, or the one before it, that lacks the ': ' which makes it a key."""
-    before = [number for number in range(line) if _text(source, number)][-1:]
-    for number in (line, *before):
+    for number in (line, *_line_before(source, line)):
         text = _text(source, number)
-        if not text or _SEPARATOR.search(text):
-            continue
         is_above = number < line and _keys_at(source, number) == _keys_at(source, line)
-        if _WITHOUT_SPACE.match(text) or is_above or (number < line and text.strip().isidentifier()):
+        is_bare = text and not _SEPARATOR.search(text)
+        if _WITHOUT_SPACE.match(text) or (is_bare and (is_above or (number < line and text.strip().isidentifier()))):
             return number
     return None
 
@@ -128,7 +261,12 @@ def _without_colon(source: Source, line: int) -> Diagnostic:
         span = source.span(line, match.end() - 1, line, match.end())
         return Diagnostic(span, Code.BAD_YAML, "a space is missing after ':'", f"write `{_spaced(text.strip())}`")
     column = _keys_at(source, line)
-    return Diagnostic(source.span(line, column, line, column + 1), Code.BAD_YAML, _NO_COLON.what)
+    words = _WITHOUT_COLON.fullmatch(_text(source, line)[column:])
+    hint = "indent text that goes on from the line above; begin a comment with '#'"
+    if words:
+        value = words[2] or words[3] or ("true" if words[1] == "auto" else "")
+        hint = f"write `{words[1]}: {value}`" if value else f"write `{words[1]}:`"
+    return _finding(source, line, column, _Advice("this line has a key without ':'", hint))
 
 
 def _spaced(text: str) -> str:
@@ -152,16 +290,36 @@ def _neighbours(source: Source, line: int) -> list[int]:
 
 def _misplaced(source: Source, line: int, neighbours: list[int]) -> Diagnostic:
     own = _indent(source.lines[line])
+    if (odd := _odd_line_above(source, line)) is not None:
+        line, own, neighbours = odd, _indent(source.lines[odd]), [own]
     spaces = f"{own} space{'s' * (own != 1)}"
     what = f"this line is indented by {spaces}, its neighbours by {' or '.join(map(str, neighbours))}"
     hint = "indent the keys of one mapping alike, and the items of one list"
     return Diagnostic(source.span(line, own, line, own + 1), Code.BAD_YAML, what, hint)
 
 
+def _odd_line_above(source: Source, line: int) -> int | None:
+    """The one line that is indented by a space more or less than this line and the next one; None without."""
+    own = _indent(source.lines[line])
+    written = [(number, _indent(text)) for number, text in enumerate(source.lines) if _text(source, number)]
+    if own != next((indent for number, indent in written if number > line and indent <= own), None):
+        return None
+    for near in (own + 1, own - 1):
+        odd = list[int]()
+        for number, indent in reversed(written):
+            if number < line and indent < min(own, near):
+                break
+            odd += [number] if number < line and indent == near else []
+        if len(odd) == 1:
+            return odd[0]
+    return None
+
+
 def _text(source: Source, line: int) -> str:
-    """The line without its comment; empty where there is nothing else."""
-    text = _COMMENT.sub("", source.lines[line]).rstrip() if line < len(source.lines) else ""
-    return text if text.strip() else ""
+    """The line without its comment, and with quotes in place of quoted text; empty where there is nothing else."""
+    text = source.lines[line] if line < len(source.lines) else ""
+    text = _HIDDEN.sub(lambda match: '"' * len(match[1] or ""), text).rstrip(" \t")
+    return text if text.strip(" ") else ""
 
 
 def _keys_at(source: Source, line: int) -> int:

@@ -129,6 +129,96 @@ def test_one_mistake_is_one_finding_in_its_line(
         assert (finding.span.line, finding.span.column) == place
 
 
+@pytest.mark.parametrize(
+    ("text", "place", "message", "hint"),
+    [
+        ("r:\n  - a: 1\n  b: 2\n", (2, 3), "an item of a list stands among keys", "remove the '-'"),
+        ("r:\n  - a: 1\n  - b: 2\n  c: 3\n", (4, 3), "does not begin with '-'", "indent what belongs"),
+        ("a:\u00a0b\nc: d\n", (1, 3), "U+00A0 (no-break space)", "write ' '"),
+        ("r:\n\u00a0\u00a0a: b\n  c: d\n", (2, 1), "U+00A0 (no-break space)", "write ' '"),
+        ("a\uff1a{b: c, d: e}\n", (1, 2), "U+FF1A (fullwidth colon)", "write ':'"),
+        ("a: {b: c\uff0cd: e}\n", (1, 9), "U+FF0C (fullwidth comma)", "write ','"),
+        ("a: \u201cb: c\u201d\n", (1, 4), "U+201C (left double quotation mark)", "write '\"'"),
+        ("a:\n  \u2013 b\n  - c: d\n", (2, 3), "U+2013 (en dash)", "write '-'"),
+        ("a:\u200bb\nc: d\n", (1, 3), "U+200B (zero width space)", "remove it"),
+        ('"a": "\u00a0"  # \u00a0\nb c\nd: e\n', (2, 1), "a key without ':'", "write `b: c`"),
+        ("a: {b: c d: e}\n", (1, 11), "a ',' is missing before 'd'", "write `c, d:`"),
+        ("a: {b: c; d: e}\n", (1, 12), "a ',' is missing before 'd'", "write `c, d:`"),
+        ("a: {b: c: d}\n", (1, 9), "a ':' cannot stand here", "put braces around"),
+        ("a: {b: 'x_' + c}\n", (1, 13), "the value ends before this", "quote the whole expression"),
+        ("a: ['b' 'c']\n", (1, 9), "a ',' or ']' is missing before this", ""),
+        ("a: [b, c}\n", (1, 9), "a ',' or ']' is missing before this", "write ']'"),
+        ("a: {b: c\n d: e}\n", (1, 4), "this '{' is not closed", "no further than line 2"),
+        ("a: {b: c,\n d: 'e' + f}\n", (2, 9), "the value ends before this", "quote the whole expression"),
+        ("a: {b: c,\n d: e]\n", (1, 4), "this '{' is not closed", "no further than line 2"),
+        ("a: {b: c, 'd: e}\nf: {g: 'h'}\n", (1, 11), "this quote is not closed in its line", ""),
+        ("a: {b: {}, , c: d}\n", (1, 12), "a value is missing before this ','", "remove the ','"),
+        ("a: [\n  - b]\n", (2, 3), "an item in brackets does not begin with '-'", "remove the '-'"),
+        ("r:\n a: 1\n  b: {}\n  c: {}\n", (2, 2), "indented by 1 space, its neighbours by 2", "alike"),
+        ("r:\n   a: {}\n  b: {}\n  c: {}\n", (2, 4), "indented by 3 spaces, its neighbours by 2", "alike"),
+        ("r:\n a: {}\n  b: {}\n", (3, 3), "indented by 2 spaces, its neighbours by 1", "alike"),
+        ("r:\n  a: {}\n b: {}\n  c: {}\n", (3, 2), "indented by 1 space, its neighbours by 2 or 0", "alike"),
+        ("a: b:\n", (1, 5), "this ':' is one too many", "remove it"),
+        ("a : : b\n", (1, 5), "this ':' is one too many", "remove it"),
+        ("a: {b: c:}\n", (1, 9), "a ':' cannot stand here", "remove it"),
+        ("a: {b: c}}\nd: e\n", (1, 10), "this '}' is one too many", "remove it"),
+        ("a: {b: c},\nd: e\n", (1, 10), "this ',' is one too many", "remove it"),
+        ("a: {b: c} // d\ne: f\n", (1, 11), "a comment begins with '#'", "write '#'"),
+        ("a: b\n// c\nd: e\n", (2, 1), "a comment begins with '#'", "write '#'"),
+        ("a:\n  b: 'c' + 1\n", (2, 10), "the value ends before this", "quote the whole expression"),
+        ("a:\n  b: [c] * 2\n", (2, 10), "the value ends before this", "quote the whole expression"),
+        ("a:\n  b: 'it's'\n", (2, 10), "the quoted text ends before this", "quotes of the other kind"),
+        ("a: [*b*, c]\n", (1, 5), "a value cannot begin with '*'", "put quotes around"),
+        ("a: !#b\n", (1, 4), "a value cannot begin with '!'", "put quotes around"),
+        ("a: > 5\n", (1, 4), "a value cannot begin with '>'", "put quotes around"),
+        ("a = b\nc: d\n", (1, 1), "a key without ':'", "write `a: b`"),
+        ("a:\n  auto\n  b: c\n", (2, 3), "a key without ':'", "write `auto: true`"),
+        ("a\nb: c\n", (1, 1), "a key without ':'", "write `a:`"),
+        ("it is old\nb: c\n", (1, 1), "a key without ':'", "begin a comment with '#'"),
+        ("<<<<<<< HEAD\na: b\n", (1, 1), "a merge conflict is not resolved", "keep one version"),
+        ("a:\n  -b\n  - c: d\n", (2, 3), "a space is missing after '-'", "'- '"),
+        ("a:{b: c, d: e}\n", (1, 2), "a space is missing after ':'", "write `a: {b: c, d: e}`"),
+        ("a: {b:[c]}\n", (1, 6), "a space is missing after ':'", "write `: [`"),
+    ],
+)  # fmt: skip
+def test_a_syntax_error_names_the_mistake_and_the_remedy(
+    tmp_path: Path, text: str, place: tuple[int, int], message: str, hint: str, request: pytest.FixtureRequest
+) -> None:
+    _, findings = composed(tmp_path, text)
+    if "pure Python" not in request.node.name:  # its sentences and places are its own
+        [finding] = findings
+        assert (finding.span.line, finding.span.column) == place
+        assert message in finding.message
+        assert hint in finding.hint
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "message", "key"),
+    [
+        ("a:: 1\n", 2, "this ':' is one too many", "a"),
+        ("{a:: 1}\n", 3, "this ':' is one too many", "a"),
+        ("-a: 1\n", 1, "a space is missing after '-'", "a"),
+    ],
+)
+def test_a_misspelt_key_is_one_finding_and_the_key_that_is_meant(
+    tmp_path: Path, text: str, column: int, message: str, key: str
+) -> None:
+    root, [finding] = composed(tmp_path, text)
+    assert (finding.code, finding.span.column, finding.message) == (Code.BAD_YAML, column, message)
+    assert isinstance(root, MappingNode)
+    assert [*root.entries] == [key]
+
+
+@pytest.mark.parametrize("key", ["'a:'", "'-a'", "-1", "a:b", "a-b"])
+def test_quoted_keys_and_numbers_are_not_misspelt(tmp_path: Path, key: str) -> None:
+    assert composed(tmp_path, f"{{{key}: 1}}\n")[1] == []
+
+
+def test_what_looks_like_a_negation_is_told_how_to_write_one(tmp_path: Path) -> None:
+    _, [finding] = composed(tmp_path, "a: !b\n")
+    assert finding.hint == "write `not b` in an expression; elsewhere, remove it"
+
+
 @pytest.mark.parametrize("text", ["[" * 100_000, "a: " + "{b: " * 100_000, "- " * 100_000, "[" * 50 + "]" * 50])
 def test_deep_nesting_is_one_finding(tmp_path: Path, text: str) -> None:
     root, [finding] = composed(tmp_path, text)
