@@ -111,7 +111,7 @@ _HINTS: dict[type[ast.AST], str] = {
     ast.DictComp: "expressions have no loops",
     ast.NamedExpr: "expressions assign nothing",
     ast.JoinedStr: "join strings with + and str()",
-    ast.Tuple: "write a list, [a, b]; a decimal number has a point, 9.81",
+    ast.Tuple: "remove the ',', or write a list, [a, b]; a decimal number has a point, 9.81",
     ast.Is: "use ==",
     ast.IsNot: "use ==",
 }
