@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NoReturn, TypeAlias
 
-from router.errors import RouterError, TableError, TransportError, UsageError, nearest
+from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -137,6 +137,11 @@ def add_verb(
     )
 
 
+def with_help(what: str, hint: str = "") -> str:
+    """What is wrong, and what to do about it in a line of its own, as in findings of a table."""
+    return f"{what}\nhelp: {hint}" if hint else what
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; the exit code: 0, 78 for a bad table, 2 for wrong usage, 1 for the network."""
     arguments = sys.argv[1:] if argv is None else list(argv)
@@ -187,7 +192,7 @@ def _run(arguments: Sequence[str]) -> int:
     chosen = _verb(arguments)
     module = _add_verbs(subparsers, chosen)
     if chosen is not None and chosen not in VERBS:
-        print(f"router: there is no verb '{chosen}'; {_suggestion(chosen, VERBS)}", file=sys.stderr)
+        print(with_help(f"router: there is no verb '{chosen}'", _suggestion(chosen, VERBS)), file=sys.stderr)
         return BAD_USAGE
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
@@ -198,7 +203,8 @@ def _run(arguments: Sequence[str]) -> int:
     try:
         Path.cwd()
     except FileNotFoundError:
-        print(f"router {chosen}: the working directory was deleted; change to one that exists", file=sys.stderr)
+        what = f"router {chosen}: the working directory was deleted"
+        print(with_help(what, "change to one that exists"), file=sys.stderr)
         return BAD_TABLE
     try:
         code: int = module.run(args)
@@ -208,7 +214,8 @@ def _run(arguments: Sequence[str]) -> int:
         print_findings(error.diagnostics, sys.stderr)
         return BAD_TABLE
     except RouterError as error:
-        print(f"router {chosen}: {error}", file=sys.stderr)
+        what, hint = (error.what, error.hint) if isinstance(error, OperatorError) else (str(error), "")
+        print(with_help(f"router {chosen}: {what}", hint), file=sys.stderr)
         if isinstance(error, UsageError):
             return BAD_USAGE
         return NETWORK_FAULT if isinstance(error, TransportError) else BAD_TABLE
@@ -241,7 +248,7 @@ def _refuse(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn
     option = unknown[0].partition("=")[0]
     close = nearest(option, re.findall(r"--\w[\w-]*", parser.format_help())) if option.startswith("-") else None
     hint = f"did you mean '{close}'?" if close else f"'{parser.prog} --help' lists what it takes"
-    parser.error(f"unrecognized arguments: {' '.join(unknown)}; {hint}")
+    parser.error(with_help(f"unrecognized arguments: {' '.join(unknown)}", hint))
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:

@@ -133,9 +133,9 @@ def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
         check_environment(os.environ)
         from router.ros.topics import TopicListener
     except StartError as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(*error.args) from error
     except ImportError as error:
-        raise UsageError(f"a topic needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
+        raise UsageError(f"a topic needs ROS 2, which is not installed here ({error})", ros_remedy()) from error
     from router.tools.tap import listen_to_topic
 
     with suppress(KeyboardInterrupt):
@@ -144,7 +144,7 @@ def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
         try:
             listener = TopicListener(topic, args.type)
         except StartError as error:
-            raise UsageError(str(error)) from error
+            raise UsageError(*error.args) from error
         with closing(listener):
             say(f"listening to {topic} of {listener.type_name}; Ctrl-C ends it")
             print_batches(listen_to_topic(listener), args)
@@ -159,7 +159,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
         yield lambda _: None
         return
     if path == Path("-"):
-        raise UsageError("--record takes a file; --json prints the same")
+        raise UsageError("--record takes a file", "--json prints the same")
     try:
         file = path.open("ab", buffering=0)
     except OSError as error:

@@ -41,7 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.last and (args.output or args.seconds):
         where = "the directory of the table's 'record', on the router's computer"
-        raise UsageError(f"--last writes to {where}; leave -o and --for")
+        raise UsageError(f"--last writes to {where}", "leave -o and --for")
     return _save_last(args) if args.last else _record(args)
 
 

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import OK, Subparsers, add_verb
+from router.cli import OK, Subparsers, add_verb, with_help
 from router.cli.tool_options import add_table, progress, speed, table_if_any, table_path
 from router.errors import TableError, UsageError
 
@@ -85,11 +85,9 @@ def _advise(resent: Resent) -> int:
     if resent.elsewhere:
         listed = ", ".join(f"{name} ({host})" for name, host in sorted(resent.elsewhere.items())[:5])
         more = f" and {len(resent.elsewhere) - 5} more" if len(resent.elsewhere) > 5 else ""
-        print(
-            f"router replay: this computer lacks the addresses of {listed}{more}: sent from its own, which a table "
-            "takes for strangers; -t TABLE has other addresses for them, or --from PLACE",
-            file=sys.stderr,
-        )
+        what = f"router replay: this computer lacks the addresses of {listed}{more}: sent from its own, which a table "
+        hint = "-t TABLE has other addresses for them, or --from PLACE"
+        print(with_help(f"{what}takes for strangers", hint), file=sys.stderr)
     if resent.refused:
         print("router replay: nobody listened for some of them", file=sys.stderr)
     return 1 if resent.refused else OK

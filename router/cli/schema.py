@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     path = lock_path(settings.protos, settings.lock)
     if is_installed(path):
         what = f"{path} belongs to the installed router, and is lost when that is upgraded"
-        raise UsageError(f"{what}; copy the protos with `router init --rover DIR`, and name yours: --protos protos")
+        raise UsageError(what, "copy the protos with `router init --rover DIR`, and name yours: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
     schema = load_protos(settings.protos, settings.message, settings.lock)
     lock = LockComparison(schema, find_envelope(schema, settings.oneof))
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
 def _settings(args: argparse.Namespace) -> EnvelopeSettings:
     """Where the protos and the lock are. Raises TableError for a broken table."""
     if args.protos and args.table:
-        raise UsageError("--protos and --table both say where the messages are; give one")
+        raise UsageError("--protos and --table both say where the messages are", "give one")
     settings = None if args.protos else _of_table(table_if_any(args))
     if settings is None:
         root = args.protos or asset("protos")
@@ -101,7 +101,7 @@ def _of_table(path: Path | None) -> EnvelopeSettings | None:
     if table is None:
         raise TableError(findings)
     if table.envelope is None:
-        raise UsageError(f"{path} has no 'envelope'; name the folder of the protos: --protos protos")
+        raise UsageError(f"{path} has no 'envelope'", "name the folder of the protos: --protos protos")
     return table.envelope
 
 
@@ -120,7 +120,7 @@ def _refuse_unknown(names: Sequence[str], found: Sequence[Conflict]) -> None:
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known) or "nothing conflicts with the lock"
-            raise UsageError(f"'{name}' has nothing to accept; {hint}; nothing was written")
+            raise UsageError(f"'{name}' has nothing to accept; nothing was written", hint)
 
 
 def _summary(old: Lock | None, new: Lock) -> str:

@@ -7,7 +7,7 @@ import contextlib
 import sys
 from typing import TYPE_CHECKING
 
-from router.cli import Subparsers, add_verb
+from router.cli import Subparsers, add_verb, with_help
 from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, whole
 
 if TYPE_CHECKING:
@@ -74,9 +74,6 @@ def _advise(args: argparse.Namespace, table: RouteTable | None, to: Address, sen
         return 0
     sources = [name.value for route in table.routes if route.case.value == args.case for name in route.sources]
     if named := [name for name in sources if name in table.endpoints]:
-        print(
-            f"router send: the table takes {args.case} from {' or '.join(named)} only; "
-            f"add --from {named[0]} unless this machine has its address",
-            file=sys.stderr,
-        )
+        what = f"router send: the table takes {args.case} from {' or '.join(named)} only"
+        print(with_help(what, f"add --from {named[0]} unless this machine has its address"), file=sys.stderr)
     return 0

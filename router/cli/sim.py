@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
     silences = [parse_silence(text) for text in args.silent]
     if args.speed == math.inf:
-        raise UsageError("--speed max is for recordings; give a factor, as 10x")
+        raise UsageError("--speed max is for recordings", "give a factor, as 10x")
     checked = check_table(table_path(args))
     if checked.program is None:
         raise TableError(checked.diagnostics)

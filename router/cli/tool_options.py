@@ -42,7 +42,7 @@ def table_path(args: argparse.Namespace) -> Path:
         return named
     if not DEFAULT_TABLE.exists():
         how = f"name a table by -t TABLE or {TABLE_VARIABLE}, or write a first one: `router init DIR`"
-        raise UsageError(f"there is no {DEFAULT_TABLE} here; {how}")
+        raise UsageError(f"there is no {DEFAULT_TABLE} here", how)
     return DEFAULT_TABLE
 
 
@@ -51,7 +51,7 @@ def named_table(args: argparse.Namespace) -> Path | None:
     subject: Path | None = getattr(args, "subject", None)
     option: Path | None = args.table
     if subject is not None and option is not None and subject.resolve() != option.resolve():
-        raise UsageError(f"the table is {subject} or, by --table, {option}; name one")
+        raise UsageError(f"the table is {subject} or, by --table, {option}", "name one")
     of_environment = os.environ.get(TABLE_VARIABLE)
     return subject or option or (Path(of_environment) if of_environment else None)
 
@@ -71,7 +71,7 @@ def table_paths(args: argparse.Namespace) -> list[Path]:
     """What a verb with `add_tables` is about. Raises UsageError."""
     paths: list[Path] = args.paths
     if paths and args.table is not None and {path.resolve() for path in paths} != {args.table.resolve()}:
-        raise UsageError(f"the table is {paths[0]} or, by --table, {args.table}; name one")
+        raise UsageError(f"the table is {paths[0]} or, by --table, {args.table}", "name one")
     return paths or [table_path(args)]
 
 
@@ -94,7 +94,7 @@ def load_wire(args: argparse.Namespace) -> tuple[Wire, RouteTable | None]:
     from router.table import read_table
 
     if args.protos is not None and args.table is not None:
-        raise UsageError("--protos and --table both say where the messages are; give one")
+        raise UsageError("--protos and --table both say where the messages are", "give one")
     if args.protos is None and (path := table_if_any(args)) is not None:
         table = read_table(path)
         return wire_of_table(table), table

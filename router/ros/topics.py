@@ -89,7 +89,9 @@ class RosTopics:
         try:
             others = self._our_types(topic) - {type_name}
             if (renamed := self.resolved(topic)) != topic:
-                raise StartError(f"a remap of this router makes '{renamed}' of '{topic}'; remap relative names instead")
+                raise StartError(
+                    f"a remap of this router makes '{renamed}' of '{topic}'", "remap relative names instead"
+                )
             if others:  # DDS has one type for a topic in a process
                 raise StartError(f"topic '{topic}' is {others.pop()} in this router, and cannot be {type_name} too")
             return TopicTap(
@@ -155,7 +157,7 @@ class TopicListener:
 
     def __init__(self, topic: str, type_name: str | None = None, ros_args: Sequence[str] = ()) -> None:
         if type_name is not None and type_name.count("/") != 2:
-            raise StartError(f"'{type_name}' is no message type; they are written like std_msgs/msg/String")
+            raise StartError(f"'{type_name}' is no message type", "they are written like std_msgs/msg/String")
         with ExitStack() as opening:
             node = open_node("router_tap", ros_args=ros_args)
             opening.callback(close_node, node)

@@ -180,7 +180,7 @@ def _ros_type(field: NewField, site: Site) -> str:
         return _short(field.type)
     if field.type in site.schema.enums:
         return "uint8"
-    raise UsageError(f"'{field.name}' needs {site.messages.name}/{_short(field.type)}.msg; declare that first")
+    raise UsageError(f"'{field.name}' needs {site.messages.name}/{_short(field.type)}.msg", "declare that first")
 
 
 def _constants(name: str, site: Site) -> Iterator[str]:
@@ -188,7 +188,7 @@ def _constants(name: str, site: Site) -> Iterator[str]:
         return
     for value, number in site.schema.enums[name].values:
         if not 0 <= number <= 255:
-            raise UsageError(f"{name}.{value} is {number}, which is no uint8; write the .msg file by hand")
+            raise UsageError(f"{name}.{value} is {number}, which is no uint8", "write the .msg file by hand")
         yield f"uint8 {value}={number}"
 
 
@@ -314,7 +314,7 @@ def _last_route(text: str, routes: Iterable[Route]) -> _Entry:
     line = max((route.case.span.line for route in routes), default=0)
     found = next((entry for entry in _entries(text, "routes") if entry.first == line - 1), None)
     if found is None:
-        raise UsageError("the table has no routes of its own that one could be added to; write it by hand")
+        raise UsageError("the table has no routes of its own that one could be added to", "write it by hand")
     return found
 
 
@@ -332,7 +332,7 @@ def _in_tests(path: Path, message: NewMessage, site: Site) -> str:
     except yaml.YAMLError as error:
         raise UsageError(f"{shown_path(path)} is no YAML: {error}") from error
     if not entries:
-        raise UsageError(f"{shown_path(path)} has no 'tests'; write one, or remove the file")
+        raise UsageError(f"{shown_path(path)} has no 'tests'", "write one, or remove the file")
     of_board = [entry for entry in entries if message.board in _senders(entry.value)]
     return _with_stanza(text, (of_board or entries)[-1], _test(message, site), "" if of_board else message.board_words)
 

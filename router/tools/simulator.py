@@ -69,7 +69,7 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
     for silence in silences:
         if silence.name not in known:
             hint = did_you_mean(silence.name, known)
-            raise UsageError(f"nothing is sent that '{silence.name}' could silence; {hint}")
+            raise UsageError(f"nothing is sent that '{silence.name}' could silence", hint)
 
 
 def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[Stream]:
@@ -83,7 +83,7 @@ def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[
             sender = STRANGER if source.value == ANY else source.value
             if sender != STRANGER and sender not in table.endpoints:
                 hint = did_you_mean(sender, table.endpoints)
-                raise UsageError(f"{source.span}: there is no endpoint '{sender}'; {hint}")
+                raise UsageError(f"{source.span}: there is no endpoint '{sender}'", hint)
             offset = random.Random(f"{seed}/{case.name}/{sender}").uniform(0, 1 / rate)
             yield Stream(sender, case, rate, offset)
 
@@ -183,7 +183,9 @@ class Simulator:
             opened = open_udp(address, owner)
         except UsageError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
-                raise UsageError(f"{error}; take a table with addresses of this machine: -t routes/sim.yaml") from error
+                raise UsageError(
+                    str(error), "take a table with addresses of this machine: -t routes/sim.yaml"
+                ) from error
             raise
         self._opened.append(opened)
         return opened

@@ -119,7 +119,7 @@ def test_the_environment_may_name_the_table(
 def test_without_any_table_it_says_how_to_name_one(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words(verb)) == BAD_USAGE
     how = "name a table by -t TABLE or ROUTER_TABLE, or write a first one: `router init DIR`"
-    assert capsys.readouterr().err == f"router {verb}: there is no routes/rover.yaml here; {how}\n"
+    assert capsys.readouterr().err == f"router {verb}: there is no routes/rover.yaml here\nhelp: {how}\n"
 
 
 @pytest.mark.parametrize("verb", [None, *VERBS])

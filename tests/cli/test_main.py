@@ -47,12 +47,12 @@ def test_an_option_that_a_verb_does_not_have_shows_those_that_it_has(capsys: pyt
         main(["record", "--tabel", "routes/sim.yaml"])
     said = capsys.readouterr().err
     assert said.startswith("usage: router record")
-    assert "unrecognized arguments: --tabel routes/sim.yaml; did you mean '--table'?" in said
+    assert "unrecognized arguments: --tabel routes/sim.yaml\nhelp: did you mean '--table'?" in said
 
 
 def test_an_unknown_verb_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["valdate"]) == BAD_USAGE
-    assert capsys.readouterr().err == "router: there is no verb 'valdate'; did you mean 'validate'?\n"
+    assert capsys.readouterr().err == "router: there is no verb 'valdate'\nhelp: did you mean 'validate'?\n"
 
 
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,7 +69,8 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     ("error", "code", "shown"),
     [
         (TableError([Diagnostic(SourceSpan("t.yaml", 3, 4), Code.BAD_YAML, "what")]), BAD_TABLE, "t.yaml:3:4: error"),
-        (StartError("port 5000 is taken"), BAD_TABLE, "router validate: port 5000 is taken"),
+        (StartError("port 5000 is taken"), BAD_TABLE, "router validate: port 5000 is taken\n"),
+        (StartError("no port", "choose another"), BAD_TABLE, "router validate: no port\nhelp: choose another\n"),
         (UsageError("there is no x"), BAD_USAGE, "router validate: there is no x"),
         (TransportError("nobody answers"), NETWORK_FAULT, "router validate: nobody answers"),
         (KeyboardInterrupt(), INTERRUPTED, ""),
