@@ -16,7 +16,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import NoReturn, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
@@ -112,6 +112,14 @@ class _Parser(argparse.ArgumentParser):
         return "\n".join([*lines, ""])
 
 
+class _VerbParser(argparse.ArgumentParser):
+    """Takes `--for -1s` for a value that its option can refuse, not for an unknown option."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._negative_number_matcher = re.compile(r"-[0-9]")
+
+
 class _Help(argparse.HelpFormatter):
     """Fills paragraphs to the terminal's width, except those with indented lines: examples."""
 
@@ -186,7 +194,7 @@ def _run(arguments: Sequence[str]) -> int:
     parser = _Parser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
     parser.add_argument("--version", action=_Version, nargs=0)
     parser.add_argument("--completion", action=_Completion, choices=SHELLS)
-    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=argparse.ArgumentParser)
+    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=_VerbParser)
     if "_ARGCOMPLETE" in os.environ:
         _complete(parser, subparsers)
     chosen = _verb(arguments)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
-from router.cli import DEFAULT_TABLE
+from router.cli import DEFAULT_TABLE, with_help
 from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
@@ -151,31 +151,47 @@ def seconds(text: str) -> float:
     """`10s`, `500ms` as seconds."""
     from router.table.units import parse_duration
 
-    return _quantity(parse_duration, text) / 1e9
+    return _quantity(parse_duration, text, "s") / 1e9
 
 
 def hertz(text: str) -> float:
     """`20Hz` as Hz."""
     from router.table.units import parse_rate
 
-    return _quantity(parse_rate, text)
+    return _quantity(parse_rate, text, "Hz")
+
+
+def factor(text: str) -> float:
+    """`2x` as a factor."""
+    return _quantity(_parse_factor, text, "x")
 
 
 def speed(text: str) -> float:
     """`2x` as a factor; `max` is infinite."""
-    if text == "max":
-        return math.inf
+    return math.inf if text == "max" else factor(text)
+
+
+def _parse_factor(text: str) -> float:
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)x", text)
     if found is None or not 0 < float(found[1]) <= 1e6:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a speed such as 2x or 0.5x, or max")
+        raise ValueError(f"'{text}' is not a speed such as 2x or 0.5x")
     return float(found[1])
 
 
-def _quantity(parse: Callable[[str], float], text: str) -> float:
+_NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
+
+
+def _quantity(parse: Callable[[str], float], text: str, unit: str) -> float:
     try:
         return parse(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+        what, _, hint = str(error).partition("; ")
+        number = _NUMBER.match(text)
+        if number and float(number[0]) <= 0:
+            what, hint = f"'{text}' is not above zero", ""
+        elif number and number[0] == text:
+            what, hint = f"'{text}' has no unit", f"did you mean '{text}{unit}'?"
+        raise argparse.ArgumentTypeError(with_help(what, hint)) from error
 
 
 def say(line: str) -> None:
@@ -183,8 +199,16 @@ def say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def integer(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number") from None
+
+
 def whole(text: str) -> int:
-    value = int(text)
+    """An integer above zero."""
+    value = integer(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
     return value

@@ -60,7 +60,10 @@ def parse_silence(text: str) -> Silence:
     found = _SILENCE.fullmatch(text)
     if found is None:
         raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")
-    return Silence(found["name"], float(found["start"]), float(found["end"] or "inf"))
+    silence = Silence(found["name"], float(found["start"]), float(found["end"] or "inf"))
+    if silence.end <= silence.start:
+        raise UsageError(f"'{text}' ends before it begins")
+    return silence
 
 
 def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
@@ -166,8 +169,10 @@ class Simulator:
     def summary(self) -> str:
         """One line for people."""
         endpoints, cases = len(self._senders) - 1, len(self._streams)
+        who = "1 endpoint sends" if endpoints == 1 else f"{endpoints} endpoints send"
+        what = "1 payload case" if cases == 1 else f"{cases} payload cases"
         rate = sum(stream.rate for stream in self._streams)
-        return f"{endpoints} endpoints send {cases} payload cases, {rate:.0f}/s, to {self._router}"
+        return f"{who} {what}, {rate:.0f}/s, to {self._router}"
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`."""
