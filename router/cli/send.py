@@ -67,8 +67,10 @@ def _summary(case: str, data: bytes, to: Address, sent: Sent) -> str:
 
 def _advise(args: argparse.Namespace, table: RouteTable | None, to: Address, sent: Sent) -> int:
     """Say on stderr why nothing may have come of it. The exit code: 1 when the other side refused."""
+    from router.net.udp import nobody_listens
+
     if sent.refused:
-        print(f"router send: nobody listens on {to}", file=sys.stderr)
+        print(f"router send: {nobody_listens(to)}", file=sys.stderr)
         return 1
     if table is None or args.origin or args.to not in table.listeners:
         return 0

@@ -202,6 +202,11 @@ def _refused(settings: model.Listener, error: OSError) -> StartError:
     return StartError(f"{settings.address.span}: {what}: {why}", hint)
 
 
+def nobody_listens(address: Address) -> str:
+    """What "Connection refused" means for UDP: the computer is there, and no process has the port."""
+    return f"nobody listens at {address}"
+
+
 class Sender:
     """A non-blocking socket, connected to one destination. Opening raises StartError.
 

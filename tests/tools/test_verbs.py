@@ -72,7 +72,7 @@ def test_send_notices_that_nobody_listens(
     nobody = place(receiver)
     receiver.close()
     assert main(["send", "plain", "--to", nobody, "--protos", str(protos)]) == 1
-    assert capsys.readouterr().err == f"router send: nobody listens on {nobody}\n"
+    assert capsys.readouterr().err == f"router send: nobody listens at {nobody}\n"
 
 
 @pytest.mark.parametrize(
