@@ -118,7 +118,7 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
     from router.tools import udp
     from router.tools.tap import listen
 
-    wire, table = load_wire(args)
+    wire, table = load_wire(args, place)
     with udp.open_udp(udp.listening(place, table), place) as receiver:
         host, port = receiver.getsockname()
         say(f"listening on {host}:{port}; Ctrl-C ends it")

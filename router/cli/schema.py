@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.assets import asset, is_installed
+from router.assets import is_installed
 from router.cli import BAD_TABLE, OK, VERBS, Subparsers, add_verb
 from router.cli.findings import plural, print_findings
-from router.cli.tool_options import add_table, table_if_any
+from router.cli.tool_options import add_table, table_path
 from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, shown_path
 from router.table import load_table
 from router.table.model import EnvelopeSettings
@@ -86,17 +86,16 @@ def _settings(args: argparse.Namespace) -> EnvelopeSettings:
     """Where the protos and the lock are. Raises TableError for a broken table."""
     if args.protos and args.table:
         raise UsageError("--protos and --table both say where the messages are", "give one")
-    settings = None if args.protos else _of_table(table_if_any(args))
-    if settings is None:
-        root = args.protos or asset("protos")
-        span = SourceSpan(shown_path(root))
-        settings = EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))
+    settings = _of_folder(args.protos) if args.protos else _of_table(table_path(args))
     return replace(settings, lock=Located(args.lock.absolute(), settings.protos.span)) if args.lock else settings
 
 
-def _of_table(path: Path | None) -> EnvelopeSettings | None:
-    if path is None:
-        return None
+def _of_folder(root: Path) -> EnvelopeSettings:
+    span = SourceSpan(shown_path(root))
+    return EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))
+
+
+def _of_table(path: Path) -> EnvelopeSettings:
     table, findings = load_table(path)
     if table is None:
         raise TableError(findings)

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.udp import Sent, send
     from router.values import payload
 
-    wire, table = load_wire(args)
+    wire, table = load_wire(args, args.to)
     case = wire.case(args.case)
     exact = wire.encode(case, payload(case, args.fields))
     data = framed(exact, args.trim, args.pad)

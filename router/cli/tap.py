@@ -15,7 +15,6 @@ from router.cli.tool_options import (
     running_url,
     say,
 )
-from router.errors import UsageError
 
 _DESCRIPTION = """Print what a running router receives, before it routes it: the fields that are not default. The
 router is asked where the table's 'http.address' says, on this computer; it does not wait for this terminal, and
@@ -49,12 +48,10 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.tap import Condition, RunningTap
     from router.tools.udp import peer_names
 
+    url = running_url(args)
     wire, table = load_wire(args)
     cases = [wire.case(name) for name in args.cases]
     condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
-    if args.url is None and table is None:
-        raise UsageError("-t TABLE or --url says which running router")
-    url = running_url(args)
     taken = RunningTap(wire, peer_names(table), args.cases, condition)
     wanted = args.cases or (sorted(condition.cases) if condition else [])
     # The router goes before whatever runs on its computer to watch it.

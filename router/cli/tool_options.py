@@ -88,14 +88,18 @@ def add_wire_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--protos", type=Path, metavar="DIR", help="folder of .proto files, instead of a table")
 
 
-def load_wire(args: argparse.Namespace) -> tuple[Wire, RouteTable | None]:
-    """The messages, of a table if there is one. Raises TableError and UsageError."""
+def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTable | None]:
+    """The messages, of a table if there is one, and there has to be one if `place` is a name.
+
+    Raises TableError and UsageError.
+    """
     from router.engine.wire import wire_of_protos, wire_of_table
     from router.table import read_table
 
     if args.protos is not None and args.table is not None:
         raise UsageError("--protos and --table both say where the messages are", "give one")
-    if args.protos is None and (path := table_if_any(args)) is not None:
+    find = table_path if place.isidentifier() and place != "localhost" else table_if_any
+    if args.protos is None and (path := find(args)) is not None:
         table = read_table(path)
         return wire_of_table(table), table
     return wire_of_protos(args.protos or asset("protos")), None

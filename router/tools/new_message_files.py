@@ -264,6 +264,11 @@ def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str =
 def _in_table(text: str, message: NewMessage, site: Site) -> str:
     """The table with a route from the board to ROS and the basestation, after the last route of that board."""
     own = _own_routes(site.table)
+    if not own and len(site.table.files) > 1:
+        extended = shown_path(site.table.files[1])
+        raise UsageError(
+            f"{shown_path(site.table.path)} has no routes of its own", f"take what it extends: -t {extended}"
+        )
     of_board = [route for route in own if message.board in (source.value for source in route.sources)]
     last = _last_route(text, of_board or own)
     route = _route(message, site, _WIDEST - last.indent)

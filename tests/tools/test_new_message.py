@@ -418,7 +418,31 @@ def test_an_installation_is_not_the_place_for_a_new_message(
     monkeypatch.setattr(router.assets, "_PACKAGE", site)
     before = contents(site)
     assert main(["new", *RADIATION]) == BAD_USAGE
-    assert "use the one of a checkout" in capsys.readouterr().err
+    assert (
+        "do not belong to routes/rover.yaml\nhelp: use the router of that table's checkout" in capsys.readouterr().err
+    )
+    assert contents(site) == before
+
+
+def test_a_table_elsewhere_gets_no_message_in_the_schemas_of_the_router(
+    site: Path, tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = tmp_path_factory.mktemp("project")
+    for part in ("routes", "protos"):
+        shutil.copytree(site / part, project / part)
+    before = contents(site)
+    assert main(["new", *RADIATION, "-t", str(project / "routes/rover.yaml")]) == BAD_USAGE
+    assert f"(schemas) do not belong to {project / 'routes/rover.yaml'}" in capsys.readouterr().err
+    assert contents(site) == before
+
+
+def test_a_table_without_routes_of_its_own_names_the_one_that_it_extends(
+    site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (site / "routes/sim.yaml").write_text("version: 1\nextends: rover.yaml\n", encoding="utf-8")
+    before = contents(site)
+    assert main(["new", *RADIATION, "-t", "routes/sim.yaml"]) == BAD_USAGE
+    assert "has no routes of its own\nhelp: take what it extends: -t routes/rover.yaml\n" in capsys.readouterr().err
     assert contents(site) == before
 
 
