@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import OK, Subparsers, add_verb, with_help
-from router.cli.tool_options import add_table, progress, speed, table_if_any, table_path
+from router.cli.tool_options import add_table, progress, speed, table_if_any, table_path, until_interrupted
 from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
@@ -69,13 +69,10 @@ def _send(args: argparse.Namespace, recording: Recording) -> int:
     to = udp.destination(args.to, table) if args.to else None
     origin = udp.origin(args.origin, table) if args.origin else None
     replayer = Replayer(table, to, origin)
-    try:
-        with closing(replayer), _progress(recording, "sending") as update:
-            for found in on_time(recording, args.speed or 1.0):
-                replayer.send(found)
-                update(completed=recording.position)
-    except KeyboardInterrupt:
-        pass
+    with until_interrupted(), closing(replayer), _progress(recording, "sending") as update:
+        for found in on_time(recording, args.speed or 1.0):
+            replayer.send(found)
+            update(completed=recording.position)
     print(f"sent {replayer.resent.datagrams} datagrams")
     return _advise(replayer.resent)
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb, with_help
-from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, whole
+from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, until_interrupted, whole
 
 if TYPE_CHECKING:
     from router.table.addresses import Address
@@ -52,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     count = args.count if args.count is not None else None if args.rate else 1
     sent = Sent()
     # Without --count it ends with Ctrl-C, and then reports what was sent.
-    with udp.open_udp(origin, "--from") as sender, contextlib.suppress(KeyboardInterrupt):
+    with udp.open_udp(origin, "--from") as sender, until_interrupted():
         send(sender, to, data, count, args.rate, sent)
     print(_summary(args.case, data, to, sent))
     return _advise(args, table, to, sent)

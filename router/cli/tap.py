@@ -14,6 +14,7 @@ from router.cli.tool_options import (
     print_batches,
     running_url,
     say,
+    until_interrupted,
 )
 
 _DESCRIPTION = """Print what a running router receives, before it routes it: the fields that are not default. The
@@ -58,9 +59,8 @@ def run(args: argparse.Namespace) -> int:
     with background_threads(), tap(url, wanted, args.sources) as batches:
         say(f"tapping the router at {url}; Ctrl-C ends it")
         try:
-            print_batches(taken.take(batches), args)
-        except KeyboardInterrupt:
-            pass
+            with until_interrupted():
+                print_batches(taken.take(batches), args)
         finally:
             if taken.missed:
                 say(f"{taken.missed} datagrams were too many for this terminal; the router routed them all the same")

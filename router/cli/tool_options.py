@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 import re
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -138,12 +139,26 @@ def add_count(parser: argparse.ArgumentParser, about: str = "end after N message
     parser.add_argument("--count", type=whole, metavar="N", help=about)
 
 
-def print_batches(batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace) -> None:
-    """Print until --count or --for is reached; while nothing comes, the batches are empty.
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Go on until Ctrl-C or SIGTERM, which end what is inside, and are no error."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def print_batches(
+    batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace, waited: float = 0.0
+) -> None:
+    """Print until --count or --for is reached, of which `waited` seconds are over; empty batches come meanwhile.
 
     A batch is written at once: a system call for each line would cost more than the line.
     """
-    left, until = args.count, time.monotonic() + (args.seconds or math.inf)
+    left, until = args.count, time.monotonic() + (args.seconds or math.inf) - waited
     for batch in batches:
         if shown := batch[:left]:
             print("\n".join(each.json(args.hex) if args.json else each.line(args.hex) for each in shown), flush=True)

@@ -178,4 +178,4 @@ def test_a_wrong_duration_is_refused_as_usage(capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit) as caught:
         main(["listen", "udp://5000", "--for", "5"])
     assert caught.value.code == 2
-    assert "'5' is not a number with a unit of" in capsys.readouterr().err
+    assert "'5' has no unit" in capsys.readouterr().err

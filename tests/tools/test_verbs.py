@@ -137,19 +137,46 @@ def test_listen_waits_for_a_topic_and_prints_what_it_carries() -> None:
     ]
 
 
-def test_listen_that_waits_for_a_topic_ends_with_ctrl_c() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_listen_that_waits_for_a_topic_ends_with_a_signal(number: signal.Signals) -> None:
     command = [sys.executable, "-m", "router", "listen", "topic://nobody_publishes_this"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as tap:
         assert tap.stderr is not None
         assert tap.stderr.readline() == "waiting for a publisher of nobody_publishes_this; Ctrl-C ends it\n"
-        tap.send_signal(signal.SIGINT)
+        tap.send_signal(number)
         out, err = tap.communicate()
     assert (tap.returncode, out, err) == (0, "", "")
+
+
+def test_listen_waits_for_a_topic_no_longer_than_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["listen", "topic://nobody_publishes_this", "--for", "300ms"]) == 1
+    assert "router listen: topic 'nobody_publishes_this' has no publisher\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_send_that_is_ended_by_a_signal_says_what_was_sent(number: signal.Signals, protos: Path) -> None:
+    words = ["plain", "--rate", "50Hz", "--protos", str(protos)]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(60)
+        to = f"127.0.0.1:{receiver.getsockname()[1]}"
+        command = [sys.executable, "-m", "router", "send", *words, "--to", to]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as sending:
+            receiver.recv(100)
+            receiver.recv(100)
+            sending.send_signal(number)
+            out, _ = sending.communicate(timeout=60)
+    assert (sending.returncode, out.startswith(f"sent plain to {to}")) == (0, True)
 
 
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
+        (
+            ["ftp://x"],
+            "there are no places ftp://\nhelp: there are udp://, tcp://, ws://, zenoh://, envelope://, topic://",
+        ),
+        (["topic://"], "topic:// names no topic"),
         (
             ["topic://t", "--type", "Point"],
             "'Point' is no message type\nhelp: they are written like std_msgs/msg/String",
@@ -162,7 +189,6 @@ def test_listen_that_waits_for_a_topic_ends_with_ctrl_c() -> None:
             ["5000"],
             "'5000' does not say what it is: udp://5000 is where a gateway sends to, envelope://5000 where a router",
         ),
-        (["mqtt://5000"], "'mqtt://5000' is not udp://[HOST:]PORT, "),
     ],
 )
 def test_a_mistake_in_listen_is_said_and_ends_with_2(
