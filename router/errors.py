@@ -240,7 +240,8 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     if not close:
         return None
     ratios = [difflib.SequenceMatcher(a=candidate, b=name.lower()).ratio() for candidate in close]
-    return folded[min(candidate for candidate, ratio in zip(close, ratios, strict=True) if ratio == max(ratios))]
+    best = (candidate for candidate, ratio in zip(close, ratios, strict=True) if ratio == max(ratios))
+    return folded[min(best, key=lambda candidate: (sorted(candidate) != sorted(name.lower()), candidate))]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

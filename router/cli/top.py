@@ -62,7 +62,9 @@ def _show_once(url: str, order: Order, interval: float) -> None:
     from router.tools.top_view import page
 
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-    console.print(page(_look(url, interval), order))
+    with console.capture() as shown:  # rich ends the process where a pipe is closed, and `main` has a code for that
+        console.print(page(_look(url, interval), order))
+    print(shown.get(), end="")
 
 
 def _look(url: str, interval: float) -> View:
