@@ -123,7 +123,7 @@ def running_url(args: argparse.Namespace) -> str:
     from router.tools.running_router import url_of
 
     if args.url:
-        return str(args.url)
+        return str(args.url).strip()
     table, findings = load_table(table_path(args))
     if table is None:
         raise TableError(findings)

@@ -49,10 +49,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_json(url: str, order: Order, interval: float) -> None:
-    """The fields of `View`, with all rows. Times in seconds."""
+    """The fields of `View`, with all rows, times in seconds; where no router answers, those of `router status`."""
     from router.tools.top import ordered
 
-    seen = _look(url, interval)
+    try:
+        seen = _look(url, interval)
+    except TransportError as error:
+        print(json.dumps({"state": "down", "url": url, "problems": [str(error)]}))
+        raise
     print(json.dumps(asdict(seen) | {"routes": [asdict(row) for row in ordered(seen.routes, order)]}))
 
 
