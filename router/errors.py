@@ -178,12 +178,25 @@ class TableError(RouterError):
         self.diagnostics = tuple(diagnostics)
 
 
-class UsageError(RouterError):
-    """What the operator asked for cannot be done; the message is one line that says what and why."""
+class OperatorError(RouterError):
+    """What an operator can see to: `what` is one line that says what is wrong and why, `hint` what to do about it."""
+
+    def __init__(self, what: str, hint: str = "") -> None:
+        super().__init__(what, hint)
+        self.what = what
+        self.hint = hint
+
+    def __str__(self) -> str:
+        """The one-line form, `what; hint`."""
+        return f"{self.what}; {self.hint}" if self.hint else self.what
 
 
-class StartError(RouterError):
-    """A socket or the ROS node could not be opened; the message says which and what to do."""
+class UsageError(OperatorError):
+    """What the operator asked for cannot be done."""
+
+
+class StartError(OperatorError):
+    """A socket or the ROS node could not be opened."""
 
 
 class DecodeError(RouterError):
@@ -198,7 +211,7 @@ class NonFiniteError(MappingError):
     """NaN or an infinity where the target can only hold a finite value."""
 
 
-class TransportError(RouterError):
+class TransportError(OperatorError):
     """The network's fault: a datagram or a ROS message could not be handed over."""
 
 
@@ -227,7 +240,8 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
     if not close:
         return None
     ratios = [difflib.SequenceMatcher(a=candidate, b=name.lower()).ratio() for candidate in close]
-    return folded[min(candidate for candidate, ratio in zip(close, ratios, strict=True) if ratio == max(ratios))]
+    best = (candidate for candidate, ratio in zip(close, ratios, strict=True) if ratio == max(ratios))
+    return folded[min(best, key=lambda candidate: (sorted(candidate) != sorted(name.lower()), candidate))]
 
 
 def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:

@@ -37,7 +37,7 @@ def set_fields(message: Message, kind: MessageType, assignments: Sequence[str]) 
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
         if not equals:
-            raise UsageError(f"'{assignment}' is not an assignment; write {assignment or 'field'}=value")
+            raise UsageError(f"'{assignment}' is not an assignment", f"write {assignment or 'field'}=value")
         _assign(message, kind, path, text)
 
 
@@ -67,11 +67,11 @@ _STEP = re.compile(r"(?P<name>\w+)(?:\[(?P<index>\d+)\])?")
 def _step(kind: MessageType, step: str, path: str) -> tuple[Field, int | None]:
     match = _STEP.fullmatch(step)
     if match is None:
-        raise UsageError(f"'{path}' is not a field path; write it as x, bbox.x or points[0]")
+        raise UsageError(f"'{path}' is not a field path", "write it as x, bbox.x or points[0]")
     field = kind.field(match["name"])
     if field is None:
         hint = did_you_mean(match["name"], (known.name for known in kind.fields))
-        raise UsageError(f"{kind.name} has no field '{match['name']}'" + (f"; {hint}" if hint else ""))
+        raise UsageError(f"{kind.name} has no field '{match['name']}'", hint)
     return field, None if match["index"] is None else int(match["index"])
 
 
@@ -83,7 +83,7 @@ def _inner_message(message: Any, field: Field, index: int | None, path: str) -> 
         member.SetInParent()
         return member
     if index is None:
-        raise UsageError(f"{path}: {field.name} is a list; say which element, such as {field.name}[0]")
+        raise UsageError(f"{path}: {field.name} is a list", f"say which element, such as {field.name}[0]")
     _extend(member, field.type, index, path)
     return member[index]
 
@@ -127,7 +127,7 @@ def parse(kind: Type, text: str, path: str) -> object:
     match kind:
         case Bool():
             if text.lower() not in _TRUTH:
-                raise UsageError(f"{path}: '{text}' is not a bool; write true or false")
+                raise UsageError(f"{path}: '{text}' is not a bool", "write true or false")
             return _TRUTH[text.lower()]
         case Int():
             return _parse_int(kind, text, path)
@@ -143,14 +143,14 @@ def parse(kind: Type, text: str, path: str) -> object:
             return _parse_bytes(kind, text, path)
         case _:
             field = kind.fields[0].name if isinstance(kind, MessageType) and kind.fields else "x"
-            raise UsageError(f"{path} is the message {kind}; set its fields, such as {path}.{field}=...")
+            raise UsageError(f"{path} is the message {kind}", f"set its fields, such as {path}.{field}=...")
 
 
 def _parse_int(kind: Int, text: str, path: str) -> int:
     try:
         value = int(text, 0)
     except ValueError:
-        raise UsageError(f"{path}: '{text}' is not an integer ({kind}); write it as 42, -1 or 0x2a") from None
+        raise UsageError(f"{path}: '{text}' is not an integer ({kind})", "write it as 42, -1 or 0x2a") from None
     if not kind.low <= value <= kind.high:
         raise UsageError(f"{path}: {text} does not fit {kind}, which holds {kind.low} to {kind.high}")
     return value
@@ -160,7 +160,7 @@ def _parse_float(kind: Float, text: str, path: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise UsageError(f"{path}: '{text}' is not a number ({kind}); write it as 1.5, -2e3, nan or inf") from None
+        raise UsageError(f"{path}: '{text}' is not a number ({kind})", "write it as 1.5, -2e3, nan or inf") from None
     largest = _LARGEST[kind.bits]
     if abs(value) > largest and "inf" not in text.lower():
         raise UsageError(f"{path}: {text} does not fit {kind}, which holds {-largest!r} to {largest!r}")
@@ -175,14 +175,14 @@ def _parse_enum(kind: Enum, text: str, path: str) -> int:
         return values[name]
     if text.lstrip("-")[:1].isdigit():
         return _parse_int(_ENUM_RANGE, text, path)
-    raise UsageError(f"{path}: {kind.name} has no value '{text}'; {did_you_mean(name, values)}")
+    raise UsageError(f"{path}: {kind.name} has no value '{text}'", did_you_mean(name, values))
 
 
 def _parse_bytes(kind: Bytes, text: str, path: str) -> bytes:
     try:
         value = bytes.fromhex(text.removeprefix("0x"))
     except ValueError:
-        raise UsageError(f"{path}: '{text}' is not hex; write bytes as 0a1b2c") from None
+        raise UsageError(f"{path}: '{text}' is not hex", "write bytes as 0a1b2c") from None
     if kind.bound is not None and len(value) > kind.bound:
         raise UsageError(f"{path}: {len(value)} bytes do not fit {kind}, which holds at most {kind.bound}")
     return value

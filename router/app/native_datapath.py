@@ -212,7 +212,7 @@ class NativeDatapath:
             native = native_program(program, generation, outlets)
         except CannotCarry as error:
             what = f"the carrier, which runs, cannot take these messages: {error}"
-            raise StartError(f"{what}; restart the router, and Python serves them") from error
+            raise StartError(what, "restart the router, and Python serves them") from error
         native.arrays += [senders, deadmen, routes]
         numbers = {handler.route: number for number, handler in enumerate(native.handlers)}
         now = self._wiring.program if self._wiring else program

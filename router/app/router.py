@@ -60,7 +60,7 @@ class Router:
     ) -> None:
         self.is_ready = False
         self._first = program
-        self._reporter = Reporter()
+        self._reporter = Reporter(self._addresses)
         self._counts = ThreadCounts(program.counters)
         self.mirror = Mirror(MAX_DATAGRAM, self._observers_changed, self._reporter.failed)
         context = RouterContext(self._counts, Timers(self._reporter.failed), self._reporter, self._deadman_changed)
@@ -108,6 +108,9 @@ class Router:
         logger.info("router stopping")
         self._open.close()
         logger.info("router stopped", **self.totals())
+
+    def _addresses(self) -> dict[str, Address]:
+        return {name: endpoint.address.value for name, endpoint in self.program.table.endpoints.items()}
 
     @property
     def program(self) -> Program:

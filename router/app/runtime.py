@@ -287,7 +287,7 @@ def _open_ros(
 
 
 def _missing_ros(program: Program, error: ImportError) -> StartError:
-    return StartError(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}; {ros_remedy()}")
+    return StartError(f"{program.table.path} has topics, and ROS 2 cannot be loaded: {error}", ros_remedy())
 
 
 def _topic_spans(program: Program) -> Mapping[str, SourceSpan]:

@@ -80,7 +80,7 @@ class ThreadCounts:
         """Add the counts of `counters`, which continue the present ones. Raises StartError."""
         if self.most is not None and counters.size > self.most:
             what = f"the table has {counters.size} counters, and the carrier has room for {self.most}"
-            raise StartError(f"{what}; with ROUTER_CARRIER=python there is no limit")
+            raise StartError(what, "with ROUTER_CARRIER=python there is no limit")
         present = dict(self.counters.series())
         new = [index for series, index in counters.series() if series not in present]
         for counts in self.lists:

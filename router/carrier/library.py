@@ -138,7 +138,7 @@ def chosen_library(variables: Mapping[str, str] = os.environ) -> ctypes.CDLL | N
     if choice == PYTHON:
         return None
     if choice not in {"", NATIVE}:
-        raise StartError(f"{VARIABLE} is '{choice}'; set it to '{NATIVE}' or '{PYTHON}', or unset it")
+        raise StartError(f"{VARIABLE} is '{choice}'", f"set it to '{NATIVE}' or '{PYTHON}', or unset it")
     try:
         return load()
     except LibraryError as error:

@@ -6,6 +6,7 @@ A verb's module offers `add_parser(subparsers)`, which calls `add_verb`, and `ru
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import io
 import os
@@ -16,9 +17,9 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import NoReturn, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
-from router.errors import RouterError, TableError, TransportError, UsageError, nearest
+from router.errors import OperatorError, RouterError, TableError, TransportError, UsageError, nearest
 from router.ros.environment import ADDRESS_SPACE, address_space
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -26,10 +27,14 @@ Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 OK = 0
 NETWORK_FAULT = 1
 BAD_USAGE = 2
+UNWRITTEN = 74
+"""EX_IOERR: stdout is a file on a full disk."""
 BAD_TABLE = 78
 """EX_CONFIG: systemd is told not to restart into it."""
 INTERRUPTED = 130
 BROKEN_PIPE = 141
+
+_UNWRITTEN = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 DEFAULT_TABLE = Path("routes/rover.yaml")
 
@@ -112,6 +117,14 @@ class _Parser(argparse.ArgumentParser):
         return "\n".join([*lines, ""])
 
 
+class _VerbParser(argparse.ArgumentParser):
+    """Takes `--for -1s` for a value that its option can refuse, not for an unknown option."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._negative_number_matcher = re.compile(r"-[0-9]")
+
+
 class _Help(argparse.HelpFormatter):
     """Fills paragraphs to the terminal's width, except those with indented lines: examples."""
 
@@ -137,6 +150,11 @@ def add_verb(
     )
 
 
+def with_help(what: str, hint: str = "") -> str:
+    """What is wrong, and what to do about it in a line of its own, as in findings of a table."""
+    return f"{what}\nhelp: {hint}" if hint else what
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb; the exit code: 0, 78 for a bad table, 2 for wrong usage, 1 for the network."""
     arguments = sys.argv[1:] if argv is None else list(argv)
@@ -145,14 +163,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal that lacks a character is no reason to fail
     try:
-        code = _run(arguments)
-        sys.stdout.flush()
+        try:
+            code = _run(arguments)
+        finally:  # argparse prints, and exits
+            sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at exit
+        _leave_stdout()
         return BROKEN_PIPE
     except KeyboardInterrupt:
         return INTERRUPTED
-    except (MemoryError, ImportError, OSError, RuntimeError) as error:  # each of them says that memory could not be had
+    except (MemoryError, ImportError, OSError, RuntimeError) as error:
+        if isinstance(error, OSError) and error.errno in _UNWRITTEN and error.filename is None:
+            _leave_stdout()
+            print(f"router {_verb(arguments) or ''}".rstrip() + f": stdout: {error.strerror}", file=sys.stderr)
+            return UNWRITTEN
+        # Each of them may say that memory could not be had.
         if (limit := address_space()) is None or limit >= ADDRESS_SPACE:
             raise
         what = f"this process may map {limit >> 20} MiB of memory (ulimit -v), which is not enough"
@@ -163,6 +188,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         os._exit(BAD_TABLE)  # threads that could be started when others could not would keep the process
     return code
+
+
+def _leave_stdout() -> None:
+    """Have nothing written any more, or Python complains when it flushes at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _verb(arguments: Sequence[str]) -> str | None:
@@ -181,13 +211,15 @@ def _run(arguments: Sequence[str]) -> int:
     parser = _Parser(prog="router", description="Route messages between protobuf over UDP and ROS 2.")
     parser.add_argument("--version", action=_Version, nargs=0)
     parser.add_argument("--completion", action=_Completion, choices=SHELLS)
-    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=argparse.ArgumentParser)
+    subparsers: Subparsers = parser.add_subparsers(dest="verb", metavar="VERB", parser_class=_VerbParser)
     if "_ARGCOMPLETE" in os.environ:
         _complete(parser, subparsers)
     chosen = _verb(arguments)
     module = _add_verbs(subparsers, chosen)
-    if chosen is not None and chosen not in VERBS:
-        print(f"router: there is no verb '{chosen}'; {_suggestion(chosen, VERBS)}", file=sys.stderr)
+    if chosen == "help":
+        return _run([*(word for word in arguments[1:2] if word in VERBS), "--help"])
+    if mistake := _mistake(arguments):
+        print(f"router: {mistake}", file=sys.stderr)
         return BAD_USAGE
     args, unknown = parser.parse_known_args(arguments)
     if unknown:
@@ -198,7 +230,8 @@ def _run(arguments: Sequence[str]) -> int:
     try:
         Path.cwd()
     except FileNotFoundError:
-        print(f"router {chosen}: the working directory was deleted; change to one that exists", file=sys.stderr)
+        what = f"router {chosen}: the working directory was deleted"
+        print(with_help(what, "change to one that exists"), file=sys.stderr)
         return BAD_TABLE
     try:
         code: int = module.run(args)
@@ -208,11 +241,22 @@ def _run(arguments: Sequence[str]) -> int:
         print_findings(error.diagnostics, sys.stderr)
         return BAD_TABLE
     except RouterError as error:
-        print(f"router {chosen}: {error}", file=sys.stderr)
+        what, hint = (error.what, error.hint) if isinstance(error, OperatorError) else (str(error), "")
+        print(with_help(f"router {chosen}: {what}", hint), file=sys.stderr)
         if isinstance(error, UsageError):
             return BAD_USAGE
         return NETWORK_FAULT if isinstance(error, TransportError) else BAD_TABLE
     return code
+
+
+def _mistake(arguments: Sequence[str]) -> str:
+    """What is wrong with the first word, and what to do about it; "" if it is a verb, or an option without one."""
+    first = arguments[0] if arguments else "--help"
+    if first.startswith("-"):
+        if first.partition("=")[0] in {"-h", "--help", "--version", "--completion"}:
+            return ""
+        return with_help(f"'{first}' is no option of the router itself", "options go after the verb: router VERB ...")
+    return "" if first in VERBS else with_help(f"there is no verb '{first}'", _suggestion(first, VERBS))
 
 
 def _add_verbs(subparsers: Subparsers, chosen: str | None) -> ModuleType | None:
@@ -239,9 +283,12 @@ def _complete(parser: argparse.ArgumentParser, subparsers: Subparsers) -> NoRetu
 def _refuse(parser: argparse.ArgumentParser, unknown: Sequence[str]) -> NoReturn:
     """Say which words a verb does not take, and which option the first of them may stand for."""
     option = unknown[0].partition("=")[0]
-    close = nearest(option, re.findall(r"--\w[\w-]*", parser.format_help())) if option.startswith("-") else None
+    options = re.findall(r"--\w[\w-]*", parser.format_help())
+    close = nearest(option, options) if option.startswith("-") else None
+    if option.endswith((".yaml", ".yml")) and "--table" in options:
+        parser.error(with_help(f"unrecognized arguments: {' '.join(unknown)}", f"the table is named by -t {option}"))
     hint = f"did you mean '{close}'?" if close else f"'{parser.prog} --help' lists what it takes"
-    parser.error(f"unrecognized arguments: {' '.join(unknown)}; {hint}")
+    parser.error(with_help(f"unrecognized arguments: {' '.join(unknown)}", hint))
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:

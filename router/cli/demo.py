@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Iterator
@@ -26,23 +27,26 @@ from router.log import configure_log
 from router.tools.simulator import Simulator
 
 _DESCRIPTION = """Play the rover's boards and its basestation, and route between them and ROS 2, until Ctrl-C.
-Nothing leaves this computer. The first lines say where to look with a browser or Foxglove; 'ros2 topic list' and the
-other verbs look at it as well. What is recorded is in ./recordings. Where the rover's ROS messages are not installed,
-it is the table of 'router init'."""
+Nothing leaves this computer. The first lines say where to look with a browser or Foxglove, and the command that shows
+it in another terminal; 'ros2 topic list' and the other verbs look at it as well. What is recorded is in ./recordings.
+Where the rover's ROS messages are not installed, it is the table of 'router init'."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    add_verb(subparsers, "demo", _DESCRIPTION, "router demo", "router top -t routes/sim.yaml    # in another terminal")
+    add_verb(subparsers, "demo", _DESCRIPTION, "router demo")
 
 
 def run(args: argparse.Namespace) -> int:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("RECORDINGS", str(Path.cwd() / "recordings"))  # not in the installation, where the table is
     configure_log(coloured=is_coloured(sys.stderr))
-    checked = check_table(_table())
+    table = _table()
+    checked = check_table(table)
     print_findings(checked.diagnostics, sys.stderr)
     if checked.program is None:
         return BAD_TABLE
+    if sys.stderr.isatty():
+        say(f"in another terminal: router top -t {shlex.quote(str(table))}; Ctrl-C ends this")
     with _simulated(checked.program):
         route(checked.program, [], os.environ)
     return OK

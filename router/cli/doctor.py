@@ -8,7 +8,7 @@ import os
 import sys
 from collections import Counter
 
-from router.cli import OK, Subparsers, add_verb
+from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import is_coloured, plural
 from router.cli.tool_options import add_table, table_path
 from router.tools.doctor_checks import CheckResult, Grade
@@ -16,7 +16,8 @@ from router.tools.doctor_checks import CheckResult, Grade
 SICK = 1
 
 _DESCRIPTION = f"""Look at the table, ROS, ports, buffers, clock, endpoints and the running router, if there is one.
-Exit code: {OK} nothing keeps it from working, {SICK} something does. What works less well is a warning only."""
+Exit code: {OK} nothing keeps it from working, {SICK} something does, {BAD_TABLE} the table cannot be read. What works
+less well is a warning only."""
 
 _STYLES = {Grade.FINE: "\x1b[32m", Grade.WARNING: "\x1b[33m", Grade.PROBLEM: "\x1b[31m"}
 _RESET = "\x1b[0m"
@@ -34,13 +35,16 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     from router.tools.doctor import before_start, examine
 
+    path = table_path(args)
     grades: Counter[Grade] = Counter()
-    for result in (before_start if args.pre_start else examine)(table_path(args), os.environ):
+    for result in (before_start if args.pre_start else examine)(path, os.environ):
         grades[result.grade] += 1
         if result.grade is Grade.PROBLEM or not args.pre_start:
             print(_json(result) if args.json else shown(result, coloured=is_coloured(sys.stdout)), flush=True)
     if not args.pre_start and not args.json:
         print(_summary(grades))
+    if not os.access(path, os.R_OK):
+        return BAD_TABLE
     return SICK if grades[Grade.PROBLEM] else OK
 
 

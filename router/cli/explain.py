@@ -70,7 +70,7 @@ def _explain(args: argparse.Namespace) -> int:
     known = [*routes, *gateways, *ignored]
     for name in args.names:
         if name not in known:
-            raise UsageError(f"{path} has no route or gateway '{name}'; {did_you_mean(name, known)}")
+            raise UsageError(f"{path} has no route or gateway '{name}'", did_you_mean(name, known))
     executed_by = _executors(checked)
     topics = seen_topics(checked.table, args.seconds or _LIVE) if args.live else known_topics(checked.table)
     for name in args.names or known:

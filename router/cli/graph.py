@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import print_findings
-from router.cli.tool_options import add_table, table_path
+from router.cli.findings import plural, print_findings
+from router.cli.tool_options import add_table, say, table_path
 from router.errors import UsageError
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
         args.output.write_text(_drawn(checked.table, args.output.suffix), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{args.output} cannot be written: {error.strerror}") from error
+    say(f"{args.output}: {plural(len(checked.table.routes), 'route')}")
     return OK
 
 

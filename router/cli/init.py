@@ -43,9 +43,10 @@ def run(args: argparse.Namespace) -> int:
         for part, target in targets.items():
             source = asset(part) if args.rover else FIRST_TABLE / part
             shutil.copytree(source, target, copy_function=shutil.copyfile)  # drops read-only modes
-            print(f"{shown_path(target)}: {parts[part]}")
     except OSError as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(f"{args.folder} cannot be written: {error.strerror or error}") from error
+    for part, target in targets.items():
+        print(f"{shown_path(target)}: {parts[part]}")
     print(_next_steps(args.folder, is_rover=args.rover))
     return OK
 

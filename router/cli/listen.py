@@ -9,13 +9,22 @@ import argparse
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import Subparsers, add_verb
-from router.cli.tool_options import add_count, add_for, add_wire_options, load_wire, print_batches, say
+from router.cli.tool_options import (
+    add_count,
+    add_for,
+    add_wire_options,
+    load_wire,
+    print_batches,
+    say,
+    until_interrupted,
+)
 from router.errors import StartError, TransportError, UsageError
 
 if TYPE_CHECKING:
@@ -82,8 +91,11 @@ def run(args: argparse.Namespace) -> int:
         _listen_to_port(rest, args)
     elif scheme == "topic":
         _listen_to_topic(rest, args)
-    else:
+    elif scheme in GATEWAYS:
         _listen_to_gateway(args)
+    else:
+        places = ", ".join(f"{each}://" for each in (*GATEWAYS, "envelope", "topic"))
+        raise UsageError(f"there are no places {scheme}://", f"there are {places}")
     return 0
 
 
@@ -101,15 +113,14 @@ def _listen_to_gateway(args: argparse.Namespace) -> None:
         say(f"listening: {source.place}; Ctrl-C ends it")
         rest = args.count
         try:
-            for heard in client.hear(source, args.seconds or math.inf):
-                record(heard)
-                show(heard)
-                if rest and isinstance(heard, Message):
-                    rest -= 1
-                    if not rest:
-                        break
-        except KeyboardInterrupt:
-            pass
+            with until_interrupted():
+                for heard in client.hear(source, args.seconds or math.inf):
+                    record(heard)
+                    show(heard)
+                    if rest and isinstance(heard, Message):
+                        rest -= 1
+                        if not rest:
+                            break
         finally:
             say(str(client.tally(source)))
 
@@ -118,36 +129,39 @@ def _listen_to_port(place: str, args: argparse.Namespace) -> None:
     from router.tools import udp
     from router.tools.tap import listen
 
-    wire, table = load_wire(args)
+    wire, table = load_wire(args, place)
     with udp.open_udp(udp.listening(place, table), place) as receiver:
         host, port = receiver.getsockname()
         say(f"listening on {host}:{port}; Ctrl-C ends it")
-        with suppress(KeyboardInterrupt):
+        with until_interrupted():
             print_batches(listen(receiver, wire, udp.peer_names(table)), args)
 
 
 def _listen_to_topic(topic: str, args: argparse.Namespace) -> None:
+    if not topic:
+        raise UsageError("topic:// names no topic", "write topic://imu_data")
     from router.ros.environment import check_environment, ros_remedy
 
     try:
         check_environment(os.environ)
         from router.ros.topics import TopicListener
     except StartError as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(*error.args) from error
     except ImportError as error:
-        raise UsageError(f"a topic needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
+        raise UsageError(f"a topic needs ROS 2, which is not installed here ({error})", ros_remedy()) from error
     from router.tools.tap import listen_to_topic
 
-    with suppress(KeyboardInterrupt):
+    begun = time.monotonic()
+    with until_interrupted():
         if args.type is None:
             say(f"waiting for a publisher of {topic}; Ctrl-C ends it")
         try:
-            listener = TopicListener(topic, args.type)
+            listener = TopicListener(topic, args.type, patience=args.seconds or math.inf)
         except StartError as error:
-            raise UsageError(str(error)) from error
+            raise UsageError(*error.args) from error
         with closing(listener):
             say(f"listening to {topic} of {listener.type_name}; Ctrl-C ends it")
-            print_batches(listen_to_topic(listener), args)
+            print_batches(listen_to_topic(listener), args, time.monotonic() - begun)
 
 
 @contextmanager
@@ -159,7 +173,7 @@ def _recorder(path: Path | None) -> Iterator[Callable[[Heard], None]]:
         yield lambda _: None
         return
     if path == Path("-"):
-        raise UsageError("--record takes a file; --json prints the same")
+        raise UsageError("--record takes a file", "--json prints the same")
     try:
         file = path.open("ab", buffering=0)
     except OSError as error:

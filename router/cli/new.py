@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
 from router.cli.findings import print_findings
-from router.cli.tool_options import add_table, table_path
+from router.cli.tool_options import add_table, integer, table_path
 
 if TYPE_CHECKING:
     from router.compiler import Checked
@@ -33,7 +33,7 @@ _EXAMPLES = (
 def add_parser(subparsers: Subparsers) -> None:
     parser = add_verb(subparsers, "new", _DESCRIPTION, *_EXAMPLES)
     parser.add_argument("name", metavar="NAME", help="of the message: its board, then what it is, as one word each")
-    parser.add_argument("--number", type=int, required=True, metavar="N", help="in the envelope, never used before")
+    parser.add_argument("--number", type=integer, required=True, metavar="N", help="in the envelope, never used before")
     parser.add_argument(
         "--board", required=True, metavar="BOARD", help="endpoint that sends it, `_board` may be missing"
     )
@@ -42,14 +42,9 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from router.assets import asset, is_installed
-    from router.errors import UsageError
     from router.tools.new_message import new_message
     from router.tools.new_message_files import Written, changes, locked
 
-    if is_installed(asset("schemas")):
-        what = "this router is installed, and its ROS messages with it; use the one of a checkout"
-        raise UsageError(f"{what}, or write by hand what docs/adding-a-message.md lists")
     path = table_path(args)
     before = _check(path)
     errors = [finding for checked in before for finding in checked.diagnostics if checked.has_errors]
@@ -58,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
         print("router new: repair that first; nothing was written", file=sys.stderr)
         return BAD_TABLE
     site = _site(before[0])
+    _check_schemas(path)
     message = new_message(args.name, args.number, args.board, args.fields, site)
     planned = changes(message, site, [checked.table for checked in before[1:] if checked.table is not None])
     written = Written(planned.texts)
@@ -88,6 +84,19 @@ def _check(table: Path) -> list[Checked]:
         return [checked]
     beside = [path for path in find_tables([table.parent]) if path.resolve() != table.resolve()]
     return [checked, *(check_table(path, definitions=definitions) for path in beside)]
+
+
+def _check_schemas(table: Path) -> None:
+    """Raises UsageError unless the router's ROS messages are those beside the folder of the table."""
+    from router.assets import asset, is_installed
+    from router.errors import UsageError, shown_path
+
+    schemas = asset("schemas")
+    if is_installed(schemas) or table.resolve().parent.parent != schemas.resolve().parent:
+        what = f"the ROS messages of this router ({shown_path(schemas)}) do not belong to {shown_path(table)}"
+        raise UsageError(
+            what, "use the router of that table's checkout, or write by hand what docs/adding-a-message.md lists"
+        )
 
 
 def _site(checked: Checked) -> Site:

@@ -11,7 +11,7 @@ from time import monotonic
 from typing import TYPE_CHECKING
 
 from router.cli import OK, Subparsers, add_verb
-from router.cli.tool_options import add_for, add_router_options, progress, running_url, table_path
+from router.cli.tool_options import add_for, add_router_options, progress, running_url, table_path, until_interrupted
 from router.errors import UsageError
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.last and (args.output or args.seconds):
         where = "the directory of the table's 'record', on the router's computer"
-        raise UsageError(f"--last writes to {where}; leave -o and --for")
+        raise UsageError(f"--last writes to {where}", "leave -o and --for")
     return _save_last(args) if args.last else _record(args)
 
 
@@ -73,15 +73,13 @@ def _record(args: argparse.Namespace) -> int:
         )
         print(f"recording the router at {url} to {recording.path}; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
-            with progress(_columns) as update:
+            with until_interrupted(), progress(_columns) as update:
                 until = monotonic() + (args.seconds or math.inf)
                 for batch in batches:  # there is one each second, at least
                     recording.take(batch)
                     update(description=_summary(recording))
                     if monotonic() >= until:
                         break
-        except KeyboardInterrupt:
-            pass
         finally:
             recording.close()
             print(_summary(recording))

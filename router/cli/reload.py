@@ -8,6 +8,7 @@ import sys
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.tool_options import add_router_options, running_url
+from router.errors import TransportError
 
 PATIENCE = 60.0
 """Seconds; a large table takes one to compile where there is much traffic."""
@@ -29,7 +30,12 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     from router.tools.running_router import post
 
-    answer = post(running_url(args), "/-/reload", PATIENCE)
+    try:
+        answer = post(running_url(args), "/-/reload", PATIENCE)
+    except TransportError as error:
+        if args.json:
+            print(json.dumps({"ok": False, "text": error.what, "findings": []}))
+        raise
     if args.json:
         print(json.dumps(answer.body))
         return OK if answer.ok else BAD_TABLE

@@ -9,8 +9,8 @@ from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.cli import OK, Subparsers, add_verb
-from router.cli.tool_options import add_table, progress, speed, table_if_any, table_path
+from router.cli import OK, Subparsers, add_verb, with_help
+from router.cli.tool_options import add_table, progress, speed, table_if_any, table_path, until_interrupted
 from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
@@ -69,13 +69,10 @@ def _send(args: argparse.Namespace, recording: Recording) -> int:
     to = udp.destination(args.to, table) if args.to else None
     origin = udp.origin(args.origin, table) if args.origin else None
     replayer = Replayer(table, to, origin)
-    try:
-        with closing(replayer), _progress(recording, "sending") as update:
-            for found in on_time(recording, args.speed or 1.0):
-                replayer.send(found)
-                update(completed=recording.position)
-    except KeyboardInterrupt:
-        pass
+    with until_interrupted(), closing(replayer), _progress(recording, "sending") as update:
+        for found in on_time(recording, args.speed or 1.0):
+            replayer.send(found)
+            update(completed=recording.position)
     print(f"sent {replayer.resent.datagrams} datagrams")
     return _advise(replayer.resent)
 
@@ -85,11 +82,9 @@ def _advise(resent: Resent) -> int:
     if resent.elsewhere:
         listed = ", ".join(f"{name} ({host})" for name, host in sorted(resent.elsewhere.items())[:5])
         more = f" and {len(resent.elsewhere) - 5} more" if len(resent.elsewhere) > 5 else ""
-        print(
-            f"router replay: this computer lacks the addresses of {listed}{more}: sent from its own, which a table "
-            "takes for strangers; -t TABLE has other addresses for them, or --from PLACE",
-            file=sys.stderr,
-        )
+        what = f"router replay: this computer lacks the addresses of {listed}{more}: sent from its own, which a table "
+        hint = "-t TABLE has other addresses for them, or --from PLACE"
+        print(with_help(f"{what}takes for strangers", hint), file=sys.stderr)
     if resent.refused:
         print("router replay: nobody listened for some of them", file=sys.stderr)
     return 1 if resent.refused else OK

@@ -75,7 +75,7 @@ def _table(args: argparse.Namespace, parameter: str | None) -> Path:
         return table_path(args)
     typed: Path | None = args.subject or args.table
     if typed is not None and table_path(args).resolve() != Path(parameter).resolve():
-        raise UsageError(f"TABLE is {typed}, {_ROUTES_PATH} is {parameter}; name one table")
+        raise UsageError(f"TABLE is {typed}, {_ROUTES_PATH} is {parameter}", "name one table")
     return typed or Path(parameter)
 
 

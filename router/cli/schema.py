@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from router.assets import asset, is_installed
+from router.assets import is_installed
 from router.cli import BAD_TABLE, OK, VERBS, Subparsers, add_verb
 from router.cli.findings import plural, print_findings
-from router.cli.tool_options import add_table, table_if_any
+from router.cli.tool_options import add_table, table_path
 from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, shown_path
 from router.table import load_table
 from router.table.model import EnvelopeSettings
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     path = lock_path(settings.protos, settings.lock)
     if is_installed(path):
         what = f"{path} belongs to the installed router, and is lost when that is upgraded"
-        raise UsageError(f"{what}; copy the protos with `router init --rover DIR`, and name yours: --protos protos")
+        raise UsageError(what, "copy the protos with `router init --rover DIR`, and name yours: --protos protos")
     settings = _with_names(settings, args, read_lock(path))
     schema = load_protos(settings.protos, settings.message, settings.lock)
     lock = LockComparison(schema, find_envelope(schema, settings.oneof))
@@ -85,23 +85,22 @@ def run(args: argparse.Namespace) -> int:
 def _settings(args: argparse.Namespace) -> EnvelopeSettings:
     """Where the protos and the lock are. Raises TableError for a broken table."""
     if args.protos and args.table:
-        raise UsageError("--protos and --table both say where the messages are; give one")
-    settings = None if args.protos else _of_table(table_if_any(args))
-    if settings is None:
-        root = args.protos or asset("protos")
-        span = SourceSpan(shown_path(root))
-        settings = EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))
+        raise UsageError("--protos and --table both say where the messages are", "give one")
+    settings = _of_folder(args.protos) if args.protos else _of_table(table_path(args))
     return replace(settings, lock=Located(args.lock.absolute(), settings.protos.span)) if args.lock else settings
 
 
-def _of_table(path: Path | None) -> EnvelopeSettings | None:
-    if path is None:
-        return None
+def _of_folder(root: Path) -> EnvelopeSettings:
+    span = SourceSpan(shown_path(root))
+    return EnvelopeSettings(Located(root.absolute(), span), Located("", span), Located("", span))
+
+
+def _of_table(path: Path) -> EnvelopeSettings:
     table, findings = load_table(path)
     if table is None:
         raise TableError(findings)
     if table.envelope is None:
-        raise UsageError(f"{path} has no 'envelope'; name the folder of the protos: --protos protos")
+        raise UsageError(f"{path} has no 'envelope'", "name the folder of the protos: --protos protos")
     return table.envelope
 
 
@@ -120,7 +119,7 @@ def _refuse_unknown(names: Sequence[str], found: Sequence[Conflict]) -> None:
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known) or "nothing conflicts with the lock"
-            raise UsageError(f"'{name}' has nothing to accept; {hint}; nothing was written")
+            raise UsageError(f"'{name}' has nothing to accept; nothing was written", hint)
 
 
 def _summary(old: Lock | None, new: Lock) -> str:

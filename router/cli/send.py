@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 from typing import TYPE_CHECKING
 
-from router.cli import Subparsers, add_verb
-from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, whole
+from router.cli import Subparsers, add_verb, with_help
+from router.cli.tool_options import add_count, add_wire_options, hertz, load_wire, until_interrupted, whole
 
 if TYPE_CHECKING:
     from router.table.addresses import Address
@@ -43,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.udp import Sent, send
     from router.values import payload
 
-    wire, table = load_wire(args)
+    wire, table = load_wire(args, args.to)
     case = wire.case(args.case)
     exact = wire.encode(case, payload(case, args.fields))
     data = framed(exact, args.trim, args.pad)
@@ -52,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     count = args.count if args.count is not None else None if args.rate else 1
     sent = Sent()
     # Without --count it ends with Ctrl-C, and then reports what was sent.
-    with udp.open_udp(origin, "--from") as sender, contextlib.suppress(KeyboardInterrupt):
+    with udp.open_udp(origin, "--from") as sender, until_interrupted():
         send(sender, to, data, count, args.rate, sent)
     print(_summary(args.case, data, to, sent))
     return _advise(args, table, to, sent)
@@ -67,16 +66,15 @@ def _summary(case: str, data: bytes, to: Address, sent: Sent) -> str:
 
 def _advise(args: argparse.Namespace, table: RouteTable | None, to: Address, sent: Sent) -> int:
     """Say on stderr why nothing may have come of it. The exit code: 1 when the other side refused."""
+    from router.net.udp import nobody_listens
+
     if sent.refused:
-        print(f"router send: nobody listens on {to}", file=sys.stderr)
+        print(f"router send: {nobody_listens(to)}", file=sys.stderr)
         return 1
     if table is None or args.origin or args.to not in table.listeners:
         return 0
     sources = [name.value for route in table.routes if route.case.value == args.case for name in route.sources]
     if named := [name for name in sources if name in table.endpoints]:
-        print(
-            f"router send: the table takes {args.case} from {' or '.join(named)} only; "
-            f"add --from {named[0]} unless this machine has its address",
-            file=sys.stderr,
-        )
+        what = f"router send: the table takes {args.case} from {' or '.join(named)} only"
+        print(with_help(what, f"add --from {named[0]} unless this machine has its address"), file=sys.stderr)
     return 0

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from router.cli import BAD_USAGE, NETWORK_FAULT, OK, Subparsers, add_verb
+from router.cli import BAD_TABLE, BAD_USAGE, NETWORK_FAULT, OK, Subparsers, add_verb
 from router.cli.tool_options import add_router_options, running_url
 from router.errors import TransportError
 
@@ -20,11 +20,14 @@ _DESCRIPTION = f"""Say in one line whether the router of a table runs, and what 
 thread, a reload that failed, boards that are silent, deadmen that send in place of commands.
 
 Exit code: {OK} it runs and is healthy, {NETWORK_FAULT} none runs, {DEGRADED} it runs and something is wrong,
-{BAD_USAGE} wrong usage. 'router doctor' says what to do about it."""
+{BAD_USAGE} wrong usage, {BAD_TABLE} a wrong table. 'router doctor' says what to do about it."""
+
+
+_UNTIL_IT_RUNS = f"until router status || [ $? -ne {NETWORK_FAULT} ]; do sleep 1; done    # until it runs"
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    examples = ("router status", "router status --json", "until router status; do sleep 1; done")
+    examples = ("router status", "router status --json", _UNTIL_IT_RUNS)
     parser = add_verb(subparsers, "status", _DESCRIPTION, *examples)
     add_router_options(parser)
     parser.add_argument("--json", action="store_true", help="a JSON object: state, url, problems, received")

@@ -14,8 +14,8 @@ from router.cli.tool_options import (
     print_batches,
     running_url,
     say,
+    until_interrupted,
 )
-from router.errors import UsageError
 
 _DESCRIPTION = """Print what a running router receives, before it routes it: the fields that are not default. The
 router is asked where the table's 'http.address' says, on this computer; it does not wait for this terminal, and
@@ -49,21 +49,18 @@ def run(args: argparse.Namespace) -> int:
     from router.tools.tap import Condition, RunningTap
     from router.tools.udp import peer_names
 
+    url = running_url(args)
     wire, table = load_wire(args)
     cases = [wire.case(name) for name in args.cases]
     condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
-    if args.url is None and table is None:
-        raise UsageError("-t TABLE or --url says which running router")
-    url = running_url(args)
     taken = RunningTap(wire, peer_names(table), args.cases, condition)
     wanted = args.cases or (sorted(condition.cases) if condition else [])
     # The router goes before whatever runs on its computer to watch it.
     with background_threads(), tap(url, wanted, args.sources) as batches:
         say(f"tapping the router at {url}; Ctrl-C ends it")
         try:
-            print_batches(taken.take(batches), args)
-        except KeyboardInterrupt:
-            pass
+            with until_interrupted():
+                print_batches(taken.take(batches), args)
         finally:
             if taken.missed:
                 say(f"{taken.missed} datagrams were too many for this terminal; the router routed them all the same")

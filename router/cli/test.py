@@ -14,6 +14,7 @@ from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import as_data as finding_data
 from router.cli.findings import excerpt, github_escaped, is_coloured, plural, print_findings, visible
 from router.cli.tool_options import add_styles, add_tables, table_paths
+from router.compiler import check_table
 from router.compiler.lookup import Definitions
 from router.errors import Diagnostic, SourceSpan, TableError, UsageError, shown_path
 from router.rehearsal.coverage import Coverage
@@ -65,11 +66,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tests_of(path: Path) -> Path:
-    """The test file beside a table; any other path as it is. Raises UsageError for a table without one."""
+    """The test file beside a table; any other path as it is. Raises UsageError for a good table without one."""
     if not path.is_file() or path.name.endswith(ENDINGS):
         return path
     tests = path.with_name(f"{path.stem}.test{path.suffix}")
     if not tests.exists():
+        if (checked := check_table(path)).has_errors:
+            raise TableError(checked.diagnostics)
         raise UsageError(f"{shown_path(path)} has no tests: there is no {shown_path(tests)}")
     return tests
 

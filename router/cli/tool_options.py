@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 import re
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from router.assets import asset
-from router.cli import DEFAULT_TABLE
+from router.cli import DEFAULT_TABLE, with_help
 from router.errors import TableError, UsageError
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def table_path(args: argparse.Namespace) -> Path:
         return named
     if not DEFAULT_TABLE.exists():
         how = f"name a table by -t TABLE or {TABLE_VARIABLE}, or write a first one: `router init DIR`"
-        raise UsageError(f"there is no {DEFAULT_TABLE} here; {how}")
+        raise UsageError(f"there is no {DEFAULT_TABLE} here", how)
     return DEFAULT_TABLE
 
 
@@ -51,7 +52,7 @@ def named_table(args: argparse.Namespace) -> Path | None:
     subject: Path | None = getattr(args, "subject", None)
     option: Path | None = args.table
     if subject is not None and option is not None and subject.resolve() != option.resolve():
-        raise UsageError(f"the table is {subject} or, by --table, {option}; name one")
+        raise UsageError(f"the table is {subject} or, by --table, {option}", "name one")
     of_environment = os.environ.get(TABLE_VARIABLE)
     return subject or option or (Path(of_environment) if of_environment else None)
 
@@ -71,7 +72,7 @@ def table_paths(args: argparse.Namespace) -> list[Path]:
     """What a verb with `add_tables` is about. Raises UsageError."""
     paths: list[Path] = args.paths
     if paths and args.table is not None and {path.resolve() for path in paths} != {args.table.resolve()}:
-        raise UsageError(f"the table is {paths[0]} or, by --table, {args.table}; name one")
+        raise UsageError(f"the table is {paths[0]} or, by --table, {args.table}", "name one")
     return paths or [table_path(args)]
 
 
@@ -88,14 +89,18 @@ def add_wire_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--protos", type=Path, metavar="DIR", help="folder of .proto files, instead of a table")
 
 
-def load_wire(args: argparse.Namespace) -> tuple[Wire, RouteTable | None]:
-    """The messages, of a table if there is one. Raises TableError and UsageError."""
+def load_wire(args: argparse.Namespace, place: str = "") -> tuple[Wire, RouteTable | None]:
+    """The messages, of a table if there is one, and there has to be one if `place` is a name.
+
+    Raises TableError and UsageError.
+    """
     from router.engine.wire import wire_of_protos, wire_of_table
     from router.table import read_table
 
     if args.protos is not None and args.table is not None:
-        raise UsageError("--protos and --table both say where the messages are; give one")
-    if args.protos is None and (path := table_if_any(args)) is not None:
+        raise UsageError("--protos and --table both say where the messages are", "give one")
+    find = table_path if place.isidentifier() and place != "localhost" else table_if_any
+    if args.protos is None and (path := find(args)) is not None:
         table = read_table(path)
         return wire_of_table(table), table
     return wire_of_protos(args.protos or asset("protos")), None
@@ -118,7 +123,7 @@ def running_url(args: argparse.Namespace) -> str:
     from router.tools.running_router import url_of
 
     if args.url:
-        return str(args.url)
+        return str(args.url).strip()
     table, findings = load_table(table_path(args))
     if table is None:
         raise TableError(findings)
@@ -134,12 +139,26 @@ def add_count(parser: argparse.ArgumentParser, about: str = "end after N message
     parser.add_argument("--count", type=whole, metavar="N", help=about)
 
 
-def print_batches(batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace) -> None:
-    """Print until --count or --for is reached; while nothing comes, the batches are empty.
+@contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Go on until Ctrl-C or SIGTERM, which end what is inside, and are no error."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def print_batches(
+    batches: Iterable[Sequence[TappedDatagram | TappedMessage]], args: argparse.Namespace, waited: float = 0.0
+) -> None:
+    """Print until --count or --for is reached, of which `waited` seconds are over; empty batches come meanwhile.
 
     A batch is written at once: a system call for each line would cost more than the line.
     """
-    left, until = args.count, time.monotonic() + (args.seconds or math.inf)
+    left, until = args.count, time.monotonic() + (args.seconds or math.inf) - waited
     for batch in batches:
         if shown := batch[:left]:
             print("\n".join(each.json(args.hex) if args.json else each.line(args.hex) for each in shown), flush=True)
@@ -151,31 +170,47 @@ def seconds(text: str) -> float:
     """`10s`, `500ms` as seconds."""
     from router.table.units import parse_duration
 
-    return _quantity(parse_duration, text) / 1e9
+    return _quantity(parse_duration, text, "s") / 1e9
 
 
 def hertz(text: str) -> float:
     """`20Hz` as Hz."""
     from router.table.units import parse_rate
 
-    return _quantity(parse_rate, text)
+    return _quantity(parse_rate, text, "Hz")
+
+
+def factor(text: str) -> float:
+    """`2x` as a factor."""
+    return _quantity(_parse_factor, text, "x")
 
 
 def speed(text: str) -> float:
     """`2x` as a factor; `max` is infinite."""
-    if text == "max":
-        return math.inf
+    return math.inf if text == "max" else factor(text)
+
+
+def _parse_factor(text: str) -> float:
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)x", text)
     if found is None or not 0 < float(found[1]) <= 1e6:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a speed such as 2x or 0.5x, or max")
+        raise ValueError(f"'{text}' is not a speed such as 2x or 0.5x")
     return float(found[1])
 
 
-def _quantity(parse: Callable[[str], float], text: str) -> float:
+_NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
+
+
+def _quantity(parse: Callable[[str], float], text: str, unit: str) -> float:
     try:
         return parse(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+        what, _, hint = str(error).partition("; ")
+        number = _NUMBER.match(text)
+        if number and float(number[0]) <= 0:
+            what, hint = f"'{text}' is not above zero", ""
+        elif number and number[0] == text:
+            what, hint = f"'{text}' has no unit", f"did you mean '{text}{unit}'?"
+        raise argparse.ArgumentTypeError(with_help(what, hint)) from error
 
 
 def say(line: str) -> None:
@@ -183,8 +218,16 @@ def say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def integer(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number") from None
+
+
 def whole(text: str) -> int:
-    value = int(text)
+    """An integer above zero."""
+    value = integer(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} is less than 1")
     return value

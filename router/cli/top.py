@@ -49,10 +49,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_json(url: str, order: Order, interval: float) -> None:
-    """The fields of `View`, with all rows. Times in seconds."""
+    """The fields of `View`, with all rows, times in seconds; where no router answers, those of `router status`."""
     from router.tools.top import ordered
 
-    seen = _look(url, interval)
+    try:
+        seen = _look(url, interval)
+    except TransportError as error:
+        print(json.dumps({"state": "down", "url": url, "problems": [str(error)]}))
+        raise
     print(json.dumps(asdict(seen) | {"routes": [asdict(row) for row in ordered(seen.routes, order)]}))
 
 
@@ -62,7 +66,9 @@ def _show_once(url: str, order: Order, interval: float) -> None:
     from router.tools.top_view import page
 
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
-    console.print(page(_look(url, interval), order))
+    with console.capture() as shown:  # rich ends the process where a pipe is closed, and `main` has a code for that
+        console.print(page(_look(url, interval), order))
+    print(shown.get(), end="")
 
 
 def _look(url: str, interval: float) -> View:

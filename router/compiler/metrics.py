@@ -104,7 +104,7 @@ DROP_REASONS: Mapping[str, str] = {
     "rate_limited": "more often than `max_rate`",
     "queue_full": "the endpoint's `bandwidth` was short, or a thread was behind, for longer than the queue lasts",
     "send_buffer_full": "the kernel's send buffer was full",
-    "send_error": "the network refused it; `Connection refused`: nobody listens there",
+    "send_error": "the network refused it, or nobody listens there",
     "publish_error": "the ROS middleware refused it",
     "incomplete": "a frame that was not complete when its time was up, or had no room",
     "loop": "it came from this router: stays 0, because tables with loops are refused",

@@ -35,7 +35,7 @@ class Wire:
         """Raises UsageError for a payload case that does not exist."""
         if name not in self.envelope.cases:
             hint = did_you_mean(name, self.envelope.cases)
-            raise UsageError(f"{self.envelope.name} has no payload case '{name}'; {hint}")
+            raise UsageError(f"{self.envelope.name} has no payload case '{name}'", hint)
         return self.envelope.cases[name]
 
     def encode(self, case: PayloadCase, payload: Message) -> bytes:

@@ -99,12 +99,12 @@ def _ask_interface(name: str, request: int) -> bytes | None:
     return bytes(_IFREQ.unpack(answer)[1])
 
 
-def port_taken(protocol: str, port: int) -> str:
+def port_taken(protocol: str, port: int) -> tuple[str, str]:
     """Return who holds a port, and the remedy, for the text of an error. `protocol` is udp or tcp."""
     process = _process(protocol, port)
     if process is not None and process.name == str(os.getpid()):
-        return f"the router itself (pid {process.name}) has the port; restart it, or choose another port"
-    return f"{_described(process)} has the port; stop it, or choose another port"
+        return f"the router itself (pid {process.name}) has the port", "restart it, or choose another port"
+    return f"{_described(process)} has the port", "stop it, or choose another port"
 
 
 def port_holder(protocol: str, port: int) -> str:

@@ -112,7 +112,7 @@ class Listener:
             self.arrived_at = arrivals(self.socket)
         except OSError as error:
             self.socket.close()
-            raise StartError(f"{settings.address.span}: {_bind_problem(settings, error)}") from error
+            raise _refused(settings, error) from error
         self.address = Address(*self.socket.getsockname())
         self._drops_at_close = 0
 
@@ -184,19 +184,27 @@ class Listener:
         )
 
 
-def _bind_problem(settings: model.Listener, error: OSError) -> str:
-    what = f"listener '{settings.name}' cannot use {settings.bound_to}"
-    if error.errno == errno.ENODEV:
-        return f"{what}: there is no such network interface now; `ip link` lists those that there are"
-    if error.errno == errno.EPERM:
-        return f"{what}: before Linux 5.7 an 'interface' needs a privilege; grant CAP_NET_RAW"
+def _refused(settings: model.Listener, error: OSError) -> StartError:
+    known = {
+        errno.ENODEV: ("there is no such network interface now", "`ip link` lists those that there are"),
+        errno.EPERM: ("before Linux 5.7 an 'interface' needs a privilege", "grant CAP_NET_RAW"),
+        errno.EADDRNOTAVAIL: (
+            "no network interface of this computer has that address",
+            "0.0.0.0 listens on all of them",
+        ),
+        errno.EACCES: ("ports below 1024 need a privilege", "choose a higher port, or grant CAP_NET_BIND_SERVICE"),
+    }
     if error.errno == errno.EADDRINUSE:
-        return f"{what}: {port_taken('udp', settings.address.value.port)}"
-    if error.errno == errno.EADDRNOTAVAIL:
-        return f"{what}: no network interface of this computer has that address; 0.0.0.0 listens on all of them"
-    if error.errno == errno.EACCES:
-        return f"{what}: ports below 1024 need a privilege; choose a higher port, or grant CAP_NET_BIND_SERVICE"
-    return f"{what}: {error.strerror}"
+        why, hint = port_taken("udp", settings.address.value.port)
+    else:
+        why, hint = known.get(error.errno or 0, (error.strerror or str(error), ""))
+    what = f"listener '{settings.name}' cannot use {settings.bound_to}"
+    return StartError(f"{settings.address.span}: {what}: {why}", hint)
+
+
+def nobody_listens(address: Address) -> str:
+    """What "Connection refused" means for UDP: the computer is there, and no process has the port."""
+    return f"nobody listens at {address}"
 
 
 class Sender:

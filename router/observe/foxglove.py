@@ -155,9 +155,8 @@ def _started(address: Located[Address], name: str, context: Context, listener: S
             why = f"{port_holder('tcp', port)} has the port"
         elif number == errno.EADDRNOTAVAIL:
             why = "no network interface of this computer has that address"
-        raise StartError(
-            f"{address.span}: Foxglove cannot be served at {address.value}: {why}; choose another foxglove.address"
-        ) from error
+        what = f"{address.span}: Foxglove cannot be served at {address.value}: {why}"
+        raise StartError(what, "choose another foxglove.address") from error
 
 
 class _DebugLog(logging.Handler):

@@ -92,9 +92,8 @@ class HttpServer:
         except OSError as error:
             in_use = error.errno == errno.EADDRINUSE
             why = f"{port_holder('tcp', address.port)} has the port" if in_use else error.strerror
-            raise StartError(
-                f"{span}: metrics cannot be served at {address}: {why}; choose another http.address"
-            ) from error
+            what = f"{span}: metrics cannot be served at {address}: {why}"
+            raise StartError(what, "choose another http.address") from error
         self._thread = threading.Thread(target=self._server.serve_forever, name="http", daemon=True)
         self._thread.start()
         self.address = Address(*self._server.socket.getsockname())

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Mapping
 
 from router.engine import Report
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, logger
+from router.net.udp import nobody_listens
+from router.table.addresses import Address
 
 
 class Reporter:
     """Logs the first report of a kind at once and then at most one line per 10 s, from a thread of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, addresses: Callable[[], Mapping[str, Address]]) -> None:
+        """`addresses` returns those of the running table's endpoints."""
+        self._addresses = addresses
         self._floods = FloodLog()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._summarise, name="log", daemon=True)  # the start may fail
@@ -39,7 +44,7 @@ class Reporter:
         traceback = report.error if report.reason in ("mapping_error", "non_finite") else None
         event = "message dropped" if report.kind == "drop" else "the deadman could not send"
         detail = {"detail": report.detail} if report.detail else {}
-        error = {"error": str(report.error)} if report.error is not None else {}
+        error = {"error": self._text(report.error, report.target)} if report.error is not None else {}
         self._floods.note(
             (report.kind, report.place, report.target, report.reason),
             logger.warning,
@@ -52,6 +57,10 @@ class Reporter:
             **error,
             **detail,
         )
+
+    def _text(self, error: BaseException, target: str) -> str:
+        address = self._addresses().get(target) if isinstance(error, ConnectionRefusedError) else None
+        return str(error) if address is None else nobody_listens(address)
 
     def failed(self, error: Exception) -> None:
         self._floods.note(

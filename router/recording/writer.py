@@ -178,7 +178,7 @@ def _encoded(records: Iterable[McapRecord]) -> bytes:
 def _cannot_record(settings: RecordSettings, why: str | None) -> StartError:
     there = settings.directory
     remedy = f"make it for this user (sudo install -d -o $USER {there}), or give `record` another 'directory'"
-    return StartError(f"{settings.span}: cannot record to {there}: {why}; {remedy}")
+    return StartError(f"{settings.span}: cannot record to {there}: {why}", remedy)
 
 
 class RecordingDirectory:

@@ -196,7 +196,7 @@ def opened_beside(
         if plan.label in now and now[plan.label].plan.type_name != plan.type_name:
             kept = now[plan.label].plan.type_name  # DDS has one type for a topic in a process
             what = f"topic '{plan.label}' is {kept} in the running router, and cannot become {plan.type_name}"
-            raise StartError(f"{spans[plan.label]}: {what} while it runs; restart it, or take another name")
+            raise StartError(f"{spans[plan.label]}: {what} while it runs", "restart it, or take another name")
         classes[plan.label] = checked_class(plan.type_name, plan.definitions, spans[plan.label])
     opened: list[Opened] = []
     with ExitStack() as opening:

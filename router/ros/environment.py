@@ -31,7 +31,7 @@ ADDRESS_SPACE = 1 << 30
 def check_environment(environ: Mapping[str, str]) -> None:
     """Raise StartError for what would end the process when ROS is imported or a node is opened."""
     for what, remedy in obstacles(environ):
-        raise StartError(f"{what}; {remedy}")
+        raise StartError(what, remedy)
 
 
 def obstacles(environ: Mapping[str, str], shm: Path = SHM) -> Iterator[tuple[str, str]]:

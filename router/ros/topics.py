@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import islice
-from time import sleep
+from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -15,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
-from router.errors import StartError
+from router.errors import StartError, TransportError
 from router.ros.node import RCL_ERRORS, close_node, open_node
 from router.ros.receiving import Arrivals, RawSubscription
 from router.ros.types import Definition, installed_class, installed_type, usable_class
@@ -89,7 +90,9 @@ class RosTopics:
         try:
             others = self._our_types(topic) - {type_name}
             if (renamed := self.resolved(topic)) != topic:
-                raise StartError(f"a remap of this router makes '{renamed}' of '{topic}'; remap relative names instead")
+                raise StartError(
+                    f"a remap of this router makes '{renamed}' of '{topic}'", "remap relative names instead"
+                )
             if others:  # DDS has one type for a topic in a process
                 raise StartError(f"topic '{topic}' is {others.pop()} in this router, and cannot be {type_name} too")
             return TopicTap(
@@ -149,18 +152,22 @@ def tap_qos(*, is_reliable: bool, keeps: bool, depth: int) -> QoSProfile:
 class TopicListener:
     """A subscription to `topic` with a node of its own. Raises StartError; to be closed.
 
-    Without a `type_name`, opening waits for the first publisher. If all publishers keep messages for late joiners,
-    `take` returns these as well.
+    Without a `type_name`, opening waits `patience` seconds for the first publisher, and raises TransportError if none
+    comes. If all publishers keep messages for late joiners, `take` returns these as well.
     """
 
-    def __init__(self, topic: str, type_name: str | None = None, ros_args: Sequence[str] = ()) -> None:
+    def __init__(
+        self, topic: str, type_name: str | None = None, ros_args: Sequence[str] = (), patience: float = math.inf
+    ) -> None:
         if type_name is not None and type_name.count("/") != 2:
-            raise StartError(f"'{type_name}' is no message type; they are written like std_msgs/msg/String")
+            raise StartError(f"'{type_name}' is no message type", "they are written like std_msgs/msg/String")
         with ExitStack() as opening:
             node = open_node("router_tap", ros_args=ros_args)
             opening.callback(close_node, node)
             try:
-                publishers = _publishers(node, topic, wait=type_name is None)
+                publishers = _publishers(node, topic, patience if type_name is None else 0.0)
+                if type_name is None and not publishers:
+                    raise TransportError(f"topic '{topic}' has no publisher")
                 self.type_name = type_name or publishers[0].type_name
                 self._message_class = installed_class(self.type_name)
                 self._subscription = RawSubscription(node, self._message_class, topic, _qos(publishers))
@@ -186,10 +193,10 @@ class TopicListener:
         self._open.close()
 
 
-def _publishers(node: Node, topic: str, *, wait: bool) -> Sequence[DiscoveredPublisher]:
-    """The publishers discovered so far; with `wait`, at least one."""
-    topics, name = RosTopics(node), node.resolve_topic_name(topic)
-    while not (publishers := topics.publishers(name)) and wait:
+def _publishers(node: Node, topic: str, patience: float) -> Sequence[DiscoveredPublisher]:
+    """The publishers discovered so far; waits up to `patience` seconds for the first one."""
+    topics, name, until = RosTopics(node), node.resolve_topic_name(topic), monotonic() + patience
+    while not (publishers := topics.publishers(name)) and monotonic() < until:
         sleep(_DISCOVERY_INTERVAL)
     return publishers
 

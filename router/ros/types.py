@@ -42,7 +42,7 @@ def checked_class(name: str, definitions: Mapping[str, Definition], span: Source
     try:
         return matching_class(name, definitions)
     except StartError as error:
-        raise StartError(f"{span}: {error}") from error
+        raise StartError(f"{span}: {error.what}", error.hint) from error
 
 
 def matching_class(name: str, definitions: Mapping[str, Definition]) -> Any:
@@ -68,13 +68,13 @@ def installed_class(name: str) -> Any:
         raise StartError(f"{name} is not installed (it is no name of a ROS message)")
     package, kind, short = parts.groups()
     if not _has_part(package, kind):
-        raise StartError(f"{name} is not installed (there is no Python package '{package}.{kind}'); {_remedy(name)}")
+        raise StartError(f"{name} is not installed (there is no Python package '{package}.{kind}')", _remedy(name))
     try:
         found = _member(importlib.import_module(f"{package}.{kind}"), short)
     except Exception as error:  # a package may raise anything
         raise StartError(f"{name} cannot be loaded: {error}") from error
     if not hasattr(found, "get_fields_and_field_types"):
-        raise StartError(f"{name} is not installed ('{package}.{kind}' has no such message); {_remedy(name)}")
+        raise StartError(f"{name} is not installed ('{package}.{kind}' has no such message)", _remedy(name))
     return found
 
 

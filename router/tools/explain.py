@@ -308,7 +308,7 @@ def seen_topics(table: RouteTable, seconds: float) -> Topics:
         from router.ros.node import close_node, open_node
         from router.ros.topics import RosTopics
     except ImportError as error:
-        raise StartError(f"--live needs ROS 2, which is not installed here ({error}); {ros_remedy()}") from error
+        raise StartError(f"--live needs ROS 2, which is not installed here ({error})", ros_remedy()) from error
     node = open_node("router_explain")
     try:
         sleep(seconds)

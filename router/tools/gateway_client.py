@@ -115,6 +115,6 @@ def topic_filter(globs: Sequence[str]) -> Callable[[str], bool]:
     """A predicate: whether any glob matches a topic. Without globs each topic matches. Raises UsageError."""
     patterns = [TopicPattern(glob, is_regex=False, span=_COMMAND_LINE) for glob in globs]
     for problem in filter(None, map(pattern_problem, patterns)):
-        raise UsageError(f"--topic: {problem.what}; {problem.hint}")
+        raise UsageError(f"--topic: {problem.what}", problem.hint)
     matchers = [matcher(pattern) for pattern in patterns]
     return lambda topic: not matchers or any(matches(topic) for matches in matchers)

@@ -330,7 +330,7 @@ def _zenoh(text: str) -> ZenohSettings:
     options = parse_qs(query, keep_blank_values=True)
     known = ("mode", "connect", "listen")
     if unknown := [name for name in options if name not in known]:
-        raise UsageError(f"zenoh has no option '{unknown[0]}'; {did_you_mean(unknown[0], known)}")
+        raise UsageError(f"zenoh has no option '{unknown[0]}'", did_you_mean(unknown[0], known))
     return ZenohSettings(
         key=Located(key, _SPAN),
         mode=options.get("mode", ["peer"])[-1],

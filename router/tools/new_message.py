@@ -128,7 +128,7 @@ def new_message(name: str, number: int, board: str, fields: Sequence[str], site:
     message = NewMessage(name, number, endpoint.name, case, asked)
     for path in (site.schema.root / site.new_file(message), site.messages / f"{name}.msg"):
         if path.exists():
-            raise UsageError(f"there is a file {shown_path(path)} already; take another name")
+            raise UsageError(f"there is a file {shown_path(path)} already", "take another name")
     return message
 
 
@@ -164,12 +164,12 @@ def _usual_fields(prefix: str, site: Site) -> tuple[NewField, ...]:
 def _field(text: str, comment: str, site: Site) -> NewField:
     name, colon, type_ = text.partition(":")
     if not colon:
-        raise UsageError(f"'{text}' is no field; write name:type, as in dose_rate:float")
+        raise UsageError(f"'{text}' is no field", "write name:type, as in dose_rate:float")
     if not _FIELD_NAME.fullmatch(name) or keyword.iskeyword(name):
-        raise UsageError(f"'{name}' is no name of a field; write it as dose_rate")
+        raise UsageError(f"'{name}' is no name of a field", "write it as dose_rate")
     _check_word(name, "take another name for the field")
     if surprise(name) or resolve(name) != name:  # in tables and tests names stand without quotation marks
-        raise UsageError(f"'{name}' is no text to readers of YAML; take another name, such as is_{name}")
+        raise UsageError(f"'{name}' is no text to readers of YAML", f"take another name, such as is_{name}")
     if type_ in SCALARS:
         return NewField(name, type_, comment)
     named = (*site.schema.messages, *site.schema.enums)
@@ -180,16 +180,16 @@ def _field(text: str, comment: str, site: Site) -> NewField:
         hint = f"did you mean '{close}'?" if close else there
         if site.schema.warnings:  # perhaps the file that declares it
             hint += f" ({site.schema.warnings[0]})"
-        raise UsageError(f"there is no type '{type_}' for '{name}'; {hint}")
+        raise UsageError(f"there is no type '{type_}' for '{name}'", hint)
     if len(own) > 1:
-        raise UsageError(f"several types are called '{type_}'; write which for '{name}': {', '.join(sorted(own))}")
+        raise UsageError(f"several types are called '{type_}'", f"write which for '{name}': {', '.join(sorted(own))}")
     return NewField(name, own[0], comment)
 
 
 def _check_word(name: str, remedy: str) -> None:
     """Refuse words of C and C++."""
     if name in _OF_C:
-        raise UsageError(f"'{name}' is a word of C or C++, and no name there; {remedy}")
+        raise UsageError(f"'{name}' is a word of C or C++, and no name there", remedy)
 
 
 def _endpoint(board: str, table: RouteTable) -> Endpoint:
@@ -199,7 +199,7 @@ def _endpoint(board: str, table: RouteTable) -> Endpoint:
     if found is None:
         names = [name.removesuffix("_board") for name in senders]
         hint = did_you_mean(board, names) or f"there are {', '.join(names)}"
-        raise UsageError(f"{table.path.name} has no board '{board}'; {hint}")
+        raise UsageError(f"{table.path.name} has no board '{board}'", hint)
     return found
 
 
@@ -210,7 +210,7 @@ def _case(name: str, board: str) -> str:
     if not _MESSAGE_NAME.fullmatch(name) or rest == name or not _MESSAGE_NAME.fullmatch(rest):
         better = rest[:1].upper() + rest[1:]
         example = better if _MESSAGE_NAME.fullmatch(better) else "RadiationInfo"
-        raise UsageError(f"'{name}' is no name for a message of {board}; write it as {prefix}{example}")
+        raise UsageError(f"'{name}' is no name for a message of {board}", f"write it as {prefix}{example}")
     return _WORD_BORDER.sub("_", rest).lower()
 
 
@@ -220,7 +220,7 @@ def _check_names(name: str, case: str, site: Site) -> None:
         raise UsageError(f"there is a message '{name}' already")
     _check_word(case, "take another name for the message")
     if surprise(case) or resolve(case) != case:
-        raise UsageError(f"'{case}' is no text to readers of YAML; take another name for the message")
+        raise UsageError(f"'{case}' is no text to readers of YAML", "take another name for the message")
     if case in site.envelope.cases:
         number = site.envelope.cases[case].number
         raise UsageError(
@@ -228,7 +228,7 @@ def _check_names(name: str, case: str, site: Site) -> None:
         )
     topics = {topic.topic.value: route.name for route in site.table.routes for topic in route.all_topics}
     if case in topics:
-        raise UsageError(f"the route {topics[case]} has a topic '{case}' already; take another name")
+        raise UsageError(f"the route {topics[case]} has a topic '{case}' already", "take another name")
 
 
 def _check_number(number: int, case: str, site: Site) -> None:
@@ -240,16 +240,16 @@ def _check_number(number: int, case: str, site: Site) -> None:
     above = range(max(holders, default=0) + 1, _LARGEST_NUMBER)
     free = next(candidate for candidate in above if _is_free(candidate, site))
     if not 1 <= number <= _LARGEST_NUMBER or number in _OF_PROTOBUF:
-        raise UsageError(f"{number} is no field number of protobuf; {free} is free")
+        raise UsageError(f"{number} is no field number of protobuf", f"{free} is free")
     if number in holders:
-        raise UsageError(f"number {number} belongs to '{holders[number]}', for ever; {free} is free")
+        raise UsageError(f"number {number} belongs to '{holders[number]}', for ever", f"{free} is free")
     if any(number in span for span in site.schema.reserved_numbers(envelope)):
-        raise UsageError(f"{envelope} reserves number {number}; {free} is free")
+        raise UsageError(f"{envelope} reserves number {number}", f"{free} is free")
     if promised := _promise(number, site):
         raise UsageError(f"{site.file(envelope)} says: {promised} {free} is free")
     if case in holders.values():
         was = next(old for old, name in holders.items() if name == case)
-        raise UsageError(f"'{case}' had number {was} once, and cannot come back with another; take another name")
+        raise UsageError(f"'{case}' had number {was} once, and cannot come back with another", "take another name")
 
 
 def _is_free(number: int, site: Site) -> bool:

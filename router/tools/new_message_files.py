@@ -180,7 +180,7 @@ def _ros_type(field: NewField, site: Site) -> str:
         return _short(field.type)
     if field.type in site.schema.enums:
         return "uint8"
-    raise UsageError(f"'{field.name}' needs {site.messages.name}/{_short(field.type)}.msg; declare that first")
+    raise UsageError(f"'{field.name}' needs {site.messages.name}/{_short(field.type)}.msg", "declare that first")
 
 
 def _constants(name: str, site: Site) -> Iterator[str]:
@@ -188,7 +188,7 @@ def _constants(name: str, site: Site) -> Iterator[str]:
         return
     for value, number in site.schema.enums[name].values:
         if not 0 <= number <= 255:
-            raise UsageError(f"{name}.{value} is {number}, which is no uint8; write the .msg file by hand")
+            raise UsageError(f"{name}.{value} is {number}, which is no uint8", "write the .msg file by hand")
         yield f"uint8 {value}={number}"
 
 
@@ -264,6 +264,11 @@ def _with_stanza(text: str, after: _Entry, stanza: Iterable[str], section: str =
 def _in_table(text: str, message: NewMessage, site: Site) -> str:
     """The table with a route from the board to ROS and the basestation, after the last route of that board."""
     own = _own_routes(site.table)
+    if not own and len(site.table.files) > 1:
+        extended = shown_path(site.table.files[1])
+        raise UsageError(
+            f"{shown_path(site.table.path)} has no routes of its own", f"take what it extends: -t {extended}"
+        )
     of_board = [route for route in own if message.board in (source.value for source in route.sources)]
     last = _last_route(text, of_board or own)
     route = _route(message, site, _WIDEST - last.indent)
@@ -314,7 +319,7 @@ def _last_route(text: str, routes: Iterable[Route]) -> _Entry:
     line = max((route.case.span.line for route in routes), default=0)
     found = next((entry for entry in _entries(text, "routes") if entry.first == line - 1), None)
     if found is None:
-        raise UsageError("the table has no routes of its own that one could be added to; write it by hand")
+        raise UsageError("the table has no routes of its own that one could be added to", "write it by hand")
     return found
 
 
@@ -332,7 +337,7 @@ def _in_tests(path: Path, message: NewMessage, site: Site) -> str:
     except yaml.YAMLError as error:
         raise UsageError(f"{shown_path(path)} is no YAML: {error}") from error
     if not entries:
-        raise UsageError(f"{shown_path(path)} has no 'tests'; write one, or remove the file")
+        raise UsageError(f"{shown_path(path)} has no 'tests'", "write one, or remove the file")
     of_board = [entry for entry in entries if message.board in _senders(entry.value)]
     return _with_stanza(text, (of_board or entries)[-1], _test(message, site), "" if of_board else message.board_words)
 

@@ -41,10 +41,10 @@ class TapRecording:
         try:
             self._file = RecordingFile(path, channels, {"reason": "router record", "table": table.path.name})
         except FileExistsError:
-            raise UsageError(f"{path} exists; choose another name") from None
+            raise UsageError(f"{path} exists", "choose another name") from None
         except OSError as error:
             remedy = f"make the folder {path.parent}" if isinstance(error, FileNotFoundError) else "see to its folder"
-            raise UsageError(f"cannot write {path}: {error.strerror}; {remedy}, or choose another by -o") from error
+            raise UsageError(f"cannot write {path}: {error.strerror}", f"{remedy}, or choose another by -o") from error
 
     @property
     def size(self) -> int:
@@ -162,7 +162,7 @@ class Replayer:
         listeners = self._table.listeners if self._table is not None else {}
         if listener not in listeners:
             hint = did_you_mean(listener, listeners)
-            raise UsageError(f"the table has no listener '{listener}' as the recording has; {hint or 'give --to'}")
+            raise UsageError(f"the table has no listener '{listener}' as the recording has", hint or "give --to")
         return udp.listener_address(listeners[listener])
 
     def _bound(self, found: Recorded) -> socket.socket:

@@ -125,7 +125,7 @@ def _asked(connection: http.client.HTTPConnection, url: str, method: str, path: 
     except (OSError, http.client.HTTPException) as error:
         remedy = "is it running? -t TABLE or --url names another router"
         why = getattr(error, "strerror", None) or error  # without the number that OSError shows
-        raise TransportError(f"no router answers at {url}: {why}; {remedy}") from error
+        raise TransportError(f"no router answers at {url}: {why}", remedy) from error
 
 
 def _read(response: http.client.HTTPResponse, url: str) -> bytes:

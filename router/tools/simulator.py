@@ -60,7 +60,10 @@ def parse_silence(text: str) -> Silence:
     found = _SILENCE.fullmatch(text)
     if found is None:
         raise UsageError(f"'{text}' is not NAME:FROM-TO with seconds, such as basestation:5-8 or basestation:5-")
-    return Silence(found["name"], float(found["start"]), float(found["end"] or "inf"))
+    silence = Silence(found["name"], float(found["start"]), float(found["end"] or "inf"))
+    if silence.end <= silence.start:
+        raise UsageError(f"'{text}' ends before it begins")
+    return silence
 
 
 def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -> None:
@@ -69,7 +72,7 @@ def check_silences(silences: Collection[Silence], streams: Collection[Stream]) -
     for silence in silences:
         if silence.name not in known:
             hint = did_you_mean(silence.name, known)
-            raise UsageError(f"nothing is sent that '{silence.name}' could silence; {hint}")
+            raise UsageError(f"nothing is sent that '{silence.name}' could silence", hint)
 
 
 FEEDS = 5
@@ -90,7 +93,7 @@ def streams(wire: Wire, table: RouteTable, seed: int, speed: float) -> Iterator[
             sender = STRANGER if source.value == ANY else source.value
             if sender != STRANGER and sender not in table.endpoints:
                 hint = did_you_mean(sender, table.endpoints)
-                raise UsageError(f"{source.span}: there is no endpoint '{sender}'; {hint}")
+                raise UsageError(f"{source.span}: there is no endpoint '{sender}'", hint)
             offset = random.Random(f"{seed}/{case.name}/{sender}").uniform(0, 1 / rate)
             yield Stream(sender, case, rate, offset)
 
@@ -173,8 +176,10 @@ class Simulator:
     def summary(self) -> str:
         """One line for people."""
         endpoints, cases = len(self._senders) - 1, len(self._streams)
+        who = "1 endpoint sends" if endpoints == 1 else f"{endpoints} endpoints send"
+        what = "1 payload case" if cases == 1 else f"{cases} payload cases"
         rate = sum(stream.rate for stream in self._streams)
-        return f"{endpoints} endpoints send {cases} payload cases, {rate:.0f}/s, to {self._router}"
+        return f"{who} {what}, {rate:.0f}/s, to {self._router}"
 
     def _open_endpoint(self, endpoint: Endpoint) -> None:
         """Open one socket for both directions, and a second one to send if the endpoint has another `source_port`."""
@@ -190,7 +195,9 @@ class Simulator:
             opened = open_udp(address, owner)
         except UsageError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
-                raise UsageError(f"{error}; take a table with addresses of this machine: -t routes/sim.yaml") from error
+                raise UsageError(
+                    str(error), "take a table with addresses of this machine: -t routes/sim.yaml"
+                ) from error
             raise
         self._opened.append(opened)
         return opened

@@ -57,7 +57,7 @@ class Condition:
                 findings[case.name] = error.diagnostic
         if not self._holds:
             likely = min(findings.values(), key=lambda each: not each.hint.startswith("did you mean"))
-            raise UsageError(f"--where: {likely.message}" + (f"; {likely.hint}" if likely.hint else ""))
+            raise UsageError(f"--where: {likely.message}", likely.hint)
 
     @property
     def cases(self) -> frozenset[str]:

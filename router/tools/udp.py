@@ -31,7 +31,7 @@ def destination(text: str, table: RouteTable | None) -> Address:
         return reachable(named)
     host, colon, port = text.rpartition(":")
     if not colon or not host:
-        raise UsageError(_not_a_place(text, table, "HOST:PORT"))
+        raise _not_a_place(text, table, "HOST:PORT")
     return Address(_resolve(host), _port(port, lowest=1))
 
 
@@ -41,7 +41,7 @@ def listening(text: str, table: RouteTable | None) -> Address:
         return named
     host, _, port = text.rpartition(":")
     if not port.isdigit():
-        raise UsageError(_not_a_place(text, table, "[HOST:]PORT"))
+        raise _not_a_place(text, table, "[HOST:]PORT")
     return Address(_resolve(host) if host else ANY_HOST, _port(port, lowest=0))
 
 
@@ -52,7 +52,7 @@ def origin(text: str, table: RouteTable | None) -> Address:
         return Address(endpoint.address.value.host, endpoint.source_port.value if endpoint.source_port else 0)
     host, colon, port = text.partition(":")
     if not colon and table is not None and not host[:1].isdigit() and host != "localhost":
-        raise UsageError(_not_a_place(text, table, "HOST[:PORT]"))
+        raise _not_a_place(text, table, "HOST[:PORT]")
     return Address(_resolve(host), _port(port, lowest=0) if colon else 0)
 
 
@@ -119,10 +119,9 @@ def _named(text: str, table: RouteTable | None) -> Address | None:
     return None if named is None else named.address.value
 
 
-def _not_a_place(text: str, table: RouteTable | None, form: str) -> str:
+def _not_a_place(text: str, table: RouteTable | None, form: str) -> UsageError:
     names = () if table is None else (*table.endpoints, *table.listeners)
-    hint = did_you_mean(text, names)
-    return f"'{text}' is neither {form} nor a name of the route table" + (f"; {hint}" if hint else "")
+    return UsageError(f"'{text}' is neither {form} nor a name of the route table", did_you_mean(text, names))
 
 
 def _resolve(host: str) -> str:
@@ -135,7 +134,7 @@ def _resolve(host: str) -> str:
 
 def _port(text: str, lowest: int) -> int:
     if not text.isdigit() or not lowest <= int(text) <= 65535:
-        raise UsageError(f"'{text}' is not a UDP port; ports are {lowest} to 65535")
+        raise UsageError(f"'{text}' is not a UDP port", f"ports are {lowest} to 65535")
     return int(text)
 
 
@@ -181,8 +180,8 @@ def send(sender: socket.socket, to: Address, data: bytes, count: int | None, rat
             sent.seconds = elapsed
     except OSError as error:
         is_away = error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH)
-        remedy = "; is it switched on, and this computer in its network?" if is_away else ""
-        raise TransportError(f"cannot send to {to}: {error.strerror}{remedy}") from error
+        remedy = "is it switched on, and this computer in its network?" if is_away else ""
+        raise TransportError(f"cannot send to {to}: {error.strerror}", remedy) from error
     if sender.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
         sent.refused += 1
 

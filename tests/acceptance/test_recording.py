@@ -91,7 +91,7 @@ def test_everything_is_recorded_before_it_is_routed_here_and_by_another_process(
         number = len(ALL_KINDS) + 1
         wait_until(lambda: place.samples()["recorded_datagrams_total"] == number, "the chunk")
         wait_until(lambda: len(read(other)) == number, "the datagrams of the other")
-        recorder.send_signal(signal.SIGINT)
+        recorder.send_signal(signal.SIGTERM)
         told, _ = recorder.communicate(timeout=PATIENCE)
         assert recorder.returncode == 0
         assert f"it.mcap: {number} datagrams" in told

@@ -83,8 +83,8 @@ def test_who_does_not_read_his_tap_misses_datagrams_and_is_told_how_many(rover: 
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["imu_inf"], "PBEnvelope has no payload case 'imu_inf'; did you mean 'imu_info'?"),
-        (["imu_info", "5000"], "PBEnvelope has no payload case '5000'; known: "),
+        (["imu_inf"], "PBEnvelope has no payload case 'imu_inf'\nhelp: did you mean 'imu_info'?"),
+        (["imu_info", "5000"], "PBEnvelope has no payload case '5000'\nhelp: known: "),
         (["--from", "arm_bord"], "the router has no endpoint 'arm_bord'; did you mean 'arm_board'?"),
         (["--url", "ftp://here"], "'ftp://here' is not like http://127.0.0.1:9108"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -15,10 +16,13 @@ ROVER = ROUTES / "rover.yaml"
 @pytest.mark.parametrize(
     ("suffix", "beginning"), [(".svg", "<svg "), (".mmd", "flowchart LR\n"), (".dot", 'digraph "rover.yaml" {\n')]
 )
-def test_the_suffix_chooses_what_is_written(tmp_path: Path, suffix: str, beginning: str) -> None:
+def test_the_suffix_chooses_what_is_written(
+    tmp_path: Path, suffix: str, beginning: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     output = tmp_path / f"routes{suffix}"
     assert main(["graph", str(ROVER), "-o", str(output)]) == OK
     assert output.read_text(encoding="utf-8").startswith(beginning)
+    assert re.fullmatch(rf"{output}: [0-9]+ routes\n", capsys.readouterr().err)
 
 
 def test_another_suffix_is_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:

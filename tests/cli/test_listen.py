@@ -152,20 +152,20 @@ def test_a_terminal_gets_colours_and_one_line_for_each(gateway: socket.socket) -
             "'here' is not udp://[HOST:]PORT, tcp://HOST:PORT, ws://HOST:PORT or zenoh://KEY?connect=LOCATOR",
         ),
         (["udp://5000", "--topic", "imu"], "--topic: 'imu' does not begin with '/'"),
-        (["udp://5000", "--record", "-"], "--record takes a file; --json prints the same"),
+        (["udp://5000", "--record", "-"], "--record takes a file\nhelp: --json prints the same"),
         (["udp://5000", "--record", "/nowhere/file"], "--record /nowhere/file: No such file or directory"),
         (["udp://5000", "--format", "json_lines"], "--format belongs to tcp://"),
         (["ws://127.0.0.1:1", "--ask", "127.0.0.1:2"], "--ask belongs to udp://"),
         (["udp://5000", "--ask", "here"], "'here' is not HOST:PORT"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(
+def test_a_mistake_is_said_and_ends_with_2(
     words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["listen", *words]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"router listen: {complaint}")
-    assert error.count("\n") == 1
+    assert error.count("\n") == 1 + error.count("\nhelp: ")
 
 
 def test_a_zenoh_network_that_cannot_be_reached_is_exit_code_1(capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,4 +178,4 @@ def test_a_wrong_duration_is_refused_as_usage(capsys: pytest.CaptureFixture[str]
     with pytest.raises(SystemExit) as caught:
         main(["listen", "udp://5000", "--for", "5"])
     assert caught.value.code == 2
-    assert "'5' is not a number with a unit of" in capsys.readouterr().err
+    assert "'5' has no unit" in capsys.readouterr().err

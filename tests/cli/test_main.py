@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -8,7 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from router.cli import BAD_TABLE, BAD_USAGE, BROKEN_PIPE, INTERRUPTED, NETWORK_FAULT, OK, VERBS, main, validate
+from router.cli import (
+    BAD_TABLE,
+    BAD_USAGE,
+    BROKEN_PIPE,
+    INTERRUPTED,
+    NETWORK_FAULT,
+    OK,
+    UNWRITTEN,
+    VERBS,
+    main,
+    validate,
+)
 from router.errors import Code, Diagnostic, SourceSpan, StartError, TableError, TransportError, UsageError
 from tests.tables import ROUTES
 
@@ -47,12 +59,46 @@ def test_an_option_that_a_verb_does_not_have_shows_those_that_it_has(capsys: pyt
         main(["record", "--tabel", "routes/sim.yaml"])
     said = capsys.readouterr().err
     assert said.startswith("usage: router record")
-    assert "unrecognized arguments: --tabel routes/sim.yaml; did you mean '--table'?" in said
+    assert "unrecognized arguments: --tabel routes/sim.yaml\nhelp: did you mean '--table'?" in said
 
 
 def test_an_unknown_verb_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["valdate"]) == BAD_USAGE
-    assert capsys.readouterr().err == "router: there is no verb 'valdate'; did you mean 'validate'?\n"
+    assert capsys.readouterr().err == "router: there is no verb 'valdate'\nhelp: did you mean 'validate'?\n"
+
+
+def test_swapped_letters_are_likelier_than_another_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["tpo"]) == BAD_USAGE
+    assert "did you mean 'top'?" in capsys.readouterr().err
+
+
+def test_options_before_the_verb_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["-t", "routes/sim.yaml", "validate"]) == BAD_USAGE
+    assert capsys.readouterr().err.endswith("\nhelp: options go after the verb: router VERB ...\n")
+
+
+@pytest.mark.parametrize(("words", "begin"), [(["help"], "usage: router VERB"), (["help", "tap"], "usage: router tap")])
+def test_help_is_a_verb_as_well(words: list[str], begin: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(words)
+    assert capsys.readouterr().out.startswith(begin)
+
+
+@pytest.mark.parametrize("verb", ["doctor", "status", "top", "sim"])
+def test_a_table_as_an_argument_of_a_verb_that_takes_none_names_the_option(
+    verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([verb, "routes/sim.yaml"])
+    assert "\nhelp: the table is named by -t routes/sim.yaml\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", ["--help", "--version", "--completion bash", "status --url http://127.0.0.1:1"])
+def test_a_full_disk_below_stdout_is_a_line(words: str) -> None:
+    router = f"exec {sys.executable} -m router {words} >/dev/full"
+    done = subprocess.run(["/bin/sh", "-c", router], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == UNWRITTEN
+    assert re.fullmatch("router( status)?: stdout: No space left on device\n", done.stderr)
 
 
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,7 +115,8 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
     ("error", "code", "shown"),
     [
         (TableError([Diagnostic(SourceSpan("t.yaml", 3, 4), Code.BAD_YAML, "what")]), BAD_TABLE, "t.yaml:3:4: error"),
-        (StartError("port 5000 is taken"), BAD_TABLE, "router validate: port 5000 is taken"),
+        (StartError("port 5000 is taken"), BAD_TABLE, "router validate: port 5000 is taken\n"),
+        (StartError("no port", "choose another"), BAD_TABLE, "router validate: no port\nhelp: choose another\n"),
         (UsageError("there is no x"), BAD_USAGE, "router validate: there is no x"),
         (TransportError("nobody answers"), NETWORK_FAULT, "router validate: nobody answers"),
         (KeyboardInterrupt(), INTERRUPTED, ""),

@@ -61,7 +61,7 @@ def test_the_table_is_an_argument_or_the_parameter_routes_path(
 def test_two_different_tables_are_wrong_usage(run: Run) -> None:
     assert run("routes/rover.yaml", "--ros-args", "-p", "routes_path:=routes/legacy.yaml") == (
         BAD_USAGE,
-        "router run: TABLE is routes/rover.yaml, routes_path is routes/legacy.yaml; name one table",
+        "router run: TABLE is routes/rover.yaml, routes_path is routes/legacy.yaml",
     )
 
 

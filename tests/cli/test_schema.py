@@ -125,9 +125,17 @@ def test_a_whole_message_is_accepted_without_those_nested_in_it(
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("Motor.rmp", BROKEN, "'Motor.rmp' has nothing to accept; did you mean 'Motor.rpm'?"),
-        ("Motor.on", BROKEN, "'Motor.on' has nothing to accept; did you mean"),
-        ("Motor.rpm", PROTO, "'Motor.rpm' has nothing to accept; nothing conflicts with the lock"),
+        (
+            "Motor.rmp",
+            BROKEN,
+            "'Motor.rmp' has nothing to accept; nothing was written\nhelp: did you mean 'Motor.rpm'?",
+        ),
+        ("Motor.on", BROKEN, "'Motor.on' has nothing to accept; nothing was written\nhelp: did you mean"),
+        (
+            "Motor.rpm",
+            PROTO,
+            "'Motor.rpm' has nothing to accept; nothing was written\nhelp: nothing conflicts with the lock",
+        ),
     ],
 )
 def test_a_name_without_a_conflict_is_refused(

@@ -257,3 +257,10 @@ def test_schema_is_one_and_describes_every_key() -> None:
         for name, key in definition.get("properties", {}).items():
             assert "$ref" in key or key.get("description"), name
     assert table_schema()["$schema"] == schema["$schema"]
+
+
+def test_a_wrong_table_without_tests_is_shown_as_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "table.yaml"
+    table.write_text("version: 1\nlisten: 5\n", encoding="utf-8")
+    assert main(["test", "-t", str(table)]) == BAD_TABLE
+    assert "table.yaml:2:9: error[" in capsys.readouterr().err

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from rich.progress import ProgressColumn, TextColumn
 
-from router.cli.tool_options import add_table, hertz, named_table, progress, seconds, speed, table_path
+from router.cli import main
+from router.cli.tool_options import add_table, factor, hertz, named_table, progress, seconds, speed, table_path
 from router.errors import UsageError
 
 
@@ -69,12 +70,34 @@ def test_numbers_have_units(parse: Callable[[str], float], text: str, value: flo
 
 @pytest.mark.parametrize(
     ("parse", "texts"),
-    [(seconds, ("10", "", "0s")), (hertz, ("20", "0Hz")), (speed, ("2", "0x", "-1x", "x", "2xx", "1e9x", "fast"))],
+    [(seconds, ("", "10 parsecs")), (hertz, ("20/s",)), (speed, ("x", "2xx", "1e9x", "fast")), (factor, ("max",))],
 )
-def test_numbers_without_their_unit_are_refused(parse: Callable[[str], float], texts: tuple[str, ...]) -> None:
+def test_other_texts_are_refused(parse: Callable[[str], float], texts: tuple[str, ...]) -> None:
     for text in texts:
         with pytest.raises(argparse.ArgumentTypeError):
             parse(text)
+
+
+@pytest.mark.parametrize(("parse", "meant"), [(seconds, "10s"), (hertz, "10Hz"), (speed, "10x")])
+def test_a_number_without_its_unit_gets_a_suggestion(parse: Callable[[str], float], meant: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match=rf"^'10' has no unit\nhelp: did you mean '{meant}'\?$"):
+        parse("10")
+
+
+@pytest.mark.parametrize(
+    "words", ["tap --for 0s", "tap --for -1s", "send imu_info --to rover --rate -5Hz", "replay it.mcap --speed -1x"]
+)
+def test_what_is_not_above_zero_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(words.split())
+    assert f"'{words.rpartition(' ')[2]}' is not above zero\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", ["tap --count x", "sim --seed x", "new Dose --board arm --number x"])
+def test_what_is_counted_is_a_whole_number(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(words.split())
+    assert "'x' is not a whole number\n" in capsys.readouterr().err
 
 
 class Terminal(io.StringIO):

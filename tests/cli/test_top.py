@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import pty
 import re
@@ -64,9 +65,20 @@ def test_where_there_is_no_table_that_is_said(tmp_path: Path, capsys: pytest.Cap
     assert "gone.yaml:1:1: error[bad-file]" in capsys.readouterr().err
 
 
-def test_nobody_there_is_said_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_nobody_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["top", "--url", f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"]) == 1
-    assert re.fullmatch(r"router top: no router answers at 127\.0\.0\.1:\d+: .*\n", capsys.readouterr().err)
+    assert re.fullmatch(r"router top: no router answers at 127\.0\.0\.1:\d+: .*\nhelp: .*\n", capsys.readouterr().err)
+
+
+def test_programs_are_told_that_nobody_is_there_as_by_status(capsys: pytest.CaptureFixture[str]) -> None:
+    url = f"http://127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
+    assert main(["top", "--json", "--url", url]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["state"], told["url"]) == ("down", url)
+    assert told["problems"][0].startswith(f"no router answers at {url}: ")
+    assert main(["reload", "--json", "--url", f"{url} "]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["ok"], told["text"]) == (False, f"no router answers at {url}: Connection refused")
 
 
 @pytest.mark.parametrize("text", ["<html>hello</html>", "", 'node_cpu{cpu="0"} 1\n', 'router_kernel_drops{a="b"} 1\n'])

@@ -218,25 +218,25 @@ def test_a_table_beside_that_routes_in_its_own_way_is_left_to_a_person(
 @pytest.mark.parametrize(
     ("asked", "why"),
     [
-        ("SensorBoardRadiationInfo 26 sensor", "number 26 belongs to 'manual_brake', for ever; 27 is free"),
+        ("SensorBoardRadiationInfo 26 sensor", "number 26 belongs to 'manual_brake', for ever\nhelp: 27 is free"),
         ("SensorBoardRadiationInfo 30 sensor", "says: Number 30 is promised"),
-        ("SensorBoardRadiationInfo 0 sensor", "0 is no field number of protobuf; 27 is free"),
+        ("SensorBoardRadiationInfo 0 sensor", "0 is no field number of protobuf\nhelp: 27 is free"),
         ("SensorBoardRadiationInfo 19500 sensor", "19500 is no field number of protobuf"),
-        ("SensorBoardRadiationInfo 27 sensors", "has no board 'sensors'; did you mean 'sensor'?"),
+        ("SensorBoardRadiationInfo 27 sensors", "has no board 'sensors'\nhelp: did you mean 'sensor'?"),
         ("DoseInfo 27 sensor", "write it as SensorBoardDoseInfo"),
         ("SensorBoarddose 27 sensor", "write it as SensorBoardDose"),
-        ("dose_info 27 sensor", "of sensor_board; write it as SensorBoardRadiationInfo"),
+        ("dose_info 27 sensor", "of sensor_board\nhelp: write it as SensorBoardRadiationInfo"),
         ("SensorBoardPumpInfo 27 sensor", "there is a message 'SensorBoardPumpInfo' already"),
         ("SensorBoardManualBrake 27 sensor", "has a payload case 'manual_brake' already, number 26"),
         ("SensorBoardWantedControlMode 27 sensor", "has a topic 'wanted_control_mode' already"),
         ("SensorBoardImuSensorInfo 27 sensor", "imu_sensor.proto already"),
         ("SensorBoardSwitch 27 sensor", "'switch' is a word of C or C++"),
         ("SensorBoardNull 27 sensor", "'null' is no text to readers of YAML"),
-        ("SensorBoardDose 27 sensor dose", "'dose' is no field; write name:type"),
+        ("SensorBoardDose 27 sensor dose", "'dose' is no field\nhelp: write name:type"),
         ("SensorBoardDose 27 sensor dose:flot", "did you mean 'float'?"),
         (
             "SensorBoardDose 27 sensor dose:string",
-            "there is no type 'string' for 'dose'; there are bool, float, double,",
+            "there is no type 'string' for 'dose'\nhelp: there are bool, float, double,",
         ),
         ("SensorBoardDose 27 sensor Dose:float", "'Dose' is no name of a field"),
         ("SensorBoardDose 27 sensor from:float", "'from' is no name of a field"),
@@ -263,7 +263,10 @@ def test_a_type_that_several_messages_have_is_to_be_said_whose(site: Path, capsy
         text = f'syntax = "proto3";\nmessage {name} {{\n  enum Side {{ {name.upper()} = 0; }}\n}}\n'
         (site / f"protos/{name.lower()}.proto").write_text(text, encoding="utf-8")
     assert main(["new", *RADIATION, "--fields", "side:Side"]) == BAD_USAGE
-    assert "several types are called 'Side'; write which for 'side': Left.Side, Right.Side" in capsys.readouterr().err
+    assert (
+        "several types are called 'Side'\nhelp: write which for 'side': Left.Side, Right.Side"
+        in capsys.readouterr().err
+    )
     assert main(["new", *RADIATION, "--fields", "side:Left.Side"]) == OK
 
 
@@ -385,7 +388,7 @@ def test_a_number_that_was_given_out_once_stays_taken(site: Path, capsys: pytest
     rewrite(site / LOCK, was, f'{was},\n        "27": "Gone gone_info"')
     rewrite(site / ENVELOPE, "  oneof payload {", "  reserved 27;\n  oneof payload {")
     assert main(["new", *RADIATION]) == BAD_USAGE
-    assert "number 27 belongs to 'gone_info', for ever; 28 is free" in capsys.readouterr().err
+    assert "number 27 belongs to 'gone_info', for ever\nhelp: 28 is free" in capsys.readouterr().err
     assert main(["new", "SensorBoardGoneInfo", "--number", "28", "--board", "sensor"]) == BAD_USAGE
     assert "'gone_info' had number 27 once" in capsys.readouterr().err
 
@@ -415,7 +418,31 @@ def test_an_installation_is_not_the_place_for_a_new_message(
     monkeypatch.setattr(router.assets, "_PACKAGE", site)
     before = contents(site)
     assert main(["new", *RADIATION]) == BAD_USAGE
-    assert "use the one of a checkout" in capsys.readouterr().err
+    assert (
+        "do not belong to routes/rover.yaml\nhelp: use the router of that table's checkout" in capsys.readouterr().err
+    )
+    assert contents(site) == before
+
+
+def test_a_table_elsewhere_gets_no_message_in_the_schemas_of_the_router(
+    site: Path, tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = tmp_path_factory.mktemp("project")
+    for part in ("routes", "protos"):
+        shutil.copytree(site / part, project / part)
+    before = contents(site)
+    assert main(["new", *RADIATION, "-t", str(project / "routes/rover.yaml")]) == BAD_USAGE
+    assert f"(schemas) do not belong to {project / 'routes/rover.yaml'}" in capsys.readouterr().err
+    assert contents(site) == before
+
+
+def test_a_table_without_routes_of_its_own_names_the_one_that_it_extends(
+    site: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (site / "routes/sim.yaml").write_text("version: 1\nextends: rover.yaml\n", encoding="utf-8")
+    before = contents(site)
+    assert main(["new", *RADIATION, "-t", "routes/sim.yaml"]) == BAD_USAGE
+    assert "has no routes of its own\nhelp: take what it extends: -t routes/rover.yaml\n" in capsys.readouterr().err
     assert contents(site) == before
 
 

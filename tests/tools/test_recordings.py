@@ -118,7 +118,7 @@ def test_a_listener_that_the_table_lacks_is_told(
     path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["replay", str(path), "--table", table(tmp_path, 5000, "rovers")]) == 2
-    assert "no listener 'rover' as the recording has; did you mean 'rovers'?" in capsys.readouterr().err
+    assert "no listener 'rover' as the recording has\nhelp: did you mean 'rovers'?" in capsys.readouterr().err
     assert main(["replay", str(path)]) == 2
     assert "give --to" in capsys.readouterr().err
 

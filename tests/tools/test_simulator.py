@@ -180,6 +180,11 @@ def test_what_is_no_silence_is_explained(text: str) -> None:
         parse_silence(text)
 
 
+def test_a_silence_that_ends_before_it_begins_is_refused() -> None:
+    with pytest.raises(UsageError, match="'basestation:5-2' ends before it begins"):
+        parse_silence("basestation:5-2")
+
+
 def test_a_silence_covers_an_endpoint_or_a_case_from_its_start_until_before_its_end(wire: Wire) -> None:
     stream = Stream("station", wire.case("plain"), rate=1.0, offset=0.0)
     for name in ("station", "plain"):

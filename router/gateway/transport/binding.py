@@ -68,7 +68,7 @@ class Binding:
     def _why_not(self, error: OSError) -> str:
         what = f"{self._address} cannot be used"
         if error.errno == errno.EADDRINUSE:
-            return f"{what}: {port_taken(self._protocol, self._address.port)}"
+            return f"{what}: {'; '.join(port_taken(self._protocol, self._address.port))}"
         if error.errno == errno.EACCES:
             return f"{what}: ports below 1024 need a privilege; choose a higher port, or grant CAP_NET_BIND_SERVICE"
         return f"{what}: {error.strerror}"

@@ -73,7 +73,7 @@ def permanent(settings: ZenohSettings, error: str) -> str:
     for locator in settings.listen:
         port = re.search(r":(\d+)$", locator)
         if port and locator in error:
-            return f"{locator} cannot be used: {port_taken('tcp', int(port[1]))}"
+            return f"{locator} cannot be used: {'; '.join(port_taken('tcp', int(port[1])))}"
     return f"Zenoh cannot listen: {short(error)}"
 
 

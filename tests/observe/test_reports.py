@@ -1,0 +1,34 @@
+"""What is logged of lost messages."""
+
+from __future__ import annotations
+
+import errno
+
+import pytest
+
+from router.engine import Report
+from router.log import logger
+from router.observe.reports import Reporter
+from router.table.addresses import Address
+
+REFUSED = ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
+
+
+@pytest.mark.parametrize(
+    ("kind", "target", "error", "said"),
+    [
+        ("deadman", "driving_board", REFUSED, "nobody listens at 127.0.0.222:25008"),
+        ("drop", "driving_board", REFUSED, "nobody listens at 127.0.0.222:25008"),
+        ("drop", "clients", REFUSED, str(REFUSED)),
+        ("drop", "driving_board", OSError(errno.EPERM, "not permitted"), "[Errno 1] not permitted"),
+    ],
+)
+def test_a_refused_datagram_is_explained(
+    kind: str, target: str, error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logged: list[object] = []
+    monkeypatch.setattr(logger, "warning", lambda _, **fields: logged.append(fields["error"]))
+    reporter = Reporter(lambda: {"driving_board": Address("127.0.0.222", 25008)})
+    reporter.report(Report(kind, "manual_drive", target, "send_error", error))
+    reporter.close()
+    assert logged == [said]
