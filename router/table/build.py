@@ -108,6 +108,8 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         return None
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
     defaults = root.get("defaults")
+    if defaults is not None and defaults.broken:
+        builder.broken.add("package")  # it may be what is broken
     return RouteTable(
         path=sources[0].path,
         files=tuple(source.path for source in sources),

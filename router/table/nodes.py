@@ -193,6 +193,7 @@ _INDISPENSABLE = frozenset(
     {
         "source",
         "ignore",
+        "none",
         "for_each",
         "topic",
         "type",
@@ -211,8 +212,8 @@ _INDISPENSABLE = frozenset(
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
 """Sets of keys each of which gives a mapping a meaning, whatever else it lacks or has too much."""
 
-_USES_NAMES_OF = {"collect": ("topics",)}
-"""Where a route's expressions use names (`items`) that there are only with this key."""
+_NEEDED_BY = {"collect": ("topics",), "destinations": ("deadman",)}
+"""Keys of a route, and others that mean nothing without: expressions use `items`, a deadman sends to destinations."""
 
 
 def valid_part(entry: Entry) -> Entry | None:
@@ -234,10 +235,10 @@ def _valid_part(node: Node) -> Node | None:
 def _valid_mapping(node: MappingNode) -> MappingNode | None:
     if node.broken and not _has_meaning(node):
         return None
-    invalid = {key for key, entry in node.entries.items() if not is_valid(entry.value)}
-    if invalid & _INDISPENSABLE:
+    invalid = {key for key, entry in node.entries.items() if not (is_valid(entry.key) and is_valid(entry.value))}
+    if invalid & _INDISPENSABLE or (invalid and "map" in node.entries):
         return None
-    left_out = {user for key, users in _USES_NAMES_OF.items() if key in invalid for user in users}
+    left_out = {user for key, users in _NEEDED_BY.items() if key in invalid for user in users}
     parts = {
         key: _valid_entry(entry) if key in invalid else entry
         for key, entry in node.entries.items()
