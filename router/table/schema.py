@@ -19,7 +19,7 @@ from router.errors import Code, Diagnostic, SourceSpan, did_you_mean, nearest
 from router.table.addresses import BadAddressError, parse_address
 from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten, to_data
 from router.table.reading import mapping
-from router.table.units import nearest_quantity
+from router.table.units import meant_quantity
 
 if TYPE_CHECKING:
     from jsonschema import ValidationError
@@ -250,10 +250,9 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
     if keyword == "maxProperties":
         return Diagnostic(span, code, f"{name} {_expected(error)}, and no other beside it")
     near = nearest(str(error.value), error.limit) if keyword == "enum" else None
-    if isinstance(error.value, str) and keyword in ("pattern", "anyOf", "oneOf"):
-        near = nearest_quantity(error.value)
-        near = None if near and near.replace(" ", "") == error.value.replace(" ", "") else near
     hint = f"did you mean '{near}'?" if near else ""
+    if isinstance(error.value, str) and keyword == "pattern":
+        hint = meant_quantity(error.value, lambda each: bool(re.search(error.limit, each)))
     if keyword == "minProperties" and "errorMessage" in error.schema:
         return Diagnostic(span, code, f"{name} {_expected(error)}")
     if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
