@@ -220,20 +220,20 @@ def nearest_path(path: Path) -> Path | None:
     return path.with_name(near) if near else None
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that `name` most likely stands for, None when none is near."""
+def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | None:
+    """Return the known name that `name` most likely stands for, None when none is near. A `closeness` of 1 is equal."""
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
-    close = difflib.get_close_matches(name.lower(), folded, n=8, cutoff=0.6)
+    close = difflib.get_close_matches(name.lower(), folded, n=8, cutoff=closeness)
     if not close:
         return None
     ratios = [difflib.SequenceMatcher(a=candidate, b=name.lower()).ratio() for candidate in close]
     return folded[min(candidate for candidate, ratio in zip(close, ratios, strict=True) if ratio == max(ratios))]
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, known: Iterable[str], closeness: float = 0.6) -> str:
     """A hint for a name that does not exist: the nearest known one, else a short list, else nothing."""
     candidates = sorted(set(known))
-    if close := nearest(name, candidates):
+    if close := nearest(name, candidates, closeness):
         return f"did you mean '{close}'?"
     if not candidates:
         return ""

@@ -17,7 +17,8 @@ from router.rehearsal.steps import Expected, ExpectedReader, GivenReader, Names,
 from router.table.compose import compose
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode, is_valid, key_at, node_at
 from router.table.reading import InvalidValueError, parsed
-from router.table.schema import SchemaError, finding, schema_errors, subject
+from router.table.schema import SchemaError, schema_errors
+from router.table.shape import finding, subject
 from router.table.source import read_source
 from router.table.units import parse_duration
 
