@@ -233,10 +233,10 @@ def nearest_path(path: Path) -> Path | None:
     return path.with_name(near) if near else None
 
 
-def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """Return the known name that `name` most likely stands for, None when none is as near as `cutoff`, at most 1."""
+def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | None:
+    """Return the known name that `name` most likely stands for, None when none is near. A `closeness` of 1 is equal."""
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}
-    close = difflib.get_close_matches(name.lower(), folded, n=8, cutoff=cutoff)
+    close = difflib.get_close_matches(name.lower(), folded, n=8, cutoff=closeness)
     if not close:
         return None
     ratios = [difflib.SequenceMatcher(a=candidate, b=name.lower()).ratio() for candidate in close]
@@ -244,10 +244,10 @@ def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
     return folded[min(best, key=lambda candidate: (sorted(candidate) != sorted(name.lower()), candidate))]
 
 
-def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+def did_you_mean(name: str, known: Iterable[str], closeness: float = 0.6) -> str:
     """A hint for a name that does not exist: the nearest known one, else a short list, else nothing."""
     candidates = sorted(set(known))
-    if close := nearest(name, candidates, cutoff):
+    if close := nearest(name, candidates, closeness):
         return f"did you mean '{close}'?"
     if not candidates:
         return ""

@@ -6,18 +6,19 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, shown_path
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest_path, shown_path
 from router.rehearsal.fields import offset
 from router.rehearsal.steps import Expected, ExpectedReader, GivenReader, Names, Step
 from router.table.compose import compose
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode, is_valid, key_at, node_at
-from router.table.reading import InvalidValueError, parsed
-from router.table.schema import SchemaError, finding, schema_errors, subject
+from router.table.reading import InvalidValueError, mapping, parsed
+from router.table.schema import schema_errors
+from router.table.shape import finding, subject, unknown_keys
 from router.table.source import read_source
 from router.table.units import parse_duration
 
@@ -60,9 +61,14 @@ def find_test_files(paths: Sequence[Path]) -> list[Path]:
 def read_test_file(path: Path, definitions: Definitions) -> TestFile:
     """Raises TableError with every finding in the file, or in its table."""
     root = _checked_nodes(path)
-    checked = check_table(_table_of(root, path), _variables(root), definitions)
+    variables = _Variables(_variables(root))
+    checked = check_table(_table_of(root, path), variables, definitions)
     if checked.program is None:
         raise TableError(checked.diagnostics)
+    if unused := [name for name in variables if name not in variables.asked]:
+        key = mapping(root.get("variables")).entries[unused[0]].key
+        message = f"{shown_path(checked.path)} has no variable '{unused[0]}'"
+        raise TableError([Diagnostic(key.span, Code.BAD_VALUE, message, did_you_mean(unused[0], variables.asked))])
     if checked.program.table.routes_span is None:
         message, hint = f"{shown_path(checked.path)} has no routes", "only routes are tested, gateways are not"
         raise TableError([Diagnostic(SourceSpan(shown_path(path)), Code.BAD_FILE, message, hint)])
@@ -80,8 +86,9 @@ def _table_of(root: MappingNode, path: Path) -> Path:
     if isinstance(named, ScalarNode):
         table = Path(os.path.normpath(path.parent / named.text))
         if not table.is_file():
-            message = f"there is no table '{named.text}' beside this file"
-            raise TableError([Diagnostic(named.span, Code.BAD_FILE, message)])
+            message, near = f"there is no table '{named.text}' beside this file", nearest_path(table)
+            hint = f"did you mean '{named.text.removesuffix(table.name)}{near.name}'?" if near else ""
+            raise TableError([Diagnostic(named.span, Code.BAD_FILE, message, hint)])
         return table
     for ending in ENDINGS:
         if path.name.endswith(ending):
@@ -96,6 +103,18 @@ def _variables(root: MappingNode) -> Mapping[str, str]:
     node = root.get("variables")
     entries = node.entries if isinstance(node, MappingNode) else {}
     return {name: entry.value.text for name, entry in entries.items() if isinstance(entry.value, ScalarNode)}
+
+
+class _Variables(dict[str, str]):
+    """Values by name that remember which names were `asked` for."""
+
+    def __init__(self, values: Mapping[str, str]) -> None:
+        super().__init__(values)
+        self.asked: set[str] = set()
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self.asked.add(name)
+        return super().get(name, default)
 
 
 class _Reader:
@@ -201,10 +220,12 @@ def _checked_nodes(path: Path) -> MappingNode:
 
 def _schema_findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnostic]:
     errors = schema_errors(root, SCHEMA)
+    empty = {error.path for error in errors if error.lacks_mapping}
     misspelt = {error.path for error in errors if error.keyword == "additionalProperties"}
     for error in errors:
         if error.keyword == "additionalProperties":
-            yield from _unknown_keys(error, node_at(root, error.path))
+            owner = subject(error.path) if error.path else "a test file"
+            yield from unknown_keys(root, error.path, list(error.schema["properties"]), owner, empty)
         elif not error.path and error.path not in misspelt:
             yield Diagnostic(whole, Code.MISSING_KEY, "a test file has its tests under the key 'tests'")
         elif error.keyword == "required" and error.path in misspelt:
@@ -216,13 +237,3 @@ def _schema_findings(root: MappingNode, whole: SourceSpan) -> Iterator[Diagnosti
             yield Diagnostic(key.span if key else node_at(root, error.path).span, Code.MISSING_KEY, message)
         else:
             yield finding(error, root)
-
-
-def _unknown_keys(error: SchemaError, node: Node) -> Iterator[Diagnostic]:
-    assert isinstance(node, MappingNode)  # noqa: S101 - only a mapping has keys
-    known = list(error.schema["properties"])
-    owner = "a test file" if not error.path else subject(error.path)
-    for name, entry in node.entries.items():
-        if name not in known:
-            hint = did_you_mean(name, known)
-            yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)

@@ -12,7 +12,7 @@ from router.table.build import build_table
 from router.table.extends import load_chain
 from router.table.mistakes import cut_findings
 from router.table.model import RouteTable
-from router.table.schema import check_shape
+from router.table.shape import check_shape
 from router.table.shorthand import written_out
 from router.table.source import Source
 

@@ -108,6 +108,8 @@ def build_table(root: MappingNode, sources: Sequence[Source], findings: list[Dia
         return None
     gateways = builder.each(root, "gateways", _gateway, salvage=valid_part)
     defaults = root.get("defaults")
+    if defaults is not None and defaults.broken:
+        builder.broken.add("package")  # it may be what is broken
     return RouteTable(
         path=sources[0].path,
         files=tuple(source.path for source in sources),
@@ -424,6 +426,8 @@ def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[Sour
     for name, entry in fields.entries.items():
         inner = (*path, *name.split("."))
         inner_spans = (*spans, *_part_spans(entry.key))
+        if not is_valid(entry.value):  # what is left of it means something else
+            continue
         if isinstance(entry.value, MappingNode) and not is_choice(entry.value) and not is_text(entry.value):
             yield from _field_entries(entry.value, inner, inner_spans)
         else:

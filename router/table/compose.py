@@ -17,7 +17,7 @@ import yaml
 from router.errors import Code, Diagnostic, SourceSpan, TableError
 from router.table.mistakes import explain
 from router.table.nodes import Entry, MappingNode, Node, Plain, ScalarNode, SequenceNode, TextPlace, cut_off, locate
-from router.table.source import Source, fill, has_variables, unusable_character
+from router.table.source import Source, fill, foreign_blank, has_variables, unusable_character
 
 MAX_DEPTH = 32
 MAX_NODES = 20_000
@@ -133,6 +133,10 @@ class _Composer:
             place = TextPlace(span)
         if unusable := unusable_character(text):
             broken |= self._report(span, f"the text holds the character {unusable[1]}", "")
+        if not event.style and text[-1:] == "," and " " not in text and self._open_bracket() is None:
+            broken |= self._report(
+                span, f"'{text}' ends with a ','", "remove it: only within brackets does ',' separate"
+            )
         if event.style or broken:
             return ScalarNode(span, text, text, place, broken)
         if found := surprise(text):
@@ -169,6 +173,10 @@ class _Composer:
                     key.span,
                     "a key must be a word, not a mapping or a sequence",
                     "quote text that begins with '{' or '['",
+                )
+            elif blank := foreign_blank(key.text):
+                broken = self._report(
+                    key.span, f"the character {blank} stands in this key", "remove it, or write an ordinary space"
                 )
             elif key.text == "<<" and key.value == "<<":
                 broken = self._report(key.span, "merge keys ('<<') have no place in a table", "write the keys out")
@@ -256,7 +264,7 @@ _HEXADECIMAL = Surprise("a hexadecimal number", "write a decimal number")
 _GROUPED = Surprise("a number", "leave out the '_'")
 _SURPRISES = (
     (re.compile("|".join(_TRUTH)), Surprise("a truth value", "write true or false")),
-    (re.compile("~"), Surprise("an empty value", "write null")),
+    (re.compile("~"), Surprise("an empty value", "leave the key out, or in a route write {ignore: why}")),
     (re.compile(r"[-+]?0[0-9_]+|0o[0-7]+"), _OCTAL),
     (re.compile(r"[-+]?0b[01_]+"), _BINARY),
     (re.compile(r"[-+]0x[0-9a-fA-F_]+|0x(?=.*_)[0-9a-fA-F_]+"), _HEXADECIMAL),

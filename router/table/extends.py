@@ -19,7 +19,7 @@ from router.table.compose import compose
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
 from router.table.reading import is_choice
-from router.table.source import Source, read_source
+from router.table.source import Source, in_braces, read_source
 
 KEY = "extends"
 IGNORE = "ignore"
@@ -129,8 +129,11 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
             raise  # the file is there, a place in it is wrong
         what = f"'{reference.text}' cannot be extended: {found.message}"
         near = nearest_path(path)
-        looked = f"looked for {shown_path(Path(os.path.realpath(path)))}"
-        hint = f"did you mean '{reference.text.removesuffix(path.name)}{near.name}'?" if near else looked
+        hint = f"looked for {shown_path(Path(os.path.realpath(path)))}"
+        if near:
+            hint = f"did you mean '{reference.text.removesuffix(path.name)}{near.name}'?"
+        if (variable := in_braces(reference.text)) != reference.text:
+            hint = f'write "{variable}"'
         raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what, hint)]) from error
 
 

@@ -193,6 +193,7 @@ _INDISPENSABLE = frozenset(
     {
         "source",
         "ignore",
+        "none",
         "for_each",
         "topic",
         "type",
@@ -213,8 +214,8 @@ _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
 
 _OF_ONE_PIECE = {"map", "text"}
 """Keys of values that are mappings, which mean nothing without one of their parts."""
-_USES_NAMES_OF = {"collect": ("topics",)}
-"""Where a route's expressions use names (`items`) that there are only with this key."""
+_NEEDED_BY = {"collect": ("topics",), "destinations": ("deadman",)}
+"""Keys of a route, and others that mean nothing without: expressions use `items`, a deadman sends to destinations."""
 
 
 def valid_part(entry: Entry) -> Entry | None:
@@ -238,10 +239,10 @@ def _valid_mapping(node: MappingNode) -> MappingNode | None:
         return None
     if _OF_ONE_PIECE & node.entries.keys() and not is_valid(node):
         return None
-    invalid = {key for key, entry in node.entries.items() if not is_valid(entry.value)}
+    invalid = {key for key, entry in node.entries.items() if not (is_valid(entry.key) and is_valid(entry.value))}
     if invalid & _INDISPENSABLE:
         return None
-    left_out = {user for key, users in _USES_NAMES_OF.items() if key in invalid for user in users}
+    left_out = {user for key, users in _NEEDED_BY.items() if key in invalid for user in users}
     parts = {
         key: _valid_entry(entry) if key in invalid else entry
         for key, entry in node.entries.items()

@@ -27,7 +27,7 @@ def written_out(root: MappingNode) -> MappingNode:
     """The table without short forms. What does not fit the schema is marked broken in it."""
     group = root.get("defaults")
     defaults = _valid_entries(group) if isinstance(group, MappingNode) else {}
-    in_long = _Shorthand(defaults)
+    in_long = _Shorthand(defaults, _of_deadmen(group))
     root = _changed(root, "routes", lambda routes: _each_value(routes, lambda case: _one_or_each(case, in_long.route)))
     return _changed(root, "gateways", lambda gateways: _each_value(gateways, in_long.gateway))
 
@@ -35,12 +35,11 @@ def written_out(root: MappingNode) -> MappingNode:
 class _Shorthand:
     """The long forms of parts of a table with these defaults."""
 
-    def __init__(self, defaults: Entries) -> None:
+    def __init__(self, defaults: Entries, of_deadmen: Entries) -> None:
         self._of_routes = {key: entry for key, entry in defaults.items() if key == "ttl"}
         self._queue_depth = {key: entry for key, entry in defaults.items() if key == "queue_depth"}
         self._qos = {key: replace(entry, value=_qos(entry.value)) for key, entry in defaults.items() if key == "qos"}
-        deadman = defaults.get("deadman")
-        self._of_deadmen = deadman.value.entries if deadman and isinstance(deadman.value, MappingNode) else {}
+        self._of_deadmen = of_deadmen
 
     def route(self, node: Node) -> Node:
         if not isinstance(node, MappingNode) or "ignore" in node.entries:
@@ -71,6 +70,17 @@ class _Shorthand:
 
     def _deadman(self, node: Node) -> Node:
         return node if isinstance(node, MappingNode) and "none" in node.entries else _with(node, self._of_deadmen)
+
+
+def _of_deadmen(defaults: Node | None) -> Entries:
+    """What they say for deadmen, valid or not. A timeout that a mistake has lost is there, and broken."""
+    deadman = defaults.get("deadman") if isinstance(defaults, MappingNode) else None
+    entries = deadman.entries if isinstance(deadman, MappingNode) else {}
+    lost = next((node for node in (deadman, defaults) if node and node.broken), None)
+    if lost is None or "timeout" in entries:
+        return entries
+    timeout = replace(_key("timeout", lost.span), broken=True)
+    return {**entries, "timeout": Entry(timeout, timeout)}
 
 
 def _named(node: Node) -> Node:

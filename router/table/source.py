@@ -6,6 +6,7 @@ What cannot be read at all is raised as TableError with one finding.
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +63,12 @@ def unusable_character(text: str) -> tuple[int, str] | None:
     return (match.start(), f"U+{ord(match[0]):04X}") if match else None
 
 
+def foreign_blank(text: str) -> str | None:
+    """The name of the first character that looks like a space, or like nothing, and is no space to YAML."""
+    found = next((char for char in text if unicodedata.category(char) in ("Zs", "Cf") and char != " "), None)
+    return f"U+{ord(found):04X}" if found else None
+
+
 def _read(path: Path, file: str) -> bytes:
     hint = ""
     try:
@@ -102,6 +109,14 @@ class Problem:
     code: Code
     message: str
     hint: str
+
+
+_AS_IN_A_SHELL = re.compile(r"\$\(?([A-Za-z_]\w*)\)?|^~(?=/|$)")
+
+
+def in_braces(text: str) -> str:
+    """The text with variables that are written as in a shell, such as `$NAME` or `~`, as a table writes them."""
+    return _AS_IN_A_SHELL.sub(lambda match: f"${{{match[1] or 'HOME'}}}", text)
 
 
 def has_variables(text: str) -> bool:

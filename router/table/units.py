@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 _QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,9}))? ?([A-Za-z]+(?:/s)?)")
@@ -70,26 +71,73 @@ class Quantity:
     show: Callable[[Any], str]
 
 
-_WRITTEN = re.compile(r"([0-9]+(?:\.[0-9]+)?) ?([A-Za-z]+(?:/s)?)")
-_UNITS = {
-    "m": "min",
-    "sec": "s",
-    "second": "s",
-    "minute": "min",
-    "hour": "h",
-    "msec": "ms",
-    "usec": "us",
-    "hertz": "Hz",
+_PART = r"([0-9]{0,15}[.,]?[0-9]{1,15}(?:e[0-9]{1,2})?) ?(1?/s|per second|[a-zµμ]+(?:/s)?)"
+_PARTS = re.compile(rf"(?:{_PART} ?)+,?", re.IGNORECASE)
+_SPELLINGS = {
+    "ns": ("ns", "nsec", "nanosecond"),
+    "us": ("us", "µs", "μs", "usec", "microsecond"),
+    "ms": ("ms", "msec", "millisecond"),
+    "s": ("s", "sec", "second"),
+    "min": ("min", "m", "minute"),
+    "h": ("h", "hour"),
+    "Hz": ("hz", "hertz", "/s", "1/s", "per second"),
+    "B": ("b", "byte"),
+    "kB": ("kb", "k", "kilobyte"),
+    "KiB": ("kib", "ki", "k"),
+    "MB": ("mb", "m", "megabyte"),
+    "MiB": ("mib", "mi", "m"),
+    "GB": ("gb", "g", "gigabyte"),
+    "GiB": ("gib", "gi", "g"),
 }
-_UNITS |= {unit.lower(): unit for unit in (*_NANOSECONDS, *_DISK_BYTES, *_BYTES_PER_SECOND, "Hz")}
+"""Units, and how people write them, in lower case."""
+_CONVERTED: Mapping[str, tuple[Fraction | int, str]] = {
+    "d": (24, "h"),
+    "day": (24, "h"),
+    "khz": (1000, "Hz"),
+    **dict.fromkeys(("bps", "bit/s", "bit"), (Fraction(1, 8), "B/s")),
+    **dict.fromkeys(("kbps", "kbit/s", "kbit"), (Fraction(1, 8), "kB/s")),
+    **dict.fromkeys(("mbps", "mbit/s", "mbit"), (Fraction(1, 8), "MB/s")),
+}
+"""Units that tables do not have, as so many of one that they have."""
 
 
-def nearest_quantity(text: str) -> str | None:
-    """`200ms` for `200 MS`, `5 Hz` for `5 hz`: the number with the unit that was meant; None where it is unclear."""
-    match = _WRITTEN.fullmatch(text)
-    written = match[2].lower() if match else ""
-    unit = _UNITS.get(written) or _UNITS.get(written.removesuffix("s"))
-    return f"{match[1]}{' ' * (unit == 'Hz')}{unit}" if match and unit else None
+def meant_quantity(text: str, fits: Callable[[str], bool]) -> str:
+    """`did you mean '4MB' or '4MiB'?`: what the text may stand for, of that what fits; empty where there is nothing."""
+    found = [f"'{each}'" for each in dict.fromkeys(_meanings(text)) if fits(each)]
+    return f"did you mean {' or '.join(found)}?" if found else ""
+
+
+def _meanings(text: str) -> Iterator[str]:
+    """Quantities of all kinds; a duration as a rate as well, and a rate as a duration."""
+    if not _PARTS.fullmatch(text):
+        return
+    parts = [(number.replace(",", "."), unit.lower()) for number, unit in re.findall(_PART, text, re.IGNORECASE)]
+    if len(parts) > 1:
+        units = [next((_NANOSECONDS[unit] for _, unit in _units(word) if unit in _NANOSECONDS), 0) for _, word in parts]
+        if all(units):
+            times = zip(parts, units, strict=True)
+            yield duration(int(sum(Fraction(number) * unit for (number, _), unit in times)))
+        return
+    [(number, written)] = parts
+    for factor, unit in _units(written):
+        amount = Fraction(number) * factor
+        is_kept = factor == 1 and number[0] != "." and "e" not in number.lower()
+        yield f"{number if is_kept else f'{float(amount):.15g}'}{' ' * (unit == 'Hz')}{unit}"
+        if unit in _NANOSECONDS and amount:
+            yield f"{float(10**9 / (amount * _NANOSECONDS[unit])):.6g} Hz"
+        if unit == "Hz" and amount:
+            yield duration(round(10**9 / amount))
+
+
+def _units(written: str) -> list[tuple[Fraction | int, str]]:
+    """What a unit may stand for: so many of a unit that tables have. Sizes may lack a `/s`, or have one too many."""
+    for word in (written, written.removesuffix("s")):
+        found = [_CONVERTED[word]] if word in _CONVERTED else []
+        found += [(1, unit) for unit, spellings in _SPELLINGS.items() if word in spellings]
+        sizes = [unit for unit in _DISK_BYTES if word.removesuffix("/s") in _SPELLINGS[unit]]
+        if found := [*found, *((1, f"{unit}{end}") for unit in sizes for end in ("", "/s"))]:
+            return found
+    return []
 
 
 def parse_duration(text: str) -> int:
@@ -134,8 +182,8 @@ def parse_topic_rate(value: str | float) -> int:
 
 def _meaning(text: str, *units: str) -> str:
     """`; did you mean '200ms'?`, if that has one of the units."""
-    meant = nearest_quantity(text)
-    return f"; did you mean '{meant}'?" if meant and meant.endswith(units) and meant != text else ""
+    meant = meant_quantity(text, lambda each: each != text and each.lstrip("0123456789. ") in units)
+    return f"; {meant}" if meant else ""
 
 
 def _exact(text: str, units: Mapping[str, int], base: str, largest: int, smallest: int = 1) -> int:

@@ -578,6 +578,34 @@ def test_table_is_the_one_that_the_file_is_named_after_or_that_it_names(tmp_path
     assert read_test_file(other, DEFINITIONS).checked.path == tmp_path / "table.yaml"
 
 
+@pytest.mark.parametrize(
+    ("written_in_full", "hint"),
+    [
+        ("tests: {a: {given: {case:ph_info}, expect: any}}", "a space is missing after ':', write `case: ph_info`"),
+        ("tests: {a: {when: {case: ph_info, from: sensor_board}, expect: any}}", "did you mean 'given'?"),
+        ("tests: {a: {then: any}}", "did you mean 'expect'?"),
+        ("tests: {a: {given: {case: ph_info, source: sensor_board}, expect: any}}", "did you mean 'from'?"),
+        ("tests: {a: {given: {case: ph_info, from: x, count: 2}, expect: any}}", "did you mean 'times'?"),
+        ("tests: {a: {expect: {rejected: source_missmatch}}}", "did you mean 'source_mismatch'?"),
+        ("tests: {a: {steps: [{wait: 1s, expect: any}]}}",
+         "say when it is, since the beginning of the test: `at: 500ms`"),
+        ("tests:\n  a:\n    expect:\n    sent: basestation", "indent what belongs to it further than it"),
+        ("table: tabel.yaml\ntests: {a: {expect: any}}", "did you mean 'table.yaml'?"),
+        ("variables: {BASESTATON: x}\ntests: {a: {expect: any}}", "did you mean 'BASESTATION'?"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_a_file_has_a_hint(written_in_full: str, hint: str, tmp_path: Path) -> None:
+    head = HEAD.replace("PROTOS", str(PROTOS)).replace(
+        "version: 1\n", "version: 1\nnode: {name: '${BASESTATION:-a}'}\n"
+    )
+    (tmp_path / "table.yaml").write_text(head + "  ph_info: {ignore: not of interest}\n")
+    path = tmp_path / "table.test.yaml"
+    path.write_text(written_in_full)
+    with pytest.raises(TableError) as raised:
+        read_test_file(path, DEFINITIONS)
+    assert [found.hint for found in raised.value.diagnostics] == [hint]
+
+
 def test_an_empty_file_is_told_what_a_test_file_is(tmp_path: Path) -> None:
     path = tmp_path / "empty.test.yaml"
     path.write_text("\n")

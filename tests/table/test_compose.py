@@ -290,3 +290,17 @@ def test_what_yaml_1_1_reads_differently_is_a_surprise(text: str) -> None:
 )
 def test_what_everybody_reads_alike_is_none(text: str) -> None:
     assert surprise(text) is None
+
+
+@pytest.mark.parametrize("value", ["sensor_board,", "200ms,", "8,"])
+def test_a_word_that_ends_with_a_comma_is_one_only_within_brackets(value: str, tmp_path: Path) -> None:
+    _, findings = composed(tmp_path, f"a: {value}")
+    assert [each.message for each in findings] == [f"'{value}' ends with a ','"]
+    for good in (f"a: {{b: {value}}}", f"a: '{value}'", f"a: some {value}", f"a: [{value} b]"):
+        assert composed(tmp_path, good)[1] == []
+
+
+@pytest.mark.parametrize("character", ["\u00a0", "\u2009", "\u200b"])
+def test_a_character_in_a_key_that_looks_like_a_space_is_named(character: str, tmp_path: Path) -> None:
+    _, findings = composed(tmp_path, f"{{a:{character}b, c: d}}")
+    assert [each.message for each in findings] == [f"the character U+{ord(character):04X} stands in this key"]

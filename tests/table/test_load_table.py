@@ -286,3 +286,27 @@ def test_expressions_are_left_out_with_what_gives_them_their_names(tmp_path: Pat
     assert [topic.topic.value for topic in route(table, "detected_object_from_ros").source_topics] == ["it"]
     together = route(table, "detected_object_from_basestation")
     assert (together.collect, together.topics) == (None, ())
+
+
+@pytest.mark.parametrize(
+    "defaults",
+    ["deadman: {timeout: 1s, send: {}}", "deadman: 500ms", "timeout: 1s", "deadman: {timeout: 5}", "deadman: {}, a: 1"],
+)
+def test_deadmen_do_not_miss_what_a_mistake_in_their_defaults_has_lost(defaults: str, tmp_path: Path) -> None:
+    text = GOOD.replace("timeout: 300 ms, ", "").replace("version: 1\n", f"version: 1\ndefaults: {{{defaults}}}\n")
+    _, findings = parts(tmp_path, text)
+    assert [each.code is Code.MISSING_KEY for each in findings] == [False]
+
+
+@pytest.mark.parametrize("reason", ["true", ""])
+def test_a_deadman_without_its_reason_lacks_no_timeout(reason: str, tmp_path: Path) -> None:
+    _, findings = parts(tmp_path, GOOD.replace("{none: nothing moves because of it}", f"{{none: {reason}}}"))
+    assert [each.code for each in findings] == [Code.WRONG_TYPE]
+
+
+def test_values_of_a_key_that_is_ambiguous_are_not_checked(tmp_path: Path) -> None:
+    table, findings = parts(tmp_path, GOOD.replace("{x: accel_x,", "{x: {map: is_ok, yes: 1, else: 0},"))
+    assert [each.code for each in findings] == [Code.AMBIGUOUS_SCALAR]
+    fields = table.routes[0].topics[1].fields
+    assert fields
+    assert not any(entry.value.choices for entry in fields.entries)

@@ -85,6 +85,31 @@ def test_numbers_are_shown_as_a_person_writes_them(quantity: Quantity, texts: di
     assert {value: quantity.show(value) for value in texts} == texts
 
 
+@pytest.mark.parametrize(
+    ("quantity", "texts"),
+    [
+        (DURATION, {"1,5s": "1.5s", "200µs": "200us", "200 MS": "200ms", "1s500ms": "1.5 s", "1m30s": "90 s",
+                    "5m": "5min", "1day": "24h", "10 Hz": "100 ms", ".5 sec": "0.5s", "1e3ms": "1000ms",
+                    "2 seconds": "2s"}),
+        (RATE, {"5/s": "5 Hz", "10ms": "100 Hz", "20hz": "20 Hz", "1 kHz": "1000 Hz", "3 per second": "3 Hz"}),
+        (SIZE, {"4M": "4MB' or '4MiB", "64K": "64kB' or '64KiB", "4 mib": "4MiB", "4MB/s": "4MB"}),
+        (DATA_RATE, {"500kB": "500kB/s", "500 kbps": "62.5kB/s", "1Mbit/s": "0.125MB/s", "2m": "2MB/s' or '2MiB/s"}),
+    ],
+)  # fmt: skip
+def test_the_quantity_of_the_kind_that_was_meant_is_suggested(quantity: Quantity, texts: dict[str, str]) -> None:
+    for text, meant in texts.items():
+        with pytest.raises(ValueError, match=r"\w") as raised:
+            quantity.parse(text)
+        assert str(raised.value).partition("; ")[2] == f"did you mean '{meant}'?"
+
+
+@pytest.mark.parametrize(
+    "text", ["5 parsecs", "0x5s", "4", "s", "1s5", "1e999999999s", "9" * 99 + "s", "never", "5 Hz 3 MB"]
+)
+def test_what_could_be_anything_has_no_suggestion(text: str) -> None:
+    assert units.meant_quantity(text, lambda _: True) == ""
+
+
 _DURATIONS = st.integers(1, units.MAX_DURATION)
 _ROUND = st.builds(
     lambda count, unit: count * unit, st.integers(1, 999), st.sampled_from([10**3, 10**6, 10**9, 6 * 10**10])

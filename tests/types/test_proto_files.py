@@ -63,7 +63,12 @@ def test_proto_without_syntax_is_a_finding(refused: Refused, text: str) -> None:
 
 @pytest.mark.parametrize(
     ("written", "meant"),
-    [("../proto", "'../protos'"), ("protos", "'../protos'"), ("../protos/a.proto", "name its folder"), ("x", "relative")],
+    [
+        ("../proto", "'../protos'"),
+        ("protos", "'../protos'"),
+        ("../protos/a.proto", "name its folder"),
+        ("x", "relative to the table"),
+    ],
 )
 def test_a_folder_that_is_not_there_is_told_with_what_is(tmp_path: Path, written: str, meant: str) -> None:
     (tmp_path / "protos").mkdir()

@@ -1,0 +1,261 @@
+"""What to write in place of a key or value that does not fit: tables of what people write, and what they mean by it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from router.errors import did_you_mean, nearest
+from router.table.compose import resolve
+from router.table.model import MAP, TEXT
+from router.table.nodes import MappingNode, Node, Path, ScalarNode, node_at, to_data
+from router.table.schema import SchemaError, matches, table_schema
+from router.table.source import in_braces
+from router.table.units import meant_quantity
+
+NAME_FIELDS = ("fields", "send")
+"""Keys under which the names of fields stand, each with an expression."""
+_ELSEWHERE = {
+    "topic": ("name", "ros"),
+    "endpoint": ("name", "to", "destination"),
+    "package": ("pkg", "msgs"),
+    "type": ("msg", "message", "msg_type", "message_type"),
+    "queue_depth": ("queue", "queue_size", "depth"),
+    "source": ("src", "from", "sender"),
+    "destinations": ("dst", "dest", "target", "targets", "to"),
+    "fields": ("map", "mapping"),
+    "when": ("if", "condition", "filter"),
+    "max_rate": ("rate", "hz", "frequency", "throttle"),
+    "publish_period": ("period", "rate", "interval"),
+    "ttl": ("max_age", "lifetime"),
+    "deadman": ("watchdog", "failsafe"),
+    "send": ("payload", "message", "command"),
+    "none": ("ignore", "reason"),
+    "http": ("metrics", "prometheus"),
+    "endpoints": ("boards", "devices", "hosts", "nodes"),
+    "extends": ("include", "includes", "import", "imports", "base"),
+    "kind": ("type",),
+    "websocket": ("ws", "websockets"),
+    "framing": ("frame",),
+    "regex": ("pattern", "re"),
+    "protos": ("proto_path", "path", "folder", "directory"),
+    "rotate_after": ("rotate", "rotation", "split"),
+    "retention": ("size", "max_size", "keep"),
+    # of tests
+    "given": ("when", "input"),
+    "expect": ("then", "output"),
+    "times": ("count", "repeat"),
+    "from": ("source", "sender"),
+    "case": ("payload", "type"),
+}
+"""Keys, and what people who know other programs call them."""
+ADDRESS_PARTS = ("ip", "host", "port")
+_IN_OTHER_WORDS = (
+    ("address", ADDRESS_PARTS, "an address is IP and port in one: `address: 192.168.0.30:8`"),
+    ("ignore", ("enabled", "enable", "disabled", "active"), "what is out of use has the one key `ignore: why`"),
+    ("qos", ("latched", "latch", "transient_local"), "write `qos: {durability: transient_local}`"),
+    ("qos", ("reliable", "best_effort"), "write `qos: {reliability: best_effort}` or `reliable`"),
+    ("websocket", ("type", "kind", "address", "port"), "write its kind and address, such as {websocket: 0.0.0.0:8765}"),
+    ("package", ("timeout", "repeat"), "write `deadman: {timeout: 500ms, repeat: 100ms}`"),
+    ("repeat", ("send", "at_start"), "each deadman says that for itself"),
+    ("at", ("wait", "sleep", "delay", "after"), "say when it is, since the beginning of the test: `at: 500ms`"),
+    ("extends", ("description", "name", "title"), "what is for people stands in a comment: `# ...`"),
+    ("source", ("description", "comment", "note"), "what is for people stands in a comment: `# ...`"),
+)
+"""A key that there is, those that people write where it is known, and how to say what they mean."""
+CLOSE = 0.7
+"""How near a misspelt key is to the one that it stands for: `period` is not `schema_period`."""
+
+
+def meant(name: str, known: Iterable[str]) -> str | None:
+    """The key among `known` that a misspelt one stands for."""
+    known = list(known)
+    if ":" in name or in_other_words(name, known):
+        return None
+    return next((key for key in known if name in _ELSEWHERE.get(key, ())), None) or nearest(name, known, CLOSE)
+
+
+def in_other_words(name: str, known: Iterable[str]) -> str:
+    return next((hint for key, names, hint in _IN_OTHER_WORDS if key in known and name in names), "")
+
+
+_NAMED = {"topics": "topic", "destinations": "endpoint"}
+"""Lists whose items are mappings, not keys of one, and the key that names an item."""
+
+
+def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
+    """What to do about a key with this value that the mapping at `path` does not have."""
+    if words := in_other_words(name, known):
+        return words
+    if ":" in name:
+        return f"a space is missing after ':', write `{': '.join(name.split(':', 1))}`"
+    if key := meant(name, known):
+        return f"did you mean '{key}'?"
+    if path[-1:] == ("deadman",) and "send" in known and isinstance(value, MappingNode):
+        return f"a payload case stands under 'send': `send: {{{name}: ...}}`"
+    if key := _NAMED.get(str(path[-1]) if path else ""):
+        is_listed = isinstance(value, ScalarNode) and value.value is None
+        return f"write a list: [{name}, ...]" if is_listed else f"write a list: [{{{key}: {name}, ...}}]"
+    return _owners(name, path) or did_you_mean(name, known, CLOSE)
+
+
+def _owners(name: str, path: Path) -> str:
+    """A hint for a key that there is, but elsewhere in a table; empty where there is no such key.
+
+    Others that are called as what stands at `path` (deadmen are of two kinds) would make no hint.
+    """
+    definitions = table_schema()["definitions"]
+    others = (*map(str, path[-1:]), "defaults")
+    owners = [
+        owner
+        for owner, schema in definitions.items()
+        if _has(schema, name) and not owner.endswith(others) and not owner.startswith("complete")
+    ]
+    owners += ["the table itself"] if _has(table_schema(), name) else []
+    return f"that is a key of: {', '.join(owners)}" if owners else ""
+
+
+def _has(schema: Any, name: str) -> bool:
+    return any(name in part.get("properties", ()) for part in (schema, schema.get("then", {}), schema.get("else", {})))
+
+
+def for_value(error: SchemaError) -> str:
+    """A hint that says which value was meant, where that is clear."""
+    value = str(error.value)
+    if error.keyword == "pattern":
+        pattern = error.limit
+        hint = as_variable(value) or meant_quantity(value, lambda each: matches(each, pattern))
+        is_unset = error.path[-1] in _OPTIONAL and value in ("none", "never", "unlimited")
+        return f"leave '{error.path[-1]}' out" if is_unset else hint
+    if error.keyword == "const" and value == str(error.limit):
+        return f"write it without quotes: {value}"
+    if error.keyword != "enum":
+        return ""
+    if error.path[-1] in ("qos", "profile") and (key := _QOS_WORDS.get(value)):
+        return f"write `qos: {{{key}}}`"
+    near = nearest(value, error.limit)
+    return f"did you mean '{near}'?" if near else ""
+
+
+_OPTIONAL = ("ttl", "age", "max_rate")
+"""Limits of which there are none where the key is missing."""
+_QOS_WORDS = {
+    "reliable": "reliability: reliable",
+    "best_effort": "reliability: best_effort",
+    "transient_local": "durability: transient_local",
+    "latched": "durability: transient_local",
+    "keep_all": "history: keep_all",
+}
+"""Words that are no profile, and the key that they belong to."""
+_LOCAL = "{{address: {0}}}"
+_INSTEAD: Mapping[Path, str] = {
+    ("listen",): "{{rover: {{address: {0}}}}}",
+    ("listen", "*"): _LOCAL,
+    ("http",): _LOCAL,
+    ("foxglove",): _LOCAL,
+    ("endpoints", "*"): "{{address: {0}, kind: board}}",
+    ("node",): "{{name: {0}}}",
+    ("record",): "{{directory: {0}}}",
+    ("reload",): "{{on_change: {0}}}",
+    ("defaults", "deadman"): "{{timeout: {0}}}",
+    ("gateways", "*", "topics"): "{{include: [{0}]}}",
+    ("gateways", "*", "inbound", "*"): "{{topic: {0}, type: TYPE}}",
+}
+"""Mappings, and what to write in place of the one value that stands there."""
+
+
+_BY_NAME: tuple[Path, ...] = (("listen",), ("endpoints",), ("routes",), ("gateways",))
+"""Mappings whose keys are names that the table chooses."""
+
+
+def for_type(error: SchemaError, tree: Node) -> str:
+    """What to do about a value of the wrong type, where that is clear."""
+    name, value = str(error.path[-1]) if error.path else "", error.value
+    if value is None:
+        return _for_nothing(error, tree, name)
+    if isinstance(value, str) and "object" in error.limit and re.match(r"\w+:[^\s/]", value):
+        return "a space is missing after ':'"
+    if error.path[:-1] == ("routes",):
+        if name in table_schema()["definitions"]["route"]["properties"]:
+            return f"'{name}' is a key of a route: indent it further than the payload case that it is for"
+        return f"write `{name}: {{ignore: why}}`" if value in (False, "ignore", "none") else ""
+    if error.is_list_in_list:
+        rows = to_data(node_at(tree, error.path[:-1]))
+        count = sum(len(row) if isinstance(row, list) else 1 for row in rows) if isinstance(rows, list) else 0
+        return f"write one list of {count}, row after row"
+    return _written_otherwise(error, name, value)
+
+
+def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
+    first, _, rest = name.partition(" ")
+    if ":" in name:
+        return "a space is missing after ':'"
+    if rest:
+        return f"a ':' is missing, write `{first}: {rest}`"
+    if "object" in error.limit:
+        is_case = error.path[:-1] == ("routes",)
+        return "indent what belongs to it further than it" + (", or write {ignore: why}" if is_case else "")
+    if name == TEXT:
+        return "write `{text: WORD}`"
+    siblings = node_at(tree, error.path[:-1])
+    if isinstance(siblings, MappingNode) and MAP in siblings.entries:
+        return f"say what it becomes: `{name}: VALUE`"
+    return "a field that is left out keeps its default" if any(key in error.path for key in NAME_FIELDS) else ""
+
+
+def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
+    """The value in the form that its key takes."""
+    if isinstance(value, str) and _is_of(error.limit, resolve(value)):
+        return f"write it without quotes: {value}"
+    if hint := _for_collection(error, value):
+        return hint
+    if (written := _in_flow(value)) is None or (isinstance(value, bool) and error.path != ("reload",)):
+        return ""
+    if instead := next((text for place, text in _INSTEAD.items() if _is_at(error.path, place)), ""):
+        if isinstance(value, list) and "[" not in instead:
+            return ""
+        text = instead.format(f"IP:{written}" if isinstance(value, int) and "address: {0}" in instead else written)
+        key = "NAME" if name == "address" else name
+        return f"write `{text}`" if isinstance(error.path[-1], int) else f"write `{key}: {text}`"
+    if error.limit == "array":
+        return f"write `{name}: [{written}]`"
+    if name == "qos" and isinstance(value, int):
+        return f"write `qos: {{depth: {written}}}`"
+    if error.limit == "string" and not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list):
+        return f'quote it: "{written}"'
+    return ""
+
+
+def _is_of(kinds: str | list[str], value: object) -> bool:
+    if isinstance(value, bool):
+        return kinds == "boolean"
+    return isinstance(value, (int, float)) and ("number" in kinds or "integer" in kinds)
+
+
+def _for_collection(error: SchemaError, value: object) -> str:
+    if isinstance(value, dict) and error.limit == "array":
+        return "begin each of its items with '-'"
+    if isinstance(value, list) and error.path in _BY_NAME:
+        return "write a name and ':' in place of each '-'"
+    return "several stand under 'topics'" if isinstance(value, list) and error.path[-1] == "topic" else ""
+
+
+def _is_at(path: Path, place: Path) -> bool:
+    return len(path) == len(place) and all(one in ("*", step) for one, step in zip(place, path, strict=True))
+
+
+def _in_flow(value: object) -> str | None:
+    """A scalar, or the scalars of a list, as they stand within brackets; None for anything else."""
+    if isinstance(value, list):
+        items = [_in_flow(item) for item in value]
+        return None if None in items or not items else ", ".join(item for item in items if item)
+    if isinstance(value, str):
+        return value if re.fullmatch(r"[\w./][\w./:* -]*", value) else json.dumps(value)
+    return json.dumps(value) if isinstance(value, (bool, int, float)) else None
+
+
+def as_variable(text: str) -> str:
+    """A hint for a variable that is written as in a shell."""
+    return f'write "{in_braces(text)}"' if in_braces(text) != text else ""

@@ -1,0 +1,261 @@
+"""The shape of a table: checked by its schema, with errors as findings in words.
+
+The schema carries the words: `errorMessage` ("must be ...", which editors show as well) beside the keyword. A misspelt
+key is one mistake: it is reported and then read as the key that was meant, so that nothing is found missing on its
+account.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Container, Iterator
+from dataclasses import replace
+
+from router.errors import Code, Diagnostic, SourceSpan, nearest
+from router.table import hints
+from router.table.addresses import BadAddressError, parse_address
+from router.table.nodes import Entry, MappingNode, Node, Path, ScalarNode, cut_off, key_at, node_at, rewritten
+from router.table.reading import mapping
+from router.table.schema import SCHEMA, SchemaError, schema_errors
+
+_TYPES = {
+    "object": "a mapping",
+    "array": "a list",
+    "string": "text",
+    "integer": "a whole number",
+    "number": "a number",
+    "boolean": "true or false",
+}
+_LONGEST = 60
+_ADDRESSES = ("address", "udp", "tcp", "websocket", "receive")
+"""Keys under which an address stands."""
+_NAME_DEPTH = len(("endpoints", "name"))
+_HINTS_FOR_MISSING = {
+    "source": "say who sends it: an endpoint, or {topic: NAME} for ROS; or say 'ignore: why'",
+    "transport": "or say 'ignore: why'",
+    "version": "begin with 'version: 1'",
+    "receive": "what its client publishes has to arrive somewhere",
+}
+_BELONG_TOGETHER = ("envelope", "listen", "routes")
+_HINT_FOR_WHOLE = "'envelope', 'listen' and 'routes' belong together; a table with 'gateways' only needs none of them"
+
+
+def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
+    """The tree with misspelt keys put right and everything that has a finding marked broken."""
+    tree: Node = root
+    found = schema_errors(tree, SCHEMA)
+    while unknown := [error for error in found if error.keyword == "additionalProperties"]:
+        repairs = {}
+        empty = {error.path for error in found if error.lacks_mapping}
+        for error in unknown:
+            known = list(error.schema["properties"])
+            findings.extend(unknown_keys(tree, error.path, known, subject(error.path), empty))
+            repairs[error.path] = functools.partial(_with_known_keys, known=known)
+        tree = rewritten(tree, repairs)
+        found = schema_errors(tree, SCHEMA)
+    rests = {error.path for error in found if _is_rest(tree, error.path)}
+    found = [error for error in found if error.path not in rests]
+    said = _said_elsewhere(found)
+    findings.extend(finding(error, tree) for error in found if error not in said and not _is_broken(tree, error.path))
+    tree = rewritten(tree, {error.path: _as_broken for error in found})
+    return mapping(rewritten(tree, {path[:-1]: _without_rests for path in rests}))
+
+
+def _said_elsewhere(found: list[SchemaError]) -> list[SchemaError]:
+    """Errors that go with another one: lists after a first one in a list, and what stands below `send` beside a case
+    that lacks its fields.
+    """
+    empty = [error.path for error in found if error.lacks_mapping and error.path[-2:-1] == ("send",)]
+    groups = [path[:-1] for path in empty]
+    said = [error for error in found if error.path not in empty and {error.path, error.path[:-1]} & {*groups}]
+    rows: dict[Path, SchemaError] = {}
+    lists = [error for error in found if error.is_list_in_list]
+    said += [error for error in lists if rows.setdefault(error.path[:-1], error) is not error]
+    return said
+
+
+def _as_broken(node: Node) -> Node:
+    return replace(node, broken=True)
+
+
+def _is_broken(tree: Node, path: Path) -> bool:
+    key = key_at(tree, path)
+    return node_at(tree, path).broken or (key is not None and key.broken)
+
+
+def _is_rest(tree: Node, path: Path) -> bool:
+    """There is no value because there is no key: a comma cut it off an expression, which will have a finding."""
+    siblings = node_at(tree, path[:-1]) if any(name in path[:-1] for name in hints.NAME_FIELDS) else None
+    return isinstance(siblings, MappingNode) and path[-1] in _rests(siblings)
+
+
+def _without_rests(node: Node) -> Node:
+    written = mapping(node)
+    rests = _rests(written)
+    return replace(written, entries={name: entry for name, entry in written.entries.items() if name not in rests})
+
+
+def _rests(node: MappingNode) -> set[str]:
+    return set(cut_off((name, entry.value) for name, entry in node.entries.items()))
+
+
+def unknown_keys(
+    tree: Node, path: Path, known: list[str], owner: str, empty: Container[Path] = ()
+) -> Iterator[Diagnostic]:
+    """A finding for each key of the mapping at `path` that is not `known`.
+
+    None for those below a key at one of the paths in `empty`: they belong to it.
+    """
+    said = set()
+    for name, entry in mapping(node_at(tree, path)).entries.items():
+        if (*path, name) in empty:
+            return
+        if name in known or entry.key.broken:
+            continue
+        hint = hints.for_key(name, entry.value, path, known)
+        if hint not in said:
+            yield Diagnostic(entry.key.span, Code.UNKNOWN_KEY, f"{owner} has no key '{name}'", hint)
+        said.add(hints.in_other_words(name, known) or None)
+
+
+def _with_known_keys(node: Node, known: list[str]) -> Node:
+    written = mapping(node)
+    entries: dict[str, Entry] = {}
+    broken = written.broken
+    for name, entry in written.entries.items():
+        free = [] if hints.in_other_words(name, known) else [key for key in known if key not in written.entries]
+        meant = name if name in known else hints.meant(name, free)
+        if meant is None or (meant != name and meant in entries):
+            broken = True  # what the key was to say is lost
+        else:
+            entries[meant] = entry
+    if "address" in entries and any(name in written.entries for name in hints.ADDRESS_PARTS):
+        entries["address"] = replace(entries["address"], value=_as_broken(entries["address"].value))
+    return replace(written, entries=entries, broken=broken)
+
+
+# Messages
+
+
+def finding(error: SchemaError, tree: Node) -> Diagnostic:
+    """The finding for anything but an unknown key of a closed mapping."""
+    path, keyword = error.path, error.keyword
+    key = key_at(tree, path)
+    name = subject(path)
+    if error.about_name:
+        return _bad_name(error, key.span if key else _first_line(tree))
+    span = _blamed(tree, path)
+    if keyword == "required":
+        return _missing_key(error, tree)
+    if keyword == "type":
+        what = f"{name} {_expected(error)}, not {shown(error.value)}"
+        return Diagnostic(span, Code.WRONG_TYPE, what, hints.for_type(error, tree))
+    if keyword == "pattern" and path[-1] in _ADDRESSES:
+        return _bad_address(str(error.value), span)
+    if keyword == "uniqueItems":
+        return _repeated(error, tree)
+    code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
+    if keyword == "maxProperties":
+        return Diagnostic(span, code, f"{name} {_expected(error)}, and no other beside it")
+    hint = hints.for_value(error)
+    if keyword == "minProperties" and "errorMessage" in error.schema:
+        return Diagnostic(span, code, f"{name} {_expected(error)}")
+    if keyword.startswith("min") and keyword != "minimum":  # minLength, minItems, minProperties
+        return Diagnostic(span, code, f"{name} must not be empty")
+    return Diagnostic(span, code, f"{name} {_expected(error)}, not {shown(error.value)}", hint)
+
+
+def shown(value: object) -> str:
+    """A value as messages name it."""
+    if value is None:
+        return "empty"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (int, float)):
+        return f"the number {_clipped(str(value))}"
+    if isinstance(value, str):
+        return f"the text '{_clipped(value)}'"
+    return "a mapping" if isinstance(value, dict) else "a list"
+
+
+def _expected(error: SchemaError) -> str:
+    schema, limit = error.schema, error.limit
+    if "errorMessage" in schema:
+        return str(schema["errorMessage"])
+    if "enum" in schema:
+        return "must be one of " + ", ".join(f"'{word}'" for word in schema["enum"])
+    if error.keyword == "type":
+        return "must be " + " or ".join(_TYPES[name] for name in ([limit] if isinstance(limit, str) else limit))
+    if error.keyword in ("minimum", "maximum"):
+        return f"must be from {schema['minimum']} to {schema['maximum']}"
+    return f"must be {limit}"
+
+
+def _bad_name(error: SchemaError, span: SourceSpan) -> Diagnostic:
+    name = f"'{_clipped(str(error.value))}'"
+    if not _is_chosen(error.path):
+        return Diagnostic(span, Code.UNKNOWN_KEY, f"{name} {_expected(error)}")
+    return Diagnostic(span, Code.BAD_VALUE, f"the name {name} {_expected(error)}")
+
+
+def _is_chosen(path: Path) -> bool:
+    """The key at the path is a name that a person gave, not one of the keys that others of their mapping rule out."""
+    return len(path) <= _NAME_DEPTH or any(key in path[_NAME_DEPTH:-1] for key in hints.NAME_FIELDS)
+
+
+def _missing_key(error: SchemaError, tree: Node) -> Diagnostic:
+    missing = error.message.split("'")[1]  # jsonschema has one error for each key and names it nowhere else
+    key = key_at(tree, error.path)
+    span = key.span if key else _first_line(node_at(tree, error.path))
+    is_whole_part = len(error.path) == _NAME_DEPTH
+    hint = _HINTS_FOR_MISSING.get(missing, "") if is_whole_part or not error.path else ""
+    if not error.path and missing in _BELONG_TOGETHER:
+        hint = _HINT_FOR_WHOLE
+    if is_whole_part and key:
+        siblings = mapping(node_at(tree, error.path[:-1])).entries
+        extended = [name for name, entry in siblings.items() if entry.key.span.file != key.span.file]
+        hint = f"did you mean '{near}'?" if (near := nearest(key.text, extended, hints.CLOSE)) else hint
+    return Diagnostic(span, Code.MISSING_KEY, f"{subject(error.path)} lacks the key '{missing}'", hint)
+
+
+def _bad_address(text: str, span: SourceSpan) -> Diagnostic:
+    try:
+        parse_address(text)
+    except BadAddressError as error:
+        return Diagnostic(span, Code.BAD_ADDRESS, error.what, hints.as_variable(text) or error.hint)
+    raise AssertionError(f"the schema refuses the address '{text}', parse_address takes it")
+
+
+def _repeated(error: SchemaError, tree: Node) -> Diagnostic:
+    items = error.value if isinstance(error.value, list) else []
+    index = next(index for index, item in enumerate(items) if item in items[:index])
+    what = f"{shown(items[index])} stands in {subject(error.path)} twice"
+    return Diagnostic(node_at(tree, (*error.path, index)).span, Code.BAD_VALUE, what)
+
+
+def _blamed(tree: Node, path: Path) -> SourceSpan:
+    """The value if it is a word on a line, else the key that it stands under."""
+    node = node_at(tree, path)
+    key = key_at(tree, path)
+    if key is None or (isinstance(node, ScalarNode) and node.span.end_column > node.span.column):
+        return _first_line(node)
+    return key.span
+
+
+def _first_line(node: Node) -> SourceSpan:
+    """The span of a scalar, or of a collection's first key."""
+    if isinstance(node, MappingNode) and node.entries:
+        return next(iter(node.entries.values())).key.span
+    return node.span
+
+
+def subject(path: Path) -> str:
+    """What stands at a path, as messages name it."""
+    names = [step for step in path if isinstance(step, str)]
+    if not names:
+        return "the table"
+    return f"'{names[-1]}'" if isinstance(path[-1], str) else f"an item of '{names[-1]}'"
+
+
+def _clipped(text: str) -> str:
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
