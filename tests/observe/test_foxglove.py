@@ -206,8 +206,9 @@ def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
     assert client.channels["imu_info"] == before["imu_info"]
     assert client.channels["manual_brake"] != before["manual_brake"]
     client.subscribe("manual_brake")
-    told = {}
+    told, limit = {}, monotonic() + PATIENCE
     while "manual_brake" not in told:  # nobody says when the subscription has come
+        assert monotonic() < limit, told
         router.show(envelope(changed, "imu_info"), envelope(changed, "manual_brake", force=7))
         next_one = client.receive()
         told[next_one.topic] = next_one.message
