@@ -85,13 +85,13 @@ class Lookup:
         found = self.table.endpoints.get(name.value)
         if found is None and f"endpoints/{name.value}" not in self.table.broken:
             known = [*self.table.endpoints, *also]
-            hint = did_you_mean(name.value, known, _ALIKE)
+            hint = "did you mean 'any'?" if name.value == "*" and also else did_you_mean(name.value, known, _ALIKE)
             if "," in name.value:
                 names = [each.strip() for each in name.value.split(",") if each.strip()]
                 hint = f"write a list: [{', '.join(names)}]" if len(names) > 1 else "remove the ','"
             elif also and name.value == ROS:
                 hint = "a topic is written `source: {topic: NAME}`"
-            elif also and not nearest(name.value, known, _ALIKE):
+            elif also and name.value != "*" and not nearest(name.value, known, _ALIKE):
                 hint += f"; a topic is written `source: {{topic: {name.value}}}`"
             self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
         return found
@@ -193,6 +193,8 @@ def _ros_type_hint(name: str, known: Collection[str]) -> str:
     """Types of that name in whatever package, else what its package has, else where types come from."""
     parts = [part for part in re.split(r"[/:.]+", name) if part] or [name]
     package, short = parts[0], parts[-1]
+    if (exact := f"{package}/msg/{short}") in known:
+        return f"did you mean '{exact}'?"
     namesakes = [full for full in known if full.rpartition("/")[2] == short]
     siblings = [full for full in known if full.partition("/")[0] == package]
     source = Path("schemas", package, "msg", f"{short}.msg")

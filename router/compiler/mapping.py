@@ -6,6 +6,7 @@ Every entry that is wrong is a finding, and the rest of the mapping is still che
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Union
@@ -15,7 +16,10 @@ from router.compiler.expressions import ExpressionError, Scope, Typed, check
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
 from router.table.model import TEXT, Choices, Expression, FieldEntry, FieldMap
-from router.types.model import Field, MessageType, Type
+from router.types.model import Field, MessageType, String, Type
+
+_FRAME = re.compile(r"/?\w+(?:[/-]\w+)+|/\w+")
+"""Text that looks like a division or a difference: `base/imu_link`, `imu-link`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +153,7 @@ class _Builder:
                     self._whole.add(path)
                     message = f"{holder} has no fields"
                     hint = "give the whole of it one value, or choose one: {map: FIELD, VALUE: ..., else: ...}"
+                    hint = "text is {text: WORD}" if isinstance(holder, String) else hint
                     self.findings.append(Diagnostic(span, Code.UNKNOWN_FIELD, message, hint))
                 return []
             member = holder.field(name)
@@ -203,6 +208,8 @@ class _Builder:
             found = error.diagnostic
             if entry.value.choices is not None and found.span == entry.value.span:
                 found = self._chosen_finding(member, entry.value.choices) or found
+            if isinstance(member.type, String) and not entry.value.literal and _FRAME.fullmatch(entry.value.text):
+                found = replace(found, hint=f"as text it is {{text: {entry.value.text}}}")
             self.findings.append(found)
             return unset(member, entry.value.span)
         self.rows.append(Row(path, str(member.type), _text(entry.value), str(typed.kind), automatic=False))

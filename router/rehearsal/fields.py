@@ -19,7 +19,7 @@ from router.compiler.namespace import entries
 from router.errors import Code, Diagnostic, SourceSpan, UsageError, did_you_mean
 from router.rehearsal.rehearsal import START
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
-from router.table.reading import InvalidValueError
+from router.table.reading import InvalidValueError, is_text
 from router.table.units import duration, parse_duration
 from router.types.model import Bool, Bytes, Field, Float, Int, List, MessageType, String, Type
 from router.values import parse, scalar_text
@@ -200,7 +200,8 @@ class FieldReader:
                 raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} is a list: write [a, b]")
             case _, ScalarNode():
                 return self._scalar(kind, node, holder)
-        raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} takes one value")
+        hint = "write the text itself" if is_text(node) else ""
+        raise invalid(node.span, Code.WRONG_TYPE, f"a {kind} takes one value", hint)
 
     def _scalar(self, kind: Type, node: ScalarNode, holder: MessageType) -> Scalar:
         text = node.text

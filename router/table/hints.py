@@ -35,6 +35,8 @@ _ELSEWHERE = {
     "none": ("ignore", "reason"),
     "http": ("metrics", "prometheus"),
     "endpoints": ("boards", "devices", "hosts", "nodes"),
+    "include": ("whitelist", "allow", "only"),
+    "exclude": ("blacklist", "deny"),
     "extends": ("include", "includes", "import", "imports", "base"),
     "kind": ("type",),
     "websocket": ("ws", "websockets"),
@@ -55,6 +57,8 @@ ADDRESS_PARTS = ("ip", "host", "port")
 _IN_OTHER_WORDS = (
     ("address", ADDRESS_PARTS, "an address is IP and port in one: `address: 192.168.0.30:8`"),
     ("ignore", ("enabled", "enable", "disabled", "active"), "what is out of use has the one key `ignore: why`"),
+    ("endpoint", ("topic", "topics"), "a ROS topic is a key of the route: `topic: NAME`"),
+    ("queue_depth", ("endpoint",), "an endpoint is named alone: `source: NAME`"),
     ("qos", ("latched", "latch", "transient_local"), "write `qos: {durability: transient_local}`"),
     ("qos", ("reliable", "best_effort"), "write `qos: {reliability: best_effort}` or `reliable`"),
     ("websocket", ("type", "kind", "address", "port"), "write its kind and address, such as {websocket: 0.0.0.0:8765}"),
@@ -95,7 +99,7 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
         return f"did you mean '{key}'?"
     if path[-1:] == ("deadman",) and "send" in known and isinstance(value, MappingNode):
         return f"a payload case stands under 'send': `send: {{{name}: ...}}`"
-    if key := _NAMED.get(str(path[-1]) if path else ""):
+    if path[:1] == ("routes",) and (key := _NAMED.get(str(path[-1]))):
         is_listed = isinstance(value, ScalarNode) and value.value is None
         return f"write a list: [{name}, ...]" if is_listed else f"write a list: [{{{key}: {name}, ...}}]"
     return _owners(name, path) or did_you_mean(name, known, CLOSE)
@@ -193,7 +197,7 @@ def _for_nothing(error: SchemaError, tree: Node, name: str) -> str:
     if ":" in name:
         return "a space is missing after ':'"
     if rest:
-        return f"a ':' is missing, write `{first}: {rest}`"
+        return f"a ':' is missing, write `{first.rstrip('=')}: {rest.lstrip('= ')}`"
     if "object" in error.limit:
         is_case = error.path[:-1] == ("routes",)
         return "indent what belongs to it further than it" + (", or write {ignore: why}" if is_case else "")
@@ -239,7 +243,9 @@ def _for_collection(error: SchemaError, value: object) -> str:
         return "begin each of its items with '-'"
     if isinstance(value, list) and error.path in _BY_NAME:
         return "write a name and ':' in place of each '-'"
-    return "several stand under 'topics'" if isinstance(value, list) and error.path[-1] == "topic" else ""
+    if not isinstance(value, list) or error.path[-1] != "topic":
+        return ""
+    return "write a list: [{topic: A}, {topic: B}]" if "source" in error.path else "several stand under 'topics'"
 
 
 def _is_at(path: Path, place: Path) -> bool:

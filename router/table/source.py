@@ -154,6 +154,7 @@ def _value(match: re.Match[str], environ: Mapping[str, str]) -> str | Problem:
         near = nearest(name, environ)
         hint = f"did you mean '{near}'? " if near else ""
         hint += f"set it, or give it a default: ${{{name}:-value}}"
+        hint += f"; an expression names a field as `{name}`" if name.islower() else ""
         return Problem(match.start(), match.end(), Code.UNDEFINED_VARIABLE, f"the variable '{name}' is not set", hint)
     filled = value or default or ""
     if _OPENING in filled:

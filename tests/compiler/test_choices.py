@@ -106,6 +106,7 @@ routes:
           frame_id: {{map: state, SENSOR_ERROR: {{text: not a field}}, SENSOR_IDLE: "'idle'", else: {{text: "4"}}}}
           stamp.sec: {{map: is_calibrated, true: 1, false: 0}}
       - {{topic: names, type: sensor_msgs/msg/JointState, fields: {{name: [source, {{text: source}}]}}}}
+      - {{topic: number, type: std_msgs/msg/Int8, fields: {{data: {{map: source, sensor_board: 1}}}}}}
       - topic: word
         type: std_msgs/msg/String
         fields: {{data: {{map: str(state), text: {{text: map}}, else: source}}}}

@@ -12,6 +12,7 @@ from time import monotonic, time_ns
 from typing import cast
 
 import pytest
+from google.protobuf.message import Message
 from structlog.testing import capture_logs
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -206,7 +207,8 @@ def test_reload_keeps_channels_of_what_stays_and_brings_those_of_what_is_new(
     assert client.channels["imu_info"] == before["imu_info"]
     assert client.channels["manual_brake"] != before["manual_brake"]
     client.subscribe("manual_brake")
-    told, limit = {}, monotonic() + PATIENCE
+    told: dict[str, Message] = {}
+    limit = monotonic() + PATIENCE
     while "manual_brake" not in told:  # nobody says when the subscription has come
         assert monotonic() < limit, told
         router.show(envelope(changed, "imu_info"), envelope(changed, "manual_brake", force=7))

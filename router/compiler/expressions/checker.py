@@ -62,7 +62,7 @@ def _chosen(choices: Choices, span: SourceSpan, scope: Scope, expected: Type | N
     if choices.otherwise is not None:
         made = check(choices.otherwise, scope, expected)
     else:
-        _want_all(subject, keys, span)
+        _want_all(subject, keys, span, scope)
         made, last = replace(values[-1], node=copy.deepcopy(values[-1].node)), keys[-1]
         if isinstance(subject.kind, EnumKind):
             fitted = call("fit", copy.deepcopy(subject.node), copy.deepcopy(last.node), copy.deepcopy(last.node))
@@ -114,11 +114,13 @@ def _want_different(choices: Choices, keys: Sequence[Typed]) -> None:
             raise ExpressionError(name.span, Code.DUPLICATE_KEY, message, "remove one of the two")
 
 
-def _want_all(subject: Typed, keys: Sequence[Typed], span: SourceSpan) -> None:
+def _want_all(subject: Typed, keys: Sequence[Typed], span: SourceSpan, scope: Scope) -> None:
     """Refuse a map without `else` that leaves out values, or whose subject has no list of them."""
     hint = "list them, or say what they become: `else: VALUE`"
     covered = {key.constant for key in keys}
     if isinstance(subject.kind, BoolKind) and covered == {True, False}:
+        return
+    if is_source(subject) and scope.sources and covered == {*scope.sources}:
         return
     if not isinstance(subject.kind, EnumKind):
         message = f"a {subject.kind} has more values than those of this map"
@@ -233,6 +235,7 @@ def _unknown(text: str, span: SourceSpan, scope: Scope, expected: Type | None) -
     hint = (
         _of_an_enum(text, scope)
         or spellings.NAMES.get(text.lower())
+        or (f"an endpoint's name is text: '{text}'" if text in scope.sources else "")
         or did_you_mean(text, known)
         or "only constants can stand here"
     )
