@@ -15,7 +15,8 @@ from router.compiler.conversion import convert, same_named, unset
 from router.compiler.expressions import ExpressionError, Scope, Typed, check
 from router.compiler.plan import Each, Items, Plan, Record, Unset
 from router.errors import Code, Diagnostic, SourceSpan, did_you_mean
-from router.table.model import TEXT, Choices, Expression, FieldEntry, FieldMap
+from router.table.model import Choices, Expression, FieldEntry, FieldMap
+from router.table.nodes import TEXT
 from router.types.model import Field, MessageType, String, Type
 
 _FRAME = re.compile(r"/?\w+(?:[/-]\w+)+|/\w+")

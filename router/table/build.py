@@ -20,10 +20,7 @@ from router.errors import Code, Diagnostic, Located, SourceSpan, shown_path
 from router.table.addresses import LOCAL, REMOTE, Address, parse_local
 from router.table.keys import Key, keys_of
 from router.table.model import (
-    ELSE,
-    MAP,
     ROS,
-    TEXT,
     Choices,
     Deadman,
     Destination,
@@ -51,6 +48,9 @@ from router.table.model import (
     ZenohSettings,
 )
 from router.table.nodes import (
+    ELSE,
+    MAP,
+    TEXT,
     Entry,
     MappingNode,
     Node,
@@ -426,8 +426,6 @@ def _field_entries(fields: MappingNode, path: tuple[str, ...], spans: tuple[Sour
     for name, entry in fields.entries.items():
         inner = (*path, *name.split("."))
         inner_spans = (*spans, *_part_spans(entry.key))
-        if not is_valid(entry.value):  # what is left of it means something else
-            continue
         if isinstance(entry.value, MappingNode) and not is_choice(entry.value) and not is_text(entry.value):
             yield from _field_entries(entry.value, inner, inner_spans)
         else:

@@ -9,8 +9,7 @@ from typing import Any
 
 from router.errors import did_you_mean, nearest
 from router.table.compose import resolve
-from router.table.model import MAP, TEXT
-from router.table.nodes import MappingNode, Node, Path, ScalarNode, node_at, to_data
+from router.table.nodes import MAP, TEXT, MappingNode, Node, Path, ScalarNode, node_at, to_data
 from router.table.schema import SchemaError, matches, table_schema
 from router.table.source import in_braces
 from router.table.units import meant_quantity

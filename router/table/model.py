@@ -181,10 +181,6 @@ class Expression:
         return self.text if self.items is None else f"[{', '.join(map(str, self.items))}]"
 
 
-MAP, ELSE, TEXT = "map", "else", "text"
-"""The keys of values that are mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
-
-
 @dataclass(frozen=True, slots=True)
 class Choices:
     """`{map: fix_quality, GPS_FIX: 1, else: 0}`: the value of `subject` chooses among `values`, by its name."""

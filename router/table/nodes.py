@@ -189,6 +189,9 @@ def _child(node: Node, step: str | int) -> Node:
     raise LookupError(f"a {type(node).__name__} has no member {step!r}")
 
 
+MAP, ELSE, TEXT = "map", "else", "text"
+"""The keys of values that are mappings: `{map: fix_quality, GPS_FIX: 1, else: 0}` and `{text: imu_link}`."""
+
 _INDISPENSABLE = frozenset(
     {
         "source",
@@ -212,8 +215,6 @@ _INDISPENSABLE = frozenset(
 _SUFFICIENT = ({"source"}, {"ignore"}, {"topic"}, {"endpoint"}, {"transport"})
 """Sets of keys each of which gives a mapping a meaning, whatever else it lacks or has too much."""
 
-_OF_ONE_PIECE = {"map", "text"}
-"""Keys of values that are mappings, which mean nothing without one of their parts."""
 _NEEDED_BY = {"collect": ("topics",), "destinations": ("deadman",)}
 """Keys of a route, and others that mean nothing without: expressions use `items`, a deadman sends to destinations."""
 
@@ -237,8 +238,6 @@ def _valid_part(node: Node) -> Node | None:
 def _valid_mapping(node: MappingNode) -> MappingNode | None:
     if node.broken and not _has_meaning(node):
         return None
-    if _OF_ONE_PIECE & node.entries.keys() and not is_valid(node):
-        return None
     invalid = {key for key, entry in node.entries.items() if not (is_valid(entry.key) and is_valid(entry.value))}
     if invalid & _INDISPENSABLE:
         return None
@@ -253,7 +252,26 @@ def _valid_mapping(node: MappingNode) -> MappingNode | None:
 
 def _valid_entry(entry: Entry) -> Entry | None:
     """The valid part of an entry; None for one that is broken as a whole, such as a mapping in place of a list."""
-    return None if entry.value.broken else valid_part(entry)
+    if entry.value.broken:
+        return None
+    if entry.key.text == "fields" and not entry.key.broken:
+        fields = _valid_fields(entry.value)
+        return Entry(entry.key, fields) if fields else None
+    return valid_part(entry)
+
+
+def _valid_fields(node: Node) -> Node | None:
+    """The valid ones of the fields of a message. The value of a field is valid as a whole, or not at all."""
+    if node.broken:
+        return None
+    if not isinstance(node, MappingNode) or {MAP, TEXT} & node.entries.keys():
+        return node if is_valid(node) else None
+    entries = {
+        name: Entry(entry.key, value)
+        for name, entry in node.entries.items()
+        if not entry.key.broken and (value := _valid_fields(entry.value))
+    }
+    return replace(node, entries=entries)
 
 
 def _has_meaning(node: Node) -> bool:

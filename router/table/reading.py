@@ -12,8 +12,7 @@ from typing import TypeVar
 
 from router.errors import Code, Diagnostic, Located, SourceSpan
 from router.table.addresses import BadAddressError
-from router.table.model import MAP, TEXT
-from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from router.table.nodes import MAP, TEXT, MappingNode, Node, ScalarNode, SequenceNode
 
 V = TypeVar("V")
 R = TypeVar("R")
