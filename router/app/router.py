@@ -60,7 +60,7 @@ class Router:
     ) -> None:
         self.is_ready = False
         self._first = program
-        self._reporter = Reporter(self._addresses)
+        self._reporter = Reporter(self._address_of)
         self._counts = ThreadCounts(program.counters)
         self.mirror = Mirror(MAX_DATAGRAM, self._observers_changed, self._reporter.failed)
         context = RouterContext(self._counts, Timers(self._reporter.failed), self._reporter, self._deadman_changed)
@@ -109,8 +109,9 @@ class Router:
         self._open.close()
         logger.info("router stopped", **self.totals())
 
-    def _addresses(self) -> dict[str, Address]:
-        return {name: endpoint.address.value for name, endpoint in self.program.table.endpoints.items()}
+    def _address_of(self, name: str) -> Address | None:
+        endpoint = self.program.table.endpoints.get(name)
+        return endpoint.address.value if endpoint else None
 
     @property
     def program(self) -> Program:

@@ -85,14 +85,7 @@ class Lookup:
         found = self.table.endpoints.get(name.value)
         if found is None and f"endpoints/{name.value}" not in self.table.broken:
             known = [*self.table.endpoints, *also]
-            hint = "did you mean 'any'?" if name.value == "*" and also else did_you_mean(name.value, known, _ALIKE)
-            if "," in name.value:
-                names = [each.strip() for each in name.value.split(",") if each.strip()]
-                hint = f"write a list: [{', '.join(names)}]" if len(names) > 1 else "remove the ','"
-            elif also and name.value == ROS:
-                hint = "a topic is written `source: {topic: NAME}`"
-            elif also and name.value != "*" and not nearest(name.value, known, _ALIKE):
-                hint += f"; a topic is written `source: {{topic: {name.value}}}`"
+            hint = _endpoint_hint(name.value, known, is_source=bool(also))
             self.report(name.span, Code.UNKNOWN_ENDPOINT, f"there is no endpoint '{name.value}'", hint)
         return found
 
@@ -119,19 +112,24 @@ class Lookup:
             self.findings += error.diagnostics
             return None
         if found is None:
-            known = self.definitions.interfaces.names()
-            packages = {full.partition("/")[0] for full in known}
-            package, hint = self.table.package, _ros_type_hint(name, known)
-            if package is not None and topic.type.span == topic.topic.span:
-                if package.value not in packages:
-                    near = nearest(package.value, packages)
-                    hint = f"did you mean '{near}'?" if near else "build and source it, or name another one"
-                    message = f"no package '{package.value}' has ROS messages"
-                    self.report(package.span, Code.UNKNOWN_ROS_TYPE, message, hint)
-                    return None
-                hint = f"that is what `defaults.package` makes of the payload; say its 'type' ({hint})"
-            self.report(topic.type.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name}'", hint)
+            is_default = topic.type.span == topic.topic.span
+            self._report_type(topic.type, self.table.package if is_default else None)
         return found
+
+    def _report_type(self, name: Located[str], package: Located[str] | None) -> None:
+        """Report an unknown type. `package` is that of the table's defaults where the type is made of it."""
+        known = self.definitions.interfaces.names()
+        packages = {full.partition("/")[0] for full in known}
+        if package is not None and package.value not in packages:
+            near = nearest(package.value, packages)
+            hint = f"did you mean '{near}'?" if near else "build and source it, or name another one"
+            message = f"no package '{package.value}' has ROS messages"
+            self.report(package.span, Code.UNKNOWN_ROS_TYPE, message, hint)
+            return
+        hint = _ros_type_hint(name.value, known)
+        if package is not None:
+            hint = f"that is what `defaults.package` makes of the payload; say its 'type' ({hint})"
+        self.report(name.span, Code.UNKNOWN_ROS_TYPE, f"there is no ROS message type '{name.value}'", hint)
 
     def scope(
         self,
@@ -168,6 +166,20 @@ class Lookup:
             return None
         hint = "compare something, as in fix_quality != GPSFixQuality.NO_FIX"
         return self.value(expression, scope, (BoolKind,), "'when' takes a bool", hint)
+
+
+def _endpoint_hint(name: str, known: Collection[str], *, is_source: bool) -> str:
+    """What to write for an endpoint that there is not."""
+    if "," in name:
+        names = [each.strip() for each in name.split(",") if each.strip()]
+        return f"write a list: [{', '.join(names)}]" if len(names) > 1 else "remove the ','"
+    if is_source and name == "*":
+        return f"did you mean '{ANY}'?"
+    if is_source and name == ROS:
+        return "a topic is written `source: {topic: NAME}`"
+    is_topic = is_source and not nearest(name, known, _ALIKE)
+    topic = f"; a topic is written `source: {{topic: {name}}}`" if is_topic else ""
+    return did_you_mean(name, known, _ALIKE) + topic
 
 
 def nested_types(declared: Type) -> Iterable[MessageType]:

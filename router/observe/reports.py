@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from router.engine import Report
 from router.log import SUMMARY_INTERVAL_NS, FloodLog, logger
@@ -14,9 +14,9 @@ from router.table.addresses import Address
 class Reporter:
     """Logs the first report of a kind at once and then at most one line per 10 s, from a thread of its own."""
 
-    def __init__(self, addresses: Callable[[], Mapping[str, Address]]) -> None:
-        """`addresses` returns those of the running table's endpoints."""
-        self._addresses = addresses
+    def __init__(self, address_of: Callable[[str], Address | None]) -> None:
+        """`address_of` returns the address of an endpoint of the running table, None for any other target."""
+        self._address_of = address_of
         self._floods = FloodLog()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._summarise, name="log", daemon=True)  # the start may fail
@@ -59,7 +59,7 @@ class Reporter:
         )
 
     def _text(self, error: BaseException, target: str) -> str:
-        address = self._addresses().get(target) if isinstance(error, ConnectionRefusedError) else None
+        address = self._address_of(target) if isinstance(error, ConnectionRefusedError) else None
         return str(error) if address is None else nobody_listens(address)
 
     def failed(self, error: Exception) -> None:

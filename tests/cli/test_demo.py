@@ -27,6 +27,37 @@ def test_without_the_rovers_messages_it_plays_the_first_table(
     assert "comms" in capsys.readouterr().err
 
 
+FAILING = """
+import signal
+
+from router.cli import demo
+from router.compiler import check_table
+
+
+class Failing:
+    def __init__(self, *_, **__):
+        pass
+
+    def run(self, *_):
+        raise RuntimeError("the simulator is broken")
+
+    stop = close = __init__
+
+
+demo.Simulator = Failing
+with demo._simulated(check_table(demo.FIRST_TABLE / "routes" / "rover.yaml").program):
+    assert signal.sigwait({signal.SIGTERM}) == signal.SIGTERM
+"""
+
+
+def test_a_simulator_that_fails_ends_it_with_the_error() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FAILING], capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
+    assert done.returncode == 1
+    assert "RuntimeError: the simulator is broken" in done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("rclpy") is None or find_spec("comms") is None, reason="needs ROS 2 and comms")
 def test_it_says_where_to_look_and_ends_with_ctrl_c(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ def test_a_refused_datagram_is_explained(
 ) -> None:
     logged: list[object] = []
     monkeypatch.setattr(logger, "warning", lambda _, **fields: logged.append(fields["error"]))
-    reporter = Reporter(lambda: {"driving_board": Address("127.0.0.222", 25008)})
+    reporter = Reporter({"driving_board": Address("127.0.0.222", 25008)}.get)
     reporter.report(Report(kind, "manual_drive", target, "send_error", error))
     reporter.close()
     assert logged == [said]

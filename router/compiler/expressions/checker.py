@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from router.compiler.expressions import operators, spellings
@@ -83,8 +83,7 @@ def _key(name: Located[str], subject: Typed, scope: Scope) -> Typed:
         raise ExpressionError(name.span, Code.UNKNOWN_ENUM_VALUE, message, _key_hint(name.value, values))
     if isinstance(subject.kind, StringKind):
         key = Typed.at(name.span, StringKind(), ast.Constant(name.value))
-        if is_source(subject):
-            want_sources([key], scope)
+        want_senders([subject, key], scope)
         return key
     if name.value in scope.message.constants:
         return constant(scope.message.constants[name.value], name.span)
@@ -177,8 +176,7 @@ class _Checker:
                 return operators.boolean(node.op, [self.check(value) for value in node.values], span)
             case ast.Compare():
                 operands = [self.check(operand) for operand in (node.left, *node.comparators)]
-                if any(is_source(operand) for operand in operands):
-                    want_sources(operands, self.scope)
+                want_senders(operands, self.scope)
                 return operators.comparison(node.ops, operands, span)
             case ast.IfExp():
                 test = self.check(node.test)
@@ -269,14 +267,14 @@ def is_source(operand: Typed) -> bool:
     return isinstance(operand.node, ast.Name) and operand.node.id == SOURCE
 
 
-def want_sources(operands: Iterable[Typed], scope: Scope) -> None:
-    """Refuse texts that are compared with the name of the sender and that no sender of the message has."""
-    for operand in operands:
-        want_sources(operand.items or (), scope)
-        if isinstance(operand.constant, str) and scope.sources and operand.constant not in scope.sources:
-            message = f"'{operand.constant}' is no source of this route"
-            hint = did_you_mean(operand.constant, scope.sources)
-            raise ExpressionError(operand.span, Code.UNKNOWN_ENDPOINT, message, hint)
+def want_senders(operands: Sequence[Typed], scope: Scope) -> None:
+    """Refuse texts that are compared with the name of the sender, and that no sender of the message has."""
+    if not scope.sources or not any(map(is_source, operands)):
+        return
+    for each in (each for operand in operands for each in (operand, *(operand.items or ()))):
+        if isinstance(each.constant, str) and each.constant not in scope.sources:
+            message = f"'{each.constant}' is no source of this route"
+            raise ExpressionError(each.span, Code.UNKNOWN_ENDPOINT, message, did_you_mean(each.constant, scope.sources))
 
 
 def constant_path(node: ast.Attribute, scope: Scope) -> tuple[str, ...] | None:
@@ -313,8 +311,8 @@ def constant_of(path: tuple[str, ...], node: ast.Attribute, text: Parsed, scope:
     if not found:
         known = {value for holder in holders for value in _constants(holder)}
         message = f"'{holder_name}' has no value '{node.attr}'"
-        hint = did_you_mean(node.attr, known) if nearest(node.attr, known) else _of_an_enum(node.attr, scope)
-        hint = hint or did_you_mean(node.attr, known)
+        elsewhere = "" if nearest(node.attr, known) else _of_an_enum(node.attr, scope)
+        hint = elsewhere or did_you_mean(node.attr, known)
         raise ExpressionError(text.last_span(node), Code.UNKNOWN_ENUM_VALUE, message, hint)
     if len({value for _, value in found}) > 1:
         names = ", ".join(sorted(holder.name for holder, _ in found))

@@ -29,10 +29,8 @@ class Parsed:
 
     def _parse(self, text: str) -> ast.expr:
         if "#" in text and (at := _comment(text)) is not None:
-            span, message = (
-                self._expression.place.part(at, at + 1),
-                "a '#' ends the expression, and the rest is not used",
-            )
+            span = self._expression.place.part(self._indent + at, self._indent + at + 1)
+            message = "a '#' ends the expression, and the rest is not used"
             hint = "remove it: in quotes, and in a text of several lines, '#' begins no comment of YAML"
             raise ExpressionError(span, Code.EXPRESSION_SYNTAX, message, hint)
         try:
