@@ -233,6 +233,12 @@ def nearest_path(path: Path) -> Path | None:
     return path.with_name(near) if near else None
 
 
+def did_you_mean_file(written: str, path: Path) -> str:
+    """A hint for `path` that is not there, in the words of who wrote it; empty where none beside it is near."""
+    near = nearest_path(path)
+    return f"did you mean '{written.removesuffix(path.name)}{near.name}'?" if near else ""
+
+
 def nearest(name: str, known: Iterable[str], closeness: float = 0.6) -> str | None:
     """Return the known name that `name` most likely stands for, None when none is near. A `closeness` of 1 is equal."""
     folded = {candidate.lower(): candidate for candidate in sorted(set(known))}

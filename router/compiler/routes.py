@@ -123,8 +123,8 @@ def check_inbound(lookup: Lookup, route: Route, case: PayloadCase) -> CheckedRou
     """Check destinations, topics and `collect` of a route from UDP."""
     targets = [_forward(lookup, route, case, to, endpoint) for to, endpoint in destinations(lookup, route, case)]
     names = _frame_names(case, route.collect.span) if route.collect else {}
-    for topic in route.topics:
-        if any(are_same(topic, other) for other in route.topics[: route.topics.index(topic)]):
+    for index, topic in enumerate(route.topics):
+        if any(are_same(topic, other) for other in route.topics[:index]):
             lookup.report(topic.topic.span, Code.BAD_VALUE, f"'{topic.topic.value}' stands here twice", "name it once")
         ros_type = lookup.ros_type(topic)
         if ros_type is not None:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from router.compiler import Checked, check_table
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
-from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest_path, shown_path
+from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, did_you_mean_file, shown_path
 from router.rehearsal.fields import offset
 from router.rehearsal.steps import Expected, ExpectedReader, GivenReader, Names, Step
 from router.table.compose import compose
@@ -86,9 +86,8 @@ def _table_of(root: MappingNode, path: Path) -> Path:
     if isinstance(named, ScalarNode):
         table = Path(os.path.normpath(path.parent / named.text))
         if not table.is_file():
-            message, near = f"there is no table '{named.text}' beside this file", nearest_path(table)
-            hint = f"did you mean '{named.text.removesuffix(table.name)}{near.name}'?" if near else ""
-            raise TableError([Diagnostic(named.span, Code.BAD_FILE, message, hint)])
+            message = f"there is no table '{named.text}' beside this file"
+            raise TableError([Diagnostic(named.span, Code.BAD_FILE, message, did_you_mean_file(named.text, table))])
         return table
     for ending in ENDINGS:
         if path.name.endswith(ending):

@@ -14,12 +14,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from router.errors import Code, Diagnostic, TableError, nearest_path, shown_path
+from router.errors import Code, Diagnostic, TableError, did_you_mean_file, shown_path
 from router.table.compose import compose
+from router.table.hints import as_variable
 from router.table.nodes import Entry, MappingNode, Node, ScalarNode, SequenceNode
 from router.table.nodes import Path as Steps
 from router.table.reading import is_choice
-from router.table.source import Source, in_braces, read_source
+from router.table.source import Source, read_source
 
 KEY = "extends"
 IGNORE = "ignore"
@@ -128,12 +129,8 @@ def _read_base(path: Path, reference: ScalarNode) -> Source:
         if found.code is not Code.BAD_FILE or found.span.end_column > found.span.column:
             raise  # the file is there, a place in it is wrong
         what = f"'{reference.text}' cannot be extended: {found.message}"
-        near = nearest_path(path)
-        hint = f"looked for {shown_path(Path(os.path.realpath(path)))}"
-        if near:
-            hint = f"did you mean '{reference.text.removesuffix(path.name)}{near.name}'?"
-        if (variable := in_braces(reference.text)) != reference.text:
-            hint = f'write "{variable}"'
+        looked = f"looked for {shown_path(Path(os.path.realpath(path)))}"
+        hint = as_variable(reference.text) or did_you_mean_file(reference.text, path) or looked
         raise TableError([Diagnostic(reference.span, Code.BAD_EXTENDS, what, hint)]) from error
 
 
