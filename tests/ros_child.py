@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import runpy
-import select
 import signal
 import socket
 import subprocess
@@ -40,16 +39,21 @@ class ForkedProcess:
         self._pidfd = os.pidfd_open(self.pid)
 
     def poll(self) -> int | None:
-        if self.returncode is None and select.select([self._pidfd], [], [], 0)[0]:
+        if self.returncode is None and self._has_ended(0):
             self.returncode = _ask({"wait": self.pid})
             os.close(self._pidfd)
         return self.returncode
 
     def wait(self, timeout: float = 60) -> int:
-        assert self.returncode is not None or select.select([self._pidfd], [], [], timeout)[0], "it does not end"
+        assert self.returncode is not None or self._has_ended(timeout), "it does not end"
         code = self.poll()
         assert code is not None
         return code
+
+    def _has_ended(self, timeout: float) -> bool:
+        from tests.readable import readable  # the forker, which is this file as well, has no `tests`
+
+        return readable(self._pidfd, timeout)
 
     def send_signal(self, number: int) -> None:
         if self.poll() is None:

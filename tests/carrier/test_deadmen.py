@@ -6,7 +6,6 @@ import ctypes
 import errno
 import gc
 import os
-import select
 import socket
 import threading
 import weakref
@@ -31,6 +30,7 @@ from router.compiler.program import DeadmanPlan
 from router.engine.deadman import Deadman
 from router.engine.delivery import Report, Stale
 from tests.carrier.building import MEMORY, RACES, run_program
+from tests.readable import readable
 
 NEVER = (1 << 63) - 1
 MS = 1_000_000
@@ -410,7 +410,7 @@ def test_commands_leave_the_timer_alone_and_it_wakes_whoever_waits(
     timer = seams.seam_timer(side.deadmen.address)
     tripped = False
     while not tripped:
-        assert select.select([timer], [], [], 10)[0]
+        assert readable(timer, 10)
         now = monotonic_ns()
         side.serve(now)
         tripped = ("tripped", "drive", "", 0) in side.events()

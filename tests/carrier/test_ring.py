@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import select
 import threading
 from collections import deque
 from pathlib import Path
@@ -14,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.carrier.building import MEMORY, RACES, run_program
+from tests.readable import readable
 
 CAPACITY = 256
 LONGEST = 88
@@ -124,13 +124,13 @@ def test_a_reader_that_waits_is_woken_by_a_record_or_by_request(library: ctypes.
 def test_who_watches_a_ring_hears_of_each_record(library: ctypes.CDLL, ring: int) -> None:
     wake = library.ring_watch(ring)
     records = ctypes.create_string_buffer(CAPACITY)
-    assert not select.select([wake], [], [], 0)[0]
+    assert not readable(wake)
     for number in range(3):
         library.ring_put(ring, record(number, 2), 16)
-        assert select.select([wake], [], [], 0)[0]
+        assert readable(wake)
         os.eventfd_read(wake)
         assert library.ring_take(ring, records, CAPACITY, 0) == 16
-    assert not select.select([wake], [], [], 0)[0]
+    assert not readable(wake)
 
 
 def test_nothing_within_the_timeout(library: ctypes.CDLL, ring: int) -> None:

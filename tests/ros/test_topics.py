@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from itertools import count
@@ -20,6 +19,7 @@ from router.errors import StartError
 from router.ros import receiving
 from router.ros.router_node import RouterNode
 from router.ros.topics import DiscoveredPublisher, TopicListener, TopicTap
+from tests.readable import readable
 from tests.ros.opening import HELLO, STRING, cdr, open_ros, string_topic
 from tests.ros.peers import Publisher, wait_until
 
@@ -134,13 +134,13 @@ def test_a_deep_tap_gives_each_in_order_and_is_readable_until_it_counted(ros: Ro
     with closing(tapped(ros, depth=100)) as tap:
         peer = publisher(STRING)
         assert peer.line() == "matched"
-        assert select.select([tap.fd], [], [], 0)[0] == []
+        assert not readable(tap.fd)
         peer.publish(texts)
         peer.await_receipt()
-        assert select.select([tap.fd], [], [], 20)[0] == [tap.fd]
+        assert readable(tap.fd, 20)
         assert [cdr for cdr, _ in iter(tap.take, None)] == texts
         assert tap.arrived() == 50
-        assert select.select([tap.fd], [], [], 0)[0] == []
+        assert not readable(tap.fd)
 
 
 def test_what_was_kept_is_given_to_a_late_tap(ros: RouterNode, publisher: Publish) -> None:
