@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pty
-import select
 import subprocess
 import sys
 import time
@@ -15,6 +14,7 @@ import pytest
 
 from router.cli import demo
 from router.cli.init import FIRST_TABLE
+from tests.readable import readable
 
 PATIENCE = 60.0
 
@@ -70,8 +70,7 @@ def test_it_says_where_to_look_and_ends_with_ctrl_c(tmp_path: Path) -> None:
         os.close(theirs)
         limit, seen = time.monotonic() + PATIENCE, ""
         while "Foxglove " not in seen:
-            ready, _, _ = select.select([ours], [], [], limit - time.monotonic())
-            assert ready, seen
+            assert readable(ours, max(0.0, limit - time.monotonic())), seen
             try:
                 seen += os.read(ours, 65536).decode()
             except OSError:  # the terminal is closed

@@ -7,7 +7,6 @@ import json
 import os
 import pty
 import re
-import select
 import socket
 import struct
 import subprocess
@@ -21,6 +20,7 @@ import pytest
 
 from router.cli import BAD_TABLE, OK, main
 from tests.ports import free_port
+from tests.readable import readable
 from tests.tools.answering import answering
 
 PATIENCE = 30.0
@@ -92,8 +92,7 @@ def read_until(terminal: int, wanted: str) -> None:
     """Read what the terminal shows until it shows `wanted`."""
     limit, seen = time.monotonic() + PATIENCE, ""
     while wanted not in seen:
-        ready, _, _ = select.select([terminal], [], [], limit - time.monotonic())
-        assert ready, f"no {wanted!r} in {seen!r}"
+        assert readable(terminal, max(0.0, limit - time.monotonic())), f"no {wanted!r} in {seen!r}"
         seen += os.read(terminal, 65536).decode()
 
 
