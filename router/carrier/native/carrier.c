@@ -57,7 +57,7 @@ void carrier_mirror(struct carrier *carrier, struct ring *mirror, uint32_t lost)
 
 void carrier_pulse(struct carrier *carrier) { atomic_store(&carrier->pulse, monotonic_ns()); }
 
-uint64_t carrier_turns(struct carrier *carrier) { return atomic_load_explicit(&carrier->turns, memory_order_relaxed); }
+uint64_t carrier_turns(struct carrier *carrier) { return atomic_load_explicit(&carrier->turns, memory_order_acquire); }
 
 /* Feed the service manager's watchdog while receiving makes progress and Python does something now and then. */
 static void feed_watchdog(struct carrier *carrier) {

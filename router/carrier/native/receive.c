@@ -289,7 +289,8 @@ static bool is_stopping(struct carrier *carrier) {
 
 static bool goes_on(struct carrier *carrier) {
     brake(carrier);
-    atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_relaxed);
+    /* Release: who sees the next turn may free what was read in this one. */
+    atomic_fetch_add_explicit(&carrier->turns, 1, memory_order_release);
     return !is_stopping(carrier) && !atomic_load_explicit(&carrier->next, memory_order_relaxed);
 }
 
