@@ -30,6 +30,7 @@ from router.net.udp import Listener
 from router.recording.recorder import Recorder, RecordError
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, udp
+from tests.ports import free_port
 from tests.recording.recorder_rig import read
 
 ROOT = Path(__file__).parents[2]
@@ -212,8 +213,7 @@ def test_metrics_are_served_before_what_an_earlier_table_used_is_closed(
 
 
 def test_metrics_are_served_while_it_runs(site: Site) -> None:
-    with udp("127.0.0.1") as unused:
-        address = f"127.0.0.1:{unused.getsockname()[1]}"
+    address = f"127.0.0.1:{free_port(kind=socket.SOCK_STREAM)}"
     with Router(site.program(ROUTE + f'http: {{address: "{address}"}}\n')) as router:
         site.send(PH, b"\x00\x01")
         assert site.basestation.recv(1000) == PH
