@@ -255,6 +255,8 @@ class UdpSource:
     def __init__(self, address: Address, gateway: Address | None, say: Say) -> None:
         self._socket = udp.open_udp(address, "listen")
         ask_for_receive_buffer(self._socket, _RECEIVE_BUFFER)
+        self._readable = select.poll()
+        self._readable.register(self._socket, select.POLLIN)
         self._gateway = gateway
         self._say = say
         self.place = f"udp {Address(*self._socket.getsockname())}"
@@ -277,7 +279,7 @@ class UdpSource:
     def arrivals(self, timeout: float) -> Sequence[Arrival]:
         """Everything that is there at once, to empty the receive buffer quickly."""
         found: list[Arrival] = []
-        if select.select([self._socket], [], [], timeout)[0]:
+        if self._readable.poll(timeout * 1000):
             with suppress(BlockingIOError):
                 while len(found) < _MOST_AT_ONCE:
                     found.append(Arrival(*self._socket.recvfrom(LARGEST_DATAGRAM)))

@@ -39,10 +39,11 @@ def keys() -> Iterator[Callable[[float], str]]:
         yield _sleep
         return
     terminal = sys.stdin.fileno()
+    readable = select.poll()
+    readable.register(terminal, select.POLLIN)
 
     def wait(seconds: float) -> str:
-        ready, _, _ = select.select([terminal], [], [], seconds)
-        return os.read(terminal, 1).decode(errors="replace") if ready else ""
+        return os.read(terminal, 1).decode(errors="replace") if readable.poll(seconds * 1000) else ""
 
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal)
