@@ -29,7 +29,7 @@ from router.net.receiver import ReceiveThread
 from router.net.udp import Listener
 from router.recording.recorder import Recorder, RecordError
 from tests.acceptance.site import wait_until
-from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, udp
+from tests.app.conftest import BRAKE, DRIVE, Site, let_rest
 from tests.ports import free_port
 from tests.recording.recorder_rig import read
 
