@@ -6,7 +6,7 @@ import select
 
 
 def readable(fd: int, timeout: float = 0) -> bool:
-    """Wait up to `timeout` seconds."""
+    """Wait up to `timeout` seconds; not at all if it is negative, as what is left until a limit may be."""
     poll = select.poll()
     poll.register(fd, select.POLLIN)
-    return bool(poll.poll(timeout * 1000))
+    return bool(poll.poll(max(0.0, timeout) * 1000))

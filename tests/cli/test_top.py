@@ -92,7 +92,7 @@ def read_until(terminal: int, wanted: str) -> None:
     """Read what the terminal shows until it shows `wanted`."""
     limit, seen = time.monotonic() + PATIENCE, ""
     while wanted not in seen:
-        assert readable(terminal, max(0.0, limit - time.monotonic())), f"no {wanted!r} in {seen!r}"
+        assert readable(terminal, limit - time.monotonic()), f"no {wanted!r} in {seen!r}"
         seen += os.read(terminal, 65536).decode()
 
 
