@@ -6,7 +6,7 @@
 # ROVER is the address (or name) by which basestations reach the rover over the radio, 192.168.1.20 or 192.168.1.20:51820.
 # Each BASESTATION is a name, `basestation` unless said. For each computer there is then a folder NAME/wg0.conf beside
 # this script, in keys/, which git ignores: copy it to /etc/wireguard/wg0.conf there, and remove it here. Run again with
-# other names, it adds these to the rover's file and leaves the others as they are. docs/security.md tells the rest.
+# other names, it adds these to the rover's file and leaves the others as they are. docs/guides/security.md tells the rest.
 set -euo pipefail
 umask 077
 keys=${KEYS:-$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)/keys}

@@ -20,7 +20,7 @@ _FIRST = {
 _ROVER = {
     "routes": "the rover's tables and their test",
     "protos": "what its boards and basestation send",
-    "schemas": "for editors, and 'comms', its ROS messages; colcon builds them (docs/ros.md)",
+    "schemas": "for editors, and 'comms', its ROS messages; colcon builds them (docs/guides/ros-workspace.md)",
 }
 _DESCRIPTION = """Write a first table into a folder: one board and one topic, on this computer, with a simulator for
 the board. With --rover, write the rover's own tables, protos and ROS messages instead, to run them and to change

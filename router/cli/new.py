@@ -95,7 +95,7 @@ def _check_schemas(table: Path) -> None:
     if is_installed(schemas) or table.resolve().parent.parent != schemas.resolve().parent:
         what = f"the ROS messages of this router ({shown_path(schemas)}) do not belong to {shown_path(table)}"
         raise UsageError(
-            what, "use the router of that table's checkout, or write by hand what docs/adding-a-message.md lists"
+            what, "use the router of that table's checkout, or write by hand what docs/guides/add-a-message.md lists"
         )
 
 

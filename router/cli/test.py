@@ -25,7 +25,7 @@ from router.table import in_order
 FAILED = 1
 _DESCRIPTION = f"""Run the tests of route tables: given this message, the table sends and publishes exactly that. A
 table stands for the tests beside it, of rover.yaml those in rover.test.yaml; a folder for the *.test.yaml and
-*.test.yml in it (not in folders below it). docs/testing-tables.md has the language.
+*.test.yml in it (not in folders below it). docs/guides/test-tables.md has the language.
 
 Exit code: {OK} all passed, {FAILED} a test failed or --coverage found a gap, {BAD_TABLE} a test file or its table is
 wrong, {BAD_USAGE} wrong usage."""

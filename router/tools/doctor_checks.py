@@ -416,5 +416,5 @@ def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[Chec
             "whoever is in a network of this computer is in the ROS domain, and can publish commands: it is domain 0, "
             f"and nodes are looked for by {', '.join(networks)}",
             "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST where all nodes are on this computer, as the service has it by "
-            "itself; else a domain of your own, and docs/security.md",
+            "itself; else a domain of your own, and docs/guides/security.md",
         )

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parent.parent.parent
 FOLDER = ROOT / "deploy/prometheus"
-PAGE = ROOT / "docs/monitoring.md"
+PAGE = ROOT / "docs/guides/monitor.md"
 TESTS = sorted((FOLDER / "tests").glob("*.yml"))
 PROMTOOL = shutil.which("promtool")
 LEVELS = ("instance", "listener", "route", "endpoint", "destination", "topic", "target", "reason", "le")
@@ -88,7 +88,7 @@ def test_an_alert_says_how_bad_it_is_what_it_is_and_where_to_read_on(name: str) 
     alert = ALERTS[name]
     assert alert["labels"]["severity"] in ("critical", "warning", "info")
     assert set(alert["annotations"]) == {"summary", "runbook_url"}
-    assert alert["annotations"]["runbook_url"] == f"{{{{ $externalLabels.docs }}}}/monitoring.md#{name.lower()}"
+    assert alert["annotations"]["runbook_url"] == f"{{{{ $externalLabels.docs }}}}/guides/monitor.md#{name.lower()}"
     assert f"\n### {name}\n" in PAGE.read_text()
 
 

@@ -1,4 +1,4 @@
-"""What docs/recording.md shows is so."""
+"""What docs/guides/record-and-replay.md shows is so."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from router.compiler import check_table
 from tests.recording.recorder_rig import START, imu, recorded, seen
 from tests.tables import ROUTES
 
-PAGE = Path(__file__).parents[2] / "docs" / "recording.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "record-and-replay.md"
 
 
 def example(language: str) -> str:
