@@ -93,7 +93,7 @@ def test_links_to_files_and_headings_lead_somewhere(page: Path) -> None:
     assert wrong == []
 
 
-# -- docs/guides/gateways.md -----------------------------------------------------------------------------------------------
+# -- docs/guides/gateways.md ----------------------------------------------------------------------------------------
 
 VECTOR = ros_interfaces().get("geometry_msgs/msg/Vector3")
 TIME = 1700000000.25

@@ -57,7 +57,7 @@ def _ignore_sim_time(node: Node) -> None:
     if node.get_parameter(_SIM_TIME).value:
         logger.warning(
             f"{_SIM_TIME} is ignored: the router runs on real time (stamps, ttl, deadmen)",
-            remedy=f"leave {_SIM_TIME} out for this node, or set it to false; docs/guides/ros-workspace.md says what to expect",
+            remedy=f"leave {_SIM_TIME} out for this node, or set it to false (docs/guides/ros-workspace.md)",
         )
         node.set_parameters([Parameter(_SIM_TIME, value=False)])
 

@@ -161,7 +161,7 @@ class Health:
             yield warning(
                 "router",
                 f"messages lost as {reason}: {', '.join(worst)}{others}",
-                "docs/reference/metrics.md says what the reason means, the log what happened: journalctl -u rover-router",
+                "the reason is in docs/reference/metrics.md, what happened in the log: journalctl -u rover-router",
             )
 
     def _kept_away(self) -> Iterator[CheckResult]:

@@ -1,6 +1,6 @@
-"""Zenoh gateways of running routers: certificates and access control of docs/gateway.md, and two that have one key.
+"""Zenoh gateways of running routers: certificates, access control, and two that have one key.
 
-All of it on the loopback interface, without multicast.
+The first two are those of docs/guides/gateways.md. All of it on the loopback interface, without multicast.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ ZENOH = """\
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the commands of docs/gateway.md make there, and in `others` the same once more."""
+    """A folder with what the commands of docs/guides/gateways.md make there, and in `others` the same once more."""
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl")
     folder = tmp_path_factory.mktemp("certificates")
-    [commands] = [text for text in examples("gateway.md", "sh") if "openssl" in text]
+    [commands] = [text for text in examples("guides/gateways.md", "sh") if "openssl" in text]
     for place in (folder, folder / "others"):
         place.mkdir(exist_ok=True)
         local = commands.replace("192.168.0.11", "127.0.0.1")
@@ -54,13 +54,13 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def documented(language: str, certificates: Path) -> str:
-    [text] = [text for text in examples("gateway.md", language) if "/etc/rover/zenoh" in text]
+    [text] = [text for text in examples("guides/gateways.md", language) if "/etc/rover/zenoh" in text]
     return text.replace("/etc/rover/zenoh", str(certificates)).replace("192.168.0.11:7447", "127.0.0.1:PORT")
 
 
 @contextmanager
 def station(now: Scene, certificates: Path, name: str = "station", others: str = "") -> Iterator[zenoh.Session]:
-    """The base station of docs/gateway.md, with the certificate of `name`."""
+    """The base station of docs/guides/gateways.md, with the certificate of `name`."""
     text = documented("json5", certificates).replace("PORT", str(now.ports["PORT"]))
     text = text.replace("/station.", f"{others}/{name}.")
     config: zenoh.Config = zenoh.Config.from_json5(text)

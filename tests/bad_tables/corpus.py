@@ -2,8 +2,8 @@
 
 A page begins with what to write in place of its first table: a table that has no findings, or an envelope.proto. Each
 section is named after its table, `bad_tables/NAME.yaml`, and has two blocks: the table, with its encoding if that is
-not UTF-8, and the exact text. Most tables extend `base/base.yaml`, which has nothing wrong in it. docs/reference/findings.md has
-the first section and what to write in its place.
+not UTF-8, and the exact text. Most tables extend `base/base.yaml`, which has nothing wrong in it.
+docs/reference/findings.md has the first section and what to write in its place.
 
 To write the texts of new or changed sections: `python -m tests.bad_tables.corpus`; then read them as if you had made
 the mistake.

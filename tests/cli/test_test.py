@@ -237,7 +237,7 @@ routes:
 
 
 def test_examples_of_the_documentation_pass(tmp_path: Path, rover: Path) -> None:
-    text = (REPOSITORY / "docs" / "testing-tables.md").read_text(encoding="utf-8")
+    text = (REPOSITORY / "docs" / "guides" / "test-tables.md").read_text(encoding="utf-8")
     examples = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     listed = tmp_path / "listed.yaml"
     listed.write_text(LISTED.replace("PROTOS", str(PROTOS)))

@@ -34,7 +34,7 @@ TEST = """\
 
 """
 DEFAULTS = "defaults: {package: comms}\n\n"
-PAGE = Path(__file__).parents[2] / "docs" / "adding-a-message.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "add-a-message.md"
 SITE = Path(__file__).parent / "new_message_site"
 LOCK = "protos/envelope.lock.json"
 ENVELOPE = "protos/components/common/envelope.proto"
