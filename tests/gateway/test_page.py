@@ -203,7 +203,7 @@ def test_chosen_numbers_are_plotted_with_their_bounds(gateway: FakeGateway, page
     for value in range(6):
         gateway.data("/imu", {"linear": {"x": value}, "ranges": [0, 8]})
     page.until("document.querySelector('#legend li').title === '/imu linear.x: 5, 0 to 5'")
-    assert page.text("#legend").split("\n") == ["linear.x /imu", "5", "0 to 5", "✕", "ranges[1] /imu", "8", "8 to 8", "✕"]
+    assert page.text("#legend").split("\n") == ["linear.x", "/imu", "5", "0 to 5", "✕", "ranges[1]", "/imu", "8", "8 to 8", "✕"]
     assert coloured(page, "--plot-0")
     assert coloured(page, "--plot-1")
     assert "linear.x: 5, 0 to 5" in page.evaluate("document.querySelector('#plot canvas').getAttribute('aria-label')")
@@ -265,7 +265,7 @@ def test_the_address_keeps_what_is_chosen(browser: Browser, gateway: FakeGateway
     opened.until("document.querySelector('#state').textContent === 'connected'")
     gateway.list_topics(["/imu", "/odom"])
     gateway.say(data_document("/imu", {"linear": {"x": 3}}), data_document("/odom", {"list": [1, 2]}))
-    opened.until("/linear.x .imu\\s3\\s.*list.1. .odom\\s2\\s/s.test(document.querySelector('#legend').innerText)")
+    opened.until("/linear.x\\s.imu\\s3\\s.*list.1.\\s.odom\\s2\\s/s.test(document.querySelector('#legend').innerText)")
     plot(opened, "/imu", "linear.x")
     opened.until("!location.hash.includes('field')")
     opened.call("Page.reload")
