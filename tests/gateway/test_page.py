@@ -180,7 +180,7 @@ def test_the_tree_shows_the_full_value_and_follows_it(gateway: FakeGateway, page
 
 
 def test_numbers_are_rounded_for_the_eye_and_exact_on_demand(gateway: FakeGateway, page: Page) -> None:
-    value = {"a": 0.1 + 0.2, "b": -1.5, "c": 2**64 - 1, "d": 9007199254740991, "e": 1e-7 / 3, "f": 16.1}
+    value = {"a": 0.1 + 0.2, "b": -1.5, "c": 2**64 - 1, "d": 9007199254740991, "e": 1e-7 / 3, "f": 12345678.9}
     gateway.data("/imu", value)
     choose(page, "/imu")
     page.until("document.querySelectorAll('#tree .number').length === 6")
@@ -191,16 +191,11 @@ def test_numbers_are_rounded_for_the_eye_and_exact_on_demand(gateway: FakeGatewa
         ["18446744073709551615", ""],
         ["9007199254740991", ""],
         ["3.33333e-8", "3.3333333333333334e-8"],
-        ["16.1", ""],
+        ["12345679", "12345678.9"],
     ]
-    copied = """(() => {
-        const number = document.querySelector('#tree .number'), clipboardData = new DataTransfer();
-        getSelection().setBaseAndExtent(number.firstChild, 0, number.firstChild, 3);
-        const event = new ClipboardEvent('copy', { clipboardData, bubbles: true, cancelable: true });
-        number.dispatchEvent(event);
-        return event.clipboardData.getData('text/plain');
-    })()"""
-    assert page.evaluate(copied) == "0.30000000000000004"
+    page.evaluate("document.querySelector('#tree .plot').focus({ focusVisible: true })")
+    beside = "getComputedStyle(document.querySelector('#tree .number'), '::after').content"
+    assert page.evaluate(beside) == '" = " "0.30000000000000004"'
 
 
 def test_long_arrays_are_opened_in_parts(gateway: FakeGateway, page: Page) -> None:
@@ -242,7 +237,7 @@ def test_chosen_numbers_are_plotted_with_their_bounds(gateway: FakeGateway, page
     for value in range(6):
         gateway.data("/imu", {"linear": {"x": value}, "ranges": [0, 8]})
     page.until("document.querySelector('#legend li').title === '/imu linear.x: 5, 0 to 5'")
-    assert page.text("#legend").split() == "linear.x /imu 5 0 to 5 ✕ ranges[1] /imu 8 8 to 8 ✕".split()
+    assert " ".join(page.text("#legend").split()) == "linear.x /imu 5 0 to 5 ✕ ranges[1] /imu 8 8 to 8 ✕"
     assert coloured(page, "--plot-0")
     assert coloured(page, "--plot-1")
     assert "linear.x: 5, 0 to 5" in page.evaluate("document.querySelector('#plot canvas').getAttribute('aria-label')")
