@@ -195,7 +195,7 @@ def test_numbers_are_rounded_for_the_eye_and_exact_on_demand(gateway: FakeGatewa
     ]
     page.evaluate("document.querySelector('#tree .plot').focus({ focusVisible: true })")
     beside = "getComputedStyle(document.querySelector('#tree .number'), '::after').content"
-    assert page.evaluate(beside) == '" = " "0.30000000000000004"'
+    assert page.evaluate(beside) == '" = 0.30000000000000004"'
 
 
 def test_long_arrays_are_opened_in_parts(gateway: FakeGateway, page: Page) -> None:
