@@ -67,7 +67,7 @@ def test_examples_with_gateways_only_need_nothing_but_the_version(tmp_path: Path
     whole = [text for text in examples(page, "yaml") if "\ngateways:" in f"\n{text}"]
     assert whole
     for example in whole:
-        version = "" if example.startswith("version:") else "version: 1\n"
+        version = "" if re.search(r"^version:", example, re.MULTILINE) else "version: 1\n"
         table.write_text(version + example)
         assert list(map(str, check_table(table, {}).diagnostics)) == []
 
