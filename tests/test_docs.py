@@ -33,6 +33,7 @@ ROVER = ROUTES / "rover.yaml"
 PAGES = runpy.run_path(str(DOCS / "generate.py"))["PAGES"]
 PATIENCE = 30.0
 TABLE_PAGES = ("reference/table.md", "guides/gateways.md", "../README.md")
+PROTOCOL = "reference/gateway-protocol.md"
 
 
 def examples(page: str, language: str) -> list[str]:
@@ -66,7 +67,7 @@ def test_examples_with_gateways_only_need_nothing_but_the_version(tmp_path: Path
     whole = [text for text in examples(page, "yaml") if "\ngateways:" in f"\n{text}"]
     assert whole
     for example in whole:
-        version = "" if example.startswith("version:") else "version: 1\n"
+        version = "" if re.search(r"^version:", example, re.MULTILINE) else "version: 1\n"
         table.write_text(version + example)
         assert list(map(str, check_table(table, {}).diagnostics)) == []
 
@@ -93,7 +94,7 @@ def test_links_to_files_and_headings_lead_somewhere(page: Path) -> None:
     assert wrong == []
 
 
-# -- docs/guides/gateways.md ----------------------------------------------------------------------------------------
+# -- docs/reference/gateway-protocol.md --------------------------------------------------------------------------------
 
 VECTOR = ros_interfaces().get("geometry_msgs/msg/Vector3")
 TIME = 1700000000.25
@@ -106,15 +107,15 @@ def vector_packet(**values: float) -> Packet:
 
 
 def test_the_packet_that_is_taken_apart_is_one_of_the_gateway() -> None:
-    [example] = examples("guides/gateways.md", "hex")
+    [example] = examples(PROTOCOL, "hex")
     data = bytes.fromhex("".join(line.partition("   ")[0] for line in example.splitlines()))
     assert data == pack(vector_packet(x=1.0, y=0.1, z=-2.5))
-    assert f"These {len(data)} bytes" in (DOCS / "guides/gateways.md").read_text(encoding="utf-8")
+    assert f"These {len(data)} bytes" in (DOCS / PROTOCOL).read_text(encoding="utf-8")
 
 
 def test_schema_and_documents_are_as_they_are_shown() -> None:
     assert VECTOR is not None
-    schema, sent, received = examples("guides/gateways.md", "json")
+    schema, sent, received = examples(PROTOCOL, "json")
     assert json.loads(schema) == json.loads(schema_text(VECTOR))
     data = next(line for line in map(json.loads, sent.splitlines()) if line["op"] == "data")
     cdr = decoder(VECTOR, Style.PLAIN)(json.dumps(data["data"]).encode())
@@ -130,7 +131,7 @@ def test_schema_and_documents_are_as_they_are_shown() -> None:
 @contextmanager
 def program(folder: Path, name: str, *arguments: object) -> Iterator[IO[str]]:
     """What an example that begins with its own name prints, while it runs."""
-    [text] = (text for text in examples("guides/gateways.md", "python") if text.startswith(f"# {name}: python {name} "))
+    [text] = (text for text in examples(PROTOCOL, "python") if text.startswith(f"# {name}: python {name} "))
     (folder / name).write_text(text)
     command = [sys.executable, name, *map(str, arguments)]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as running:
