@@ -181,9 +181,10 @@ def test_the_tree_shows_the_full_value_and_follows_it(gateway: FakeGateway, page
 
 def test_numbers_are_rounded_for_the_eye_and_exact_on_demand(gateway: FakeGateway, page: Page) -> None:
     value = {"a": 0.1 + 0.2, "b": -1.5, "c": 2**64 - 1, "d": 9007199254740991, "e": 1e-7 / 3, "f": 12345678.9}
+    value |= {"latitude": 51.09931234567, "float32": 9.798620223999023}
     gateway.data("/imu", value)
     choose(page, "/imu")
-    page.until("document.querySelectorAll('#tree .number').length === 6")
+    page.until("document.querySelectorAll('#tree .number').length === 8")
     shown = page.evaluate("[...document.querySelectorAll('#tree .number')].map(e => [e.textContent, e.title])")
     assert shown == [
         ["0.3", "0.30000000000000004"],
@@ -192,6 +193,8 @@ def test_numbers_are_rounded_for_the_eye_and_exact_on_demand(gateway: FakeGatewa
         ["9007199254740991", ""],
         ["3.33333e-8", "3.3333333333333334e-8"],
         ["12345679", "12345678.9"],
+        ["51.099312", "51.09931234567"],
+        ["9.79862", ""],
     ]
     page.evaluate("document.querySelector('#tree .plot').focus({ focusVisible: true })")
     beside = "getComputedStyle(document.querySelector('#tree .number'), '::after').content"
