@@ -197,7 +197,9 @@ class Simulator:
         except UsageError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
                 raise UsageError(
-                    str(error), "take a table with addresses of this machine: -t routes/sim.yaml"
+                    str(error),
+                    "play a table with addresses of this machine, such as 127.0.0.2; "
+                    "routes/sim.yaml lays them over the rover's",
                 ) from error
             raise
         self._opened.append(opened)

@@ -160,6 +160,16 @@ def test_a_taken_address_is_named_and_leaves_nothing_open(wire: Wire, table: Rou
         pass
 
 
+def test_an_address_of_another_machine_is_named_with_what_to_play_instead(
+    wire: Wire, table_path: Callable[..., Path]
+) -> None:
+    path = table_path()
+    path.write_text(path.read_text().replace("127.0.6.30", "192.0.2.30"))
+    with pytest.raises(UsageError, match=r"board: cannot bind .*: this machine has no such address") as caught:
+        Simulator(wire, read_table(path), seed=1)
+    assert "addresses of this machine" in caught.value.hint
+
+
 def test_stop_ends_a_run_from_another_thread(wire: Wire, table: RouteTable) -> None:
     with closing(Simulator(wire, table, seed=1)) as simulator:
         running = threading.Thread(target=simulator.run, args=(None, 1.0, lambda _: None))
