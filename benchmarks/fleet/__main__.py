@@ -3,8 +3,8 @@
     python -m benchmarks.fleet
     python -m benchmarks.fleet --rovers 2 --operators 1 --seconds 3 --json fleet.json
 
-Each rover is a `router run` with a ROS domain of its own, a simulated board that sends to it, and one that obeys. It all
-runs in a network namespace. Exit code 1 where sums do not come out, or a deadman did not do what it should.
+Each rover is a `router run` with a ROS domain of its own, a simulated board that sends to it, and one that obeys.
+Everything runs in a network namespace. Exit code 1 where sums do not come out, or a deadman did not do what it should.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 from benchmarks.fleet.actors import Told
 from benchmarks.fleet.figures import Figures, braked, carried, dropped, first_after, imbalances, spread
+from benchmarks.fleet.report import report, wrong
 from benchmarks.fleet.site import PATIENCE, Fleet, cpu_ns, memory
 from benchmarks.versus.results import commit, machine
 
@@ -32,7 +34,7 @@ DOWN = 2.0
 """Seconds for which the hub is away, and an operator is gone."""
 
 DRAIN = 1.0
-"""Seconds in which everything that was sent arrives."""
+"""Seconds without an arrival after which nothing is on its way."""
 
 INSIDE = "FLEET_NAMESPACE"
 
@@ -53,7 +55,7 @@ def main() -> int:
     args = arguments()
     if INSIDE not in os.environ:
         enter_namespace()
-    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)  # noqa: S607 - as found in PATH
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that what was started is ended too
     results: Figures = {"machine": machine(), "commit": commit(), "arguments": {**vars(args), "json": None}}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
@@ -105,27 +107,40 @@ def await_flow(fleet: Fleet, rovers: Sequence[int], since: int = 0) -> tuple[Tol
         if time.monotonic() > deadline:
             raise SystemExit(f"not all of {len(rovers)} rovers were heard and driven")
         time.sleep(0.2)
-        for told, more in zip((boards, operators), take(fleet), strict=True):
-            for kind, records in zip(told, more, strict=True):
-                kind.extend(records)
+        add(boards, operators, *take(fleet))
     return boards, operators
+
+
+def drained(fleet: Fleet) -> tuple[Told, Told]:
+    """Stop all sending, and wait until nothing arrives any more. Return all that was recorded."""
+    flow(fleet, [])
+    boards, operators = take(fleet)
+    is_quiet = False
+    while not is_quiet:
+        time.sleep(DRAIN)
+        more = take(fleet)
+        is_quiet = not any(told.received for told in more)
+        add(boards, operators, *more)
+    return boards, operators
+
+
+def add(boards: Told, operators: Told, more_boards: Told, more_operators: Told) -> None:
+    for told, more in ((boards, more_boards), (operators, more_operators)):
+        for kind, records in zip(told, more, strict=True):
+            kind.extend(records)
 
 
 def measured(fleet: Fleet, rovers: Sequence[int], seconds: float) -> Figures:
     flow(fleet, rovers)
     await_flow(fleet, rovers)
-    flow(fleet, [])
-    time.sleep(DRAIN)
-    take(fleet)
+    drained(fleet)
     before = {rover: fleet.scrape(rover) for rover in rovers}
     pids = {"hub": fleet.hub.pid, **{str(rover): fleet.routers[rover].pid for rover in rovers}}
     flow(fleet, rovers)
     cpu, began = {name: cpu_ns(pid) for name, pid in pids.items()}, time.monotonic()
     time.sleep(seconds)
     used, elapsed = {name: cpu_ns(pid) - cpu[name] for name, pid in pids.items()}, time.monotonic() - began
-    flow(fleet, [])
-    time.sleep(DRAIN)
-    boards, operators = take(fleet)
+    boards, operators = drained(fleet)
     counted = {rover: fleet.scrape(rover) - before[rover] for rover in rovers}
     up = carried(boards.sent, operators.received, elapsed)
     down = carried(operators.sent, boards.received, elapsed)
@@ -205,61 +220,7 @@ def without_operator(fleet: Fleet, rovers: Sequence[int]) -> Figures:
 def waits(boards: Told, rover: int) -> list[float]:
     """Milliseconds between commands to one rover."""
     times = [at for one, _, at in boards.received if one == rover]
-    return [(later - earlier) / 1e6 for earlier, later in zip(times, times[1:])]
-
-
-# -- the report ----------------------------------------------------------------------------------------------------
-
-
-def wrong(results: Figures, rovers: int) -> list[str]:
-    """Deadmen that did not trip, or tripped though commands came."""
-    hub, operator = results["hub"], results["operator"]
-    found = []
-    if hub["braked"] != rovers:
-        found.append(f"without the hub, {hub['braked']} of {rovers} rovers were braked")
-    if operator["braked"] != operator["his_rovers"]:
-        found.append(f"without their operator, {operator['braked']} of {operator['his_rovers']} rovers were braked")
-    if operator["others_braked"]:
-        found.append(f"{operator['others_braked']} rovers of other operators were braked")
-    return found
-
-
-def report(results: Figures) -> str:
-    one, whole, hub, operator = (results[name] for name in ("one", "all", "hub", "operator"))
-    lines = [f"{'':34}{one['rovers']:>10} rover{whole['rovers']:>9} rovers"]
-
-    def row(label: str, *path: str) -> None:
-        values = []
-        for found in (one, whole):
-            for step in path:
-                found = found[step]
-            values.append(found)
-        lines.append(f"{label:34}{values[0]!s:>16}{values[1]!s:>16}")
-
-    for way, label in (("rover_to_operator", "rover -> operator"), ("operator_to_rover", "operator -> rover")):
-        row(f"{label}, messages/s", way, "per_second")
-        row("  sent", way, "sent")
-        row("  lost", way, "lost")
-        for part in ("p50", "p99", "max"):
-            row(f"  latency {part}, ms", way, "latency_ms", part)
-    row("hub: CPU, % of a core", "hub_cpu_percent")
-    row("  CPU per message, us", "hub_cpu_us_per_message")
-    row("router: CPU, % of a core", "router_cpu_percent")
-    row("  memory, MB", "router_memory_mb", "rss")
-    row("  of it its own", "router_memory_mb", "private")
-    ratio = whole["hub_cpu_us_per_message"] / one["hub_cpu_us_per_message"]
-    lines += [
-        f"CPU per message of the hub, {whole['rovers']} rovers over 1: {ratio:.2f}",
-        f"dropped by routers: {whole['dropped'] or 'nothing'}",
-        f"hub killed: {hub['braked']} of {hub['rovers']} rovers braked, after {hub['brake_after_ms']} ms",
-        f"  hub back: driven again after {hub['driven_again_after_ms']} ms, heard again {hub['heard_again_after_ms']} ms",
-        f"operator killed: {operator['braked']} of his {operator['his_rovers']} rovers braked, after "
-        f"{operator['brake_after_ms']} ms",
-        f"  of {operator['other_rovers']} others braked: {operator['others_braked']}; between their commands "
-        f"{operator['others_gap_ms']} ms",
-        *results["wrong"],
-    ]
-    return "\n".join(lines)
+    return [(later - earlier) / 1e6 for earlier, later in pairwise(times)]
 
 
 if __name__ == "__main__":

@@ -11,14 +11,14 @@ from benchmarks.fleet.actors import Record, Told
 Figures = dict[str, Any]
 
 
-def percentile(values: Sequence[float], part: float) -> float:
-    """NaN of nothing."""
+def percentile(values: Sequence[float], part: float) -> float | None:
+    """None of nothing."""
     ordered = sorted(values)
-    return ordered[round(part * (len(ordered) - 1))] if ordered else float("nan")
+    return round(ordered[round(part * (len(ordered) - 1))], 2) if ordered else None
 
 
 def spread(values: Sequence[float]) -> Figures:
-    return {name: round(percentile(values, part), 2) for name, part in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))}
+    return {name: percentile(values, part) for name, part in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))}
 
 
 def carried(sent: Iterable[Record], received: Sequence[Record], seconds: float) -> Figures:
@@ -47,7 +47,10 @@ def dropped(counted: Mapping[str, int]) -> dict[str, int]:
 def imbalances(counted: Mapping[str, int], up: tuple[int, int], down: tuple[int, int]) -> list[str]:
     """Sums of one rover that do not come out. `up` and `down` are what was sent and received at the ends."""
     count = Counter(counted)
-    from_ros, to_hub = count['messages_received_total{route="fleet",source="ros"}'], _sum(count, "sent", "fleet", "clients")
+    from_ros, to_hub = (
+        count['messages_received_total{route="fleet",source="ros"}'],
+        _sum(count, "sent", "fleet", "clients"),
+    )
     from_hub = count['datagrams_received_total{listener="fleet"}']
     accepted = count['messages_received_total{route="fleet",source="clients"}']
     to_ros = count['messages_published_total{route="fleet",topic="/drive"}']
@@ -55,7 +58,10 @@ def imbalances(counted: Mapping[str, int], up: tuple[int, int], down: tuple[int,
     sums = {
         "boards -> router": (up[0], count['messages_received_total{route="imu",source="sensor_board"}']),
         "router -> gateway": (count['messages_published_total{route="imu",topic="imu"}'], from_ros),
-        "gateway -> hub": (from_ros, to_hub + _sum(count, "filtered", "fleet") + _sum(count, "dropped", "fleet", "clients")),
+        "gateway -> hub": (
+            from_ros,
+            to_hub + _sum(count, "filtered", "fleet") + _sum(count, "dropped", "fleet", "clients"),
+        ),
         "hub -> gateway": (from_hub, accepted + _sum(count, "rejected", "fleet")),
         "gateway -> ROS": (accepted, to_ros + _sum(count, "dropped", "fleet", "/drive")),
         "ROS -> router": (to_ros, commands),

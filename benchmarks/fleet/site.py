@@ -1,5 +1,6 @@
-"""The computers of a fleet as processes on one machine: hub, routers, boards, operators. Certificates and rules are made
-by the programs of docs/guides/fleet.md.
+"""The computers of a fleet as processes on one machine: hub, routers, boards, operators.
+
+Certificates, rules and the table's gateway are made by the commands and programs of docs/guides/fleet.md.
 """
 
 from __future__ import annotations
@@ -27,6 +28,14 @@ PATIENCE = 120.0
 
 AT_ONCE = 4
 """Routers that start together."""
+
+HUB = """\
+import signal, zenoh
+hub = zenoh.open(zenoh.Config.from_file("hub.json5"))
+print(flush=True)
+signal.pause()
+"""
+"""The guide's, which says when it takes connections."""
 
 PROTO = """\
 syntax = "proto3";
@@ -68,9 +77,11 @@ GATEWAY = """\
     publish_period: each
     topics: {include: [/imu]}
     inbound:
-      - {topic: drive, type: geometry_msgs/msg/Twist, ttl: 200ms, max_rate: 50 Hz}
+      - {topic: drive, type: geometry_msgs/msg/Twist, ttl: 200ms}
 """
-"""The end of the guide's gateway, which sends all topics there, twice a second."""
+"""The gateway sends every message of one topic, where the guide's sends all topics twice a second. There is no
+`max_rate`, so that commands which come together are all delivered.
+"""
 
 
 def blocks(language: str, name: str) -> str:
@@ -96,7 +107,9 @@ def table() -> str:
 class Fleet:
     """Rovers and operators have numbers from 1 on; a rover has one operator."""
 
-    def __init__(self, folder: Path, rovers: int, operators: int, rates: tuple[float, float], opened: ExitStack) -> None:
+    def __init__(
+        self, folder: Path, rovers: int, operators: int, rates: tuple[float, float], opened: ExitStack
+    ) -> None:
         self.folder = folder
         self.drivers = {rover: 1 + (rover - 1) * operators // rovers for rover in range(1, rovers + 1)}
         self._rates = rates
@@ -105,7 +118,9 @@ class Fleet:
         self.operators: dict[int, Actor] = {}
         self._prepare()
         self.start_hub()
-        addresses = [Address(rover, f"127.0.1.{rover}", f"127.0.2.{rover}", f"127.0.3.{rover}") for rover in self.drivers]
+        addresses = [
+            Address(rover, f"127.0.1.{rover}", f"127.0.2.{rover}", f"127.0.3.{rover}") for rover in self.drivers
+        ]
         self.boards = opened.enter_context(actor(play_boards, addresses, rates[0]))
 
     def _prepare(self) -> None:
@@ -123,11 +138,10 @@ class Fleet:
 
     def start_hub(self) -> None:
         """Return when it takes connections."""
-        program = "import signal, zenoh; hub = zenoh.open(zenoh.Config.from_file('hub.json5')); print(flush=True); signal.pause()"
-        self.hub = subprocess.Popen([sys.executable, "-c", program], cwd=self.folder, stdout=subprocess.PIPE)
+        self.hub = subprocess.Popen([sys.executable, "-c", HUB], cwd=self.folder, stdout=subprocess.PIPE)
         self._opened.callback(end, self.hub)
-        assert self.hub.stdout is not None
-        self.hub.stdout.readline()
+        if self.hub.stdout is None or not self.hub.stdout.readline():
+            raise SystemExit("the hub did not start")
 
     def start(self, rovers: Sequence[int]) -> None:
         """Start routers, a few at a time, and the operators that they need; return when every gateway serves."""
@@ -168,7 +182,7 @@ class Fleet:
 
     def scrape(self, rover: int) -> Counter[str]:
         """A router's metrics, without the prefix `router_`."""
-        with urllib.request.urlopen(f"http://127.0.1.{rover}:9108/metrics", timeout=PATIENCE) as answer:  # noqa: S310
+        with urllib.request.urlopen(f"http://127.0.1.{rover}:9108/metrics", timeout=PATIENCE) as answer:
             text = answer.read().decode()
         lines = (line.rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
         return Counter({name.removeprefix("router_"): int(float(value)) for name, _, value in lines})
@@ -237,4 +251,5 @@ def memory(pid: int) -> Mapping[str, float]:
     """MB: resident, and the part that is this process's own."""
     lines = (line.split() for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:])
     kb = {words[0]: int(words[1]) for words in lines}
-    return {"rss": kb["Rss:"] / 1024, "private": (kb["Private_Clean:"] + kb["Private_Dirty:"]) / 1024}
+    own = kb["Private_Clean:"] + kb["Private_Dirty:"]
+    return {"rss": round(kb["Rss:"] / 1024, 1), "private": round(own / 1024, 1)}
