@@ -12,7 +12,6 @@ import json
 import os
 import re
 import shutil
-import struct
 import subprocess
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from rich.console import Console
 from demo.children import Child
 from demo.expected import checked_table, page_of
 from demo.places import free_ros_domain, taken_places
+from docs.pictures.png import png
 from router.errors import RouterError, TransportError
 from router.table.model import RouteTable
 from router.tools.running_router import metrics, url_of
@@ -48,10 +48,18 @@ TERMINAL = (80, 36)
 SETTLED = 60.0
 """Seconds that everything flows before a picture: pages show the last minute."""
 
+TAKING = 40.0
+"""Seconds within which the pictures of a rover that is well are taken; then the basestation falls silent."""
+
 SILENCE = 12.0
 """Seconds that the basestation has been silent in its picture, at least."""
 
 PATIENCE = 60.0
+
+WELL = r"all is well|nothing is wrong"
+UNWELL = r"silent for|connecting|no answer|does not get"
+"""What pages say, in a page's text."""
+
 _INSIDE = "ROUTER_PICTURES_INSIDE"
 
 
@@ -102,7 +110,7 @@ def make(folder: Path, settled: float) -> None:
         profile.mkdir()
         browser = Browser(program, profile)
         try:
-            with rover(Path(scratch), table) as running:
+            with rover(Path(scratch), table, settled + TAKING) as running:
                 _take_all(folder, running, browser, settled)
         finally:
             browser.close()
@@ -122,7 +130,7 @@ class Rover:
     def __init__(self, scratch: Path, table: RouteTable) -> None:
         self.url = url_of(table)
         self.gateway = f"http://{page_of(table)}/"
-        self._running: dict[str, Child] = {}
+        self._running: list[Child] = []
         self._window = Window()
         self._env = os.environ | {
             "ROS_DOMAIN_ID": str(free_ros_domain()),
@@ -132,32 +140,22 @@ class Rover:
         }
 
     def start(self, name: str, *module: str) -> None:
-        self._running[name] = Child(name, self._env, *module)
+        self._running.append(Child(name, self._env, *module))
 
-    def simulate(self, *silent: str) -> None:
-        """Play the boards and the basestation, from now on so."""
-        self.stop("simulator")
-        options = [word for each in silent for word in ("--silent", each)]
-        self.start("simulator", "router", "sim", "-t", str(TABLE), "--json", *options)
-
-    def stop(self, *names: str) -> None:
-        children = [self._running.pop(name) for name in names if name in self._running]
-        for child in children:
+    def stop(self) -> None:
+        for child in self._running:
             child.ask_to_end()
-        for child in children:
+        for child in self._running:
             child.end()
-
-    def stop_all(self) -> None:
-        self.stop(*reversed(list(self._running)))
 
     def look(self) -> View:
         self._window.add(metrics(self.url))
         return view(*self._window.ends, time.time())
 
-    def until(self, holds: Callable[[View], bool], what: str) -> View:
-        limit = time.monotonic() + PATIENCE
+    def until(self, holds: Callable[[View], bool], what: str, patience: float = PATIENCE) -> View:
+        limit = time.monotonic() + patience
         while True:
-            for child in self._running.values():
+            for child in self._running:
                 if child.exit_code is not None:
                     raise PictureError(f"the {child.name} has ended:\n{child.last_words()}")
             try:
@@ -167,22 +165,24 @@ class Rover:
             except TransportError:
                 pass
             if time.monotonic() > limit:
-                raise PictureError(f"not within {PATIENCE:.0f} s: {what}")
+                raise PictureError(f"not within {patience:.0f} s: {what}")
             time.sleep(0.5)
 
 
 @contextmanager
-def rover(scratch: Path, table: RouteTable) -> Iterator[Rover]:
+def rover(scratch: Path, table: RouteTable, well: float) -> Iterator[Rover]:
+    """One whose basestation falls silent after so many seconds."""
     running = Rover(scratch, table)
     try:
         running.start("listener", "demo.ros_listener", str(TABLE))
         running.start("router", "router", "run", str(TABLE))
         running.until(lambda _: True, "the router answers")
-        running.simulate()
+        cut_off = f"{BASESTATION}:{well:g}-"
+        running.start("simulator", "router", "sim", "-t", str(TABLE), "--json", "--silent", cut_off)
         running.start("talker", "demo.ros_talker", str(TABLE))
         yield running
     finally:
-        running.stop_all()
+        running.stop()
 
 
 def _take_all(folder: Path, running: Rover, browser: Browser, settled: float) -> None:
@@ -195,20 +195,18 @@ def _take_all(folder: Path, running: Rover, browser: Browser, settled: float) ->
     top = running.until(_is_well, "everything is well")
     _write_terminal(folder / "top.svg", Screen(top, f"router top {running.url}", Order.TABLE, TERMINAL[1]))
 
-    said = _expect(desktop, wanted=r"sensor_board", unwanted=r"silent for|connecting|no answer")
-    _expect(phone, wanted=r"sensor_board", unwanted=r"silent for|connecting|no answer")
-    _write(folder / "status.png", _composed(browser, _shot(desktop), _shot(phone)), said)
+    said = _expect(desktop, wanted=WELL, unwanted=UNWELL)
+    _expect(phone, wanted=WELL, unwanted=UNWELL)
+    _write(folder / "status.png", _composed(browser, _shot(desktop), _shot(phone)), browser, said)
     said = _expect(gateway, wanted=r"linear_acceleration[\s\S]*plot", unwanted=r"connecting|choose a topic")
-    _write(folder / "gateway.png", _shot(gateway), said)
+    _write(folder / "gateway.png", _shot(gateway), browser, said)
     for page in (phone, gateway):
         page.close()
 
-    running.stop("talker")
-    running.simulate(f"{BASESTATION}:0-")
     desktop.prefer("light")
-    running.until(_is_cut_off, "the basestation is silent, and deadmen send")
-    said = _expect(desktop, wanted=rf"{BASESTATION}\b.{{0,40}}\bsilent", unwanted=r"connecting|no answer")
-    _write(folder / "cut-off.png", _shot(desktop), said)
+    running.until(_is_cut_off, "the basestation is silent, and deadmen send", PATIENCE + TAKING)
+    said = _expect(desktop, wanted=rf"{BASESTATION}\b.{{0,40}}\bsilent", unwanted=r"connecting|no answer|does not get")
+    _write(folder / "cut-off.png", _shot(desktop), browser, said)
 
 
 def _flows(seen: View) -> bool:
@@ -245,8 +243,9 @@ def _expect(page: Page, wanted: str, unwanted: str) -> str:
         time.sleep(0.2)
 
 
-def _shot(page: Page) -> bytes:
-    return base64.b64decode(page.call("Page.captureScreenshot", format="png")["data"])
+def _shot(page: Page) -> str:
+    """A PNG in Base64."""
+    return str(page.call("Page.captureScreenshot", format="png")["data"])
 
 
 _COMPOSITION = """<!doctype html><style>
@@ -259,11 +258,12 @@ img {{ position: absolute; display: block; border: 1px solid #474d57; box-sizing
 <img class="desktop" src="data:image/png;base64,{wide}"><img class="phone" src="data:image/png;base64,{narrow}">"""
 
 
-def _composed(browser: Browser, wide: bytes, narrow: bytes) -> bytes:
+def _composed(browser: Browser, wide: str, narrow: str) -> str:
     """The desktop's page, and the phone's over its lower right corner, on nothing."""
-    width, height, phone = DESKTOP[0] + 200, DESKTOP[1] + 60, PHONE[0] + 16
-    code = {"wide": base64.b64encode(wide).decode(), "narrow": base64.b64encode(narrow).decode()}
-    html = _COMPOSITION.format(width=width, height=height, desktop=DESKTOP[0], phone=phone, **code)
+    width, height = DESKTOP[0] + 120, DESKTOP[1] + 85
+    html = _COMPOSITION.format(
+        width=width, height=height, desktop=DESKTOP[0], phone=PHONE[0] * 0.84 + 16, wide=wide, narrow=narrow
+    )
     page = browser.open("about:blank", width, height)
     page.call("Emulation.setDefaultBackgroundColorOverride", color={"r": 0, "g": 0, "b": 0, "a": 0})
     page.evaluate(f"document.documentElement.innerHTML = {json.dumps(html)}")
@@ -282,14 +282,30 @@ def _write_terminal(file: Path, shown: Screen) -> None:
         said = console.export_text(clear=False)
         text = console.export_svg(title="router top")
     text = re.sub(r"@font-face \{.*?\}\s*", "", text, flags=re.DOTALL)
-    text = text.replace("Fira Code", "ui-monospace, DejaVu Sans Mono")
+    text = re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL).replace("Fira Code", "ui-monospace, DejaVu Sans Mono")
     file.write_text(text, encoding="utf-8")
     _say(file, said)
 
 
-def _write(file: Path, picture: bytes, said: str) -> None:
-    file.write_bytes(picture)
-    width, height = struct.unpack(">II", picture[16:24])
+_PIXELS = """(async () => {
+  const image = new Image();
+  image.src = %s;
+  await image.decode();
+  const canvas = new OffscreenCanvas(image.width, image.height).getContext("2d");
+  canvas.drawImage(image, 0, 0);
+  const { data } = canvas.getImageData(0, 0, image.width, image.height);
+  let text = "";
+  for (let at = 0; at < data.length; at += 0x8000) text += String.fromCharCode(...data.subarray(at, at + 0x8000));
+  return [btoa(text), image.width, image.height];
+})()"""
+
+
+def _write(file: Path, picture: str, browser: Browser, said: str) -> None:
+    """As a PNG with few colours. The browser reads the one that it made."""
+    page = browser.open("about:blank")
+    pixels, width, height = page.evaluate(_PIXELS % json.dumps(f"data:image/png;base64,{picture}"))
+    page.close()
+    file.write_bytes(png(base64.b64decode(pixels), width, height))
     _say(file, f"{width}x{height}; {said}")
 
 
