@@ -57,6 +57,9 @@ SILENCE = 12.0
 PATIENCE = 60.0
 ATTEMPTS = 3
 
+COMMANDED = 4.0
+"""Seconds that the talker commands the boards, after which a busy browser makes no command stale."""
+
 WELL = r"all is well|nothing is wrong"
 UNWELL = r"silent for|connecting|no answer|does not get"
 """What pages say, in a page's text."""
@@ -182,7 +185,9 @@ def rover(scratch: Path, table: RouteTable, well: float) -> Iterator[Rover]:
             cut_off = f"{BASESTATION}:{well:g}-"
             running.start("simulator", "router", "sim", "-t", str(TABLE), "--json", "--silent", cut_off)
             running.start("talker", "demo.ros_talker", str(TABLE))
-            seen = running.until(_flows, "all endpoints send, and topics have subscribers")
+            running.until(_flows, "all endpoints send, and topics have subscribers")
+            time.sleep(COMMANDED)
+            seen = running.look()
             if attempt + 1 < ATTEMPTS and any(row.lost for row in seen.routes):
                 continue  # commands that were stale when ROS nodes found each other
             yield running
