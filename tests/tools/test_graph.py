@@ -15,6 +15,7 @@ from router.observe.route_map import NodeKind, nodes_and_edges, route_map
 from router.table.model import RouteTable
 from router.tools.graph import LEGEND, dot, mermaid
 from router.tools.graph_svg import svg
+from tests.gateway.browser import Browser, executable
 from tests.tables import PROTOS, ROUTES
 
 DOT = shutil.which("dot")
@@ -78,6 +79,34 @@ def test_it_refers_to_nothing_outside_itself(table: RouteTable) -> None:
     text = svg(route_map(table), "title").replace("http://www.w3.org/2000/svg", "")
     for outside in ("http:", "https:", "url(", "@import", "href", "<script"):
         assert outside not in text
+
+
+OVERLAPS = """(() => {
+  const inside = (a, b) => a.left >= b.left && a.right <= b.right && a.top >= b.top && a.bottom <= b.bottom;
+  const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+  const box = (element) => element.getBoundingClientRect();
+  const texts = [...document.querySelectorAll("svg text")], whole = box(document.querySelector("svg"));
+  const wrong = texts.filter((text) => !inside(box(text), whole));
+  wrong.push(...texts.filter((a, i) => texts.slice(i + 1).some((b) => meet(box(a), box(b)))));
+  for (const node of document.querySelectorAll("svg .node")) {
+    if (!inside(box(node.querySelector("text")), box(node.querySelector(".shape")))) wrong.push(node);
+    const halt = node.querySelector(".halt");
+    if (halt && meet(box(halt), box(node.querySelector("text")))) wrong.push(node);
+  }
+  return wrong.map((element) => element.textContent);
+})()"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(executable() is None, reason="no Chromium here")
+def test_nothing_in_the_picture_overlaps(table: RouteTable, tmp_path: Path) -> None:
+    file = tmp_path / "routes.html"
+    file.write_text(svg(route_map(table), table.path.name, "boat: 2 routes"), encoding="utf-8")
+    browser = Browser(str(executable()), tmp_path)
+    try:
+        assert browser.open(file.as_uri()).evaluate(OVERLAPS) == []
+    finally:
+        browser.close()
 
 
 def test_browsers_that_darken_pages_on_their_own_leave_it_alone(table: RouteTable) -> None:
