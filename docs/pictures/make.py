@@ -208,7 +208,8 @@ def _take_all(folder: Path, running: Rover, browser: Browser, settled: float) ->
     said = _expect(desktop, wanted=WELL, unwanted=UNWELL)
     _expect(phone, wanted=WELL, unwanted=UNWELL)
     _write(folder / "status.png", _composed(browser, _shot(desktop), _shot(phone)), browser, said)
-    said = _expect(gateway, wanted=r"linear_acceleration[\s\S]*plot", unwanted=r"connecting|choose a topic")
+    plotted, shown = re.escape(FIELDS[0]), "frame_id: imu_link"
+    said = _expect(gateway, wanted=f"{plotted}.*{shown}|{shown}.*{plotted}", unwanted=r"connecting|choose a topic")
     _write(folder / "gateway.png", _shot(gateway), browser, said)
     for page in (phone, gateway):
         page.close()
