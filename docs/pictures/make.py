@@ -61,7 +61,7 @@ COMMANDED = 4.0
 """Seconds that the talker commands the boards, after which a busy browser makes no command stale."""
 
 WELL = r"all is well|nothing is wrong"
-UNWELL = r"silent for|connecting|no answer|does not get"
+UNWELL = r"silent (for )?\d|connecting|no answer|does not get"
 """What pages say, in a page's text."""
 
 _INSIDE = "ROUTER_PICTURES_INSIDE"
