@@ -11,7 +11,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Says what must be sourced; nothing at all unless ROS comes from outside .venv.
 ENV := . .venv/env.sh &&
 
-.PHONY: help setup install-service test test-all demo bench validate lint clean
+.PHONY: help setup install-service test test-all demo bench pictures validate lint clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 17
@@ -44,6 +44,9 @@ demo: setup  ## simulated rover, router and real ROS nodes; in between, a lost l
 bench: setup  ## measure the router beside the C++ node, about an hour; ARGS="--only own_table --repeat 3" for less
 	@$(ENV) .venv/bin/python -m benchmarks.versus $(ARGS)
 	@.venv/bin/python docs/generate.py
+
+pictures: setup  ## take the pictures of README and documentation from the running program, with Chromium
+	@$(ENV) .venv/bin/python -m docs.pictures.make $(ARGS)
 
 validate: setup  ## say what is wrong with the tables in routes/, and prove them
 	@$(ENV) .venv/bin/router validate routes/
