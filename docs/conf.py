@@ -14,7 +14,7 @@ from sphinx.transforms import SphinxTransform
 
 project = "Rover router"
 html_title = project
-copyright = "the rover router's authors"
+copyright = "the rover router's authors"  # noqa: A001 - Sphinx's name
 extensions = ["myst_parser", "sphinx_copybutton"]
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["pictures/*"]

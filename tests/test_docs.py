@@ -17,6 +17,7 @@ from typing import IO
 
 import pytest
 
+from router.assets import asset
 from router.compiler import check_table
 from router.gateway.documents import PublishRequest, request
 from router.gateway.json_codec import decoder, encoder
@@ -43,6 +44,26 @@ def examples(page: str, language: str) -> list[str]:
 @pytest.mark.parametrize("name", PAGES)
 def test_page_is_what_the_code_says(name: str) -> None:
     assert (DOCS / name).read_text(encoding="utf-8") == PAGES[name](), "run `python docs/generate.py`"
+
+
+@pytest.mark.parametrize(
+    ("page", "schema"), [("keys", "schemas/route-table.schema.json"), ("test-keys", "schemas/table-test.schema.json")]
+)
+def test_every_key_of_a_schema_is_on_its_page(page: str, schema: str) -> None:
+    text = (DOCS / f"reference/{page}.md").read_text(encoding="utf-8")
+    shown = {line.split("`")[1].rpartition(".")[2] for line in text.splitlines() if line.startswith("| `")}
+    assert set(keys(json.loads(asset(schema).read_text(encoding="utf-8")))) - shown == set()
+
+
+def keys(schema: object) -> Iterator[str]:
+    """The keys that a schema declares, apart from what it says of whole tables."""
+    if not isinstance(schema, dict):
+        return
+    for name, value in schema.items():
+        if name == "properties":
+            yield from value
+        if name not in ("if", "complete", "complete_route", "complete_gateway"):
+            yield from keys(value)
 
 
 def table_examples() -> Iterator[str]:
