@@ -62,7 +62,7 @@ A [gateway](table.md#gateways) has its name as `listener` and as `route`. What i
 its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
 For what is not published of that, the reasons are those of routes. A deadman of a topic that is let in has gateway and
 topic for its route: `vr_headset:/cmd_vel`. Requests for schemas that are answered are datagrams received, and neither
-rejected nor accepted. [Gateways](../guides/gateways.md#metrics) has how these counters balance."""
+rejected nor accepted. [Gateways](gateway-protocol.md#counters) has how these counters balance."""
 _OWN = """\
 [Recordings](../guides/record-and-replay.md) and taps get datagrams beside routing: what they miss is counted here only.
 A reload keeps all counters: the series of a route that is gone stays as long as the process, if it counted anything."""

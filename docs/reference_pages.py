@@ -83,7 +83,6 @@ _OR_EACH = re.compile(r"\^(never|each)\$")
 class Row:
     path: str
     value: str
-    default: str
     meaning: str
 
 
@@ -97,7 +96,7 @@ class SchemaPage:
         self.required = dict(self._required(schema["definitions"].get("complete", {}), "definitions.complete"))
 
     def lines(self) -> Iterator[str]:
-        yield from self._table(self.schema, "", "key")
+        yield from self._table(self.schema, "")
         for section in self.sections:
             found = self._at(section.schema)
             outer = self._at(section.schema.removesuffix(".then").removesuffix(".else"))
@@ -106,25 +105,26 @@ class SchemaPage:
             yield ""
             if "then" not in section.schema and (examples := outer.get("examples")):
                 yield from (f"Such as `{section.path.rpartition('.')[2].lower()}: {flow(examples[0])}`.", "")
-            yield from self._table(found, section.schema, "key")
+            yield from self._table(found, section.schema)
 
-    def _table(self, found: Schema, name: str, title: str) -> Iterator[str]:
-        yield from (f"| {title} | value | default | meaning |", "|---|---|---|---|")
+    def _table(self, found: Schema, name: str) -> Iterator[str]:
+        yield from ("| key | value | meaning |", "|---|---|---|")
         for row in self._rows(found, name, ""):
-            yield f"| `{row.path}` | {row.value} | {row.default} | {row.meaning} |"
+            yield f"| `{row.path}` | {row.value} | {row.meaning} |"
 
     def _rows(self, found: Schema, name: str, prefix: str) -> Iterator[Row]:
         required = {*found.get("required", ()), *self.required.get(name.removesuffix(".then"), ())}
         for key, declared in found.get("properties", {}).items():
             key_schema = self._resolved(declared)
             path = f"{prefix}{key}"
-            default = f"`{flow(key_schema['default'])}`" if "default" in key_schema else ""
-            if key in required and not default:
-                default = "required"
             value, meaning = self._value(declared, name, key), key_schema.get("description", "")
             if "](" in value and "$ref" in declared:  # the rest is said there
                 meaning = re.sub(r"(?<=\w\.) [A-Z].*", "", meaning)
-            yield Row(path, value, default, prose(meaning))
+            if key in required:
+                value += "; required"
+            elif "default" in key_schema:
+                value += f"; by default `{flow(key_schema['default'])}`"
+            yield Row(path, value, prose(meaning))
             if "$ref" not in declared and "properties" in declared and name:
                 yield from self._rows(declared, "", f"{path}.")
 
