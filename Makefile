@@ -50,7 +50,7 @@ validate: setup  ## say what is wrong with the tables in routes/, and prove them
 	@$(ENV) .venv/bin/router test --coverage routes/
 
 docs: setup  ## build the documentation into build/docs; a dead link or a page without a place fails
-	@.venv/bin/python -m sphinx -q -W --keep-going -b html docs build/docs
+	@.venv/bin/python -m sphinx -q -E -W --keep-going -b html docs build/docs
 	@echo build/docs/index.html
 
 lint: setup  ## ruff, mypy, and what the C compiler warns of
