@@ -78,10 +78,16 @@ def steps(page: Path) -> list[File | Command]:
             continue
         if block.language == "console":
             found += commands(block)
-        elif block.lines and (named := _FILE.fullmatch(block.lines[0])):
+        elif block.lines and (path := file_name(block.lines[0])):
             lines = block.lines[block.language == "json" :]  # where a comment would be an error
-            found.append(File(block.line, named[1], "\n".join([*lines, ""])))
+            found.append(File(block.line, path, "\n".join([*lines, ""])))
     return found
+
+
+def file_name(first_line: str) -> str | None:
+    """The file that a block is, which its first line names in a comment."""
+    named = _FILE.fullmatch(first_line)
+    return named[1] if named else None
 
 
 def commands(block: Block) -> Iterator[Command]:

@@ -25,6 +25,7 @@ from router.gateway.json_types import Style, schema_text
 from router.gateway.packets import Packet, compress, pack, unpack
 from router.table.schema import table_schema
 from router.types.ros import ros_interfaces
+from tests.docs_commands import file_name
 from tests.gateway.fake_gateway import FakeGateway
 from tests.ports import free_port
 from tests.tables import ROUTES
@@ -66,9 +67,19 @@ def keys(schema: object) -> Iterator[str]:
             yield from keys(value)
 
 
+OTHER_YAML = ("guides/test-tables.md",)
+"""Pages whose YAML is no table. A block that is a whole file, tests/test_docs_commands.py writes."""
+
+
 def table_examples() -> Iterator[str]:
     """Some show routes without the key above them."""
-    for example in (example for page in TABLE_PAGES for example in examples(page, "yaml")):
+    user_pages = (
+        str(page.relative_to(DOCS)) for folder in ("start", "guides") for page in (DOCS / folder).glob("*.md")
+    )
+    pages = ["../README.md", "index.md", "reference/table.md", *sorted(user_pages)]
+    for example in (text for page in pages if page not in OTHER_YAML for text in examples(page, "yaml")):
+        if file_name(example.partition("\n")[0]):
+            continue
         bare = not re.match(rf"#|({'|'.join(table_schema()['properties'])}):", example)
         yield "routes:\n" + indent(example, "  ") if bare else example
 
