@@ -28,7 +28,7 @@ suppress_warnings = ["misc.highlighting_failure"]
 highlight_language = "text"
 
 html_theme = "furo"
-pygments_style, pygments_dark_style = "github-light", "github-dark"
+pygments_style, pygments_dark_style = "github-light-high-contrast", "github-dark"
 html_logo = html_favicon = "site/logo.svg"
 html_static_path = ["site"]
 html_css_files = ["site.css"]
