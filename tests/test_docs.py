@@ -74,7 +74,9 @@ OTHER_YAML = ("guides/test-tables.md",)
 def table_examples() -> Iterator[str]:
     """Some show routes without the key above them."""
     user_pages = (
-        str(page.relative_to(DOCS)) for folder in ("start", "guides") for page in (DOCS / folder).glob("*.md")
+        str(page.relative_to(DOCS))
+        for folder in ("start", "guides", "troubleshooting")
+        for page in (DOCS / folder).glob("*.md")
     )
     pages = ["../README.md", "index.md", "reference/table.md", *sorted(user_pages)]
     for example in (text for page in pages if page not in OTHER_YAML for text in examples(page, "yaml")):

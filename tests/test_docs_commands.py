@@ -17,7 +17,8 @@ from tests.docs_commands import Block, Command, File, blocks, commands, steps
 from tests.namespaces import computers
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/start/*.md")), *sorted(ROOT.glob("docs/guides/*.md"))]
+FOLDERS = ("start", "guides", "troubleshooting")
+PAGES = [ROOT / "README.md", *(page for folder in FOLDERS for page in sorted((ROOT / "docs" / folder).glob("*.md")))]
 NEEDS = ("git", "tar", "ip", "unshare")
 PATIENCE = 60.0
 """Seconds that one command may take."""
