@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from pathlib import Path
-
-from docutils import nodes
 from pygments.lexers.special import TextLexer
-from sphinx.addnodes import download_reference
 from sphinx.application import Sphinx
-from sphinx.transforms import SphinxTransform
 
 project = "Rover router"
 html_title = project
@@ -50,26 +43,6 @@ copybutton_prompt_text = r"\$ |> "
 copybutton_prompt_is_regexp = True
 copybutton_line_continuation_character = "\\"
 
-ROOT = Path(__file__).parent.parent
-
-
-class RepositoryFiles(SphinxTransform):
-    """Links to files outside docs/ lead to a copy that browsers show as text, also without a web server."""
-
-    default_priority = 10
-
-    def apply(self, **_: object) -> None:
-        page = self.env.docname
-        for link in list(self.document.findall(download_reference)):
-            file = (Path(self.env.doc2path(page)).parent / link["reftarget"].partition("#")[0]).resolve()
-            copy = Path("files", f"{file.relative_to(ROOT)}.txt")
-            target = Path(self.app.outdir, copy)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, target)
-            address = os.path.relpath(copy, Path(page).parent)
-            link.replace_self(nodes.reference("", "", *link.children, refuri=address, internal=True))
-
 
 def setup(app: Sphinx) -> None:
     app.add_lexer("hex", TextLexer)
-    app.add_transform(RepositoryFiles)

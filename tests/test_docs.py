@@ -119,6 +119,12 @@ def anchors(page: Path) -> set[str]:
     }
 
 
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.name)
+def test_pages_of_the_site_do_not_link_to_files_outside(page: Path) -> None:
+    links = re.findall(r"\]\((?!\w+://)([^)\s#]+)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not (page.parent / link).resolve().is_relative_to(DOCS.resolve())] == []
+
+
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
 def test_links_to_files_and_headings_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\((?!\w+://)([^)\s#]*)(?:#([^)\s]*))?\)", page.read_text(encoding="utf-8"))
