@@ -17,6 +17,7 @@ from typing import IO
 
 import pytest
 
+from router.assets import asset
 from router.compiler import check_table
 from router.gateway.documents import PublishRequest, request
 from router.gateway.json_codec import decoder, encoder
@@ -24,6 +25,7 @@ from router.gateway.json_types import Style, schema_text
 from router.gateway.packets import Packet, compress, pack, unpack
 from router.table.schema import table_schema
 from router.types.ros import ros_interfaces
+from tests.docs_commands import file_name
 from tests.gateway.fake_gateway import FakeGateway
 from tests.ports import free_port
 from tests.tables import ROUTES
@@ -46,9 +48,41 @@ def test_page_is_what_the_code_says(name: str) -> None:
     assert (DOCS / name).read_text(encoding="utf-8") == PAGES[name](), "run `python docs/generate.py`"
 
 
+@pytest.mark.parametrize(
+    ("page", "schema"), [("keys", "schemas/route-table.schema.json"), ("test-keys", "schemas/table-test.schema.json")]
+)
+def test_every_key_of_a_schema_is_on_its_page(page: str, schema: str) -> None:
+    text = (DOCS / f"reference/{page}.md").read_text(encoding="utf-8")
+    shown = {line.split("`")[1].rpartition(".")[2] for line in text.splitlines() if line.startswith("| `")}
+    assert set(keys(json.loads(asset(schema).read_text(encoding="utf-8")))) - shown == set()
+
+
+def keys(schema: object) -> Iterator[str]:
+    """The keys that a schema declares, apart from what it says of whole tables."""
+    if not isinstance(schema, dict):
+        return
+    for name, value in schema.items():
+        if name == "properties":
+            yield from value
+        if name not in ("if", "complete", "complete_route", "complete_gateway"):
+            yield from keys(value)
+
+
+OTHER_YAML = ("guides/test-tables.md",)
+"""Pages whose YAML is no table. A block that is a whole file, tests/test_docs_commands.py writes."""
+
+
 def table_examples() -> Iterator[str]:
     """Some show routes without the key above them."""
-    for example in (example for page in TABLE_PAGES for example in examples(page, "yaml")):
+    user_pages = (
+        str(page.relative_to(DOCS))
+        for folder in ("start", "guides", "troubleshooting")
+        for page in (DOCS / folder).glob("*.md")
+    )
+    pages = ["../README.md", "index.md", "reference/table.md", *sorted(user_pages)]
+    for example in (text for page in pages if page not in OTHER_YAML for text in examples(page, "yaml")):
+        if file_name(example.partition("\n")[0]):
+            continue
         bare = not re.match(rf"#|({'|'.join(table_schema()['properties'])}):", example)
         yield "routes:\n" + indent(example, "  ") if bare else example
 
@@ -84,6 +118,12 @@ def anchors(page: Path) -> set[str]:
         re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
         for heading in re.findall(r"^#+ (.*)", text, re.MULTILINE)
     }
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.name)
+def test_pages_of_the_site_do_not_link_to_files_outside(page: Path) -> None:
+    links = re.findall(r"\]\((?!\w+://)([^)\s#]+)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not (page.parent / link).resolve().is_relative_to(DOCS.resolve())] == []
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
