@@ -11,7 +11,7 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Says what must be sourced; nothing at all unless ROS comes from outside .venv.
 ENV := . .venv/env.sh &&
 
-.PHONY: help setup install-service test test-all demo bench validate lint clean
+.PHONY: help setup install-service test test-all demo bench pictures docs validate lint clean
 
 help:  ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 17
@@ -45,9 +45,16 @@ bench: setup  ## measure the router beside the C++ node, about an hour; ARGS="--
 	@$(ENV) .venv/bin/python -m benchmarks.versus $(ARGS)
 	@.venv/bin/python docs/generate.py
 
+pictures: setup  ## take the pictures of README and documentation from the running program, with Chromium
+	@$(ENV) .venv/bin/python -m docs.pictures.make $(ARGS)
+
 validate: setup  ## say what is wrong with the tables in routes/, and prove them
 	@$(ENV) .venv/bin/router validate routes/
 	@$(ENV) .venv/bin/router test --coverage routes/
+
+docs: setup  ## build the documentation into build/docs; a dead link or a page without a place fails
+	@.venv/bin/python -m sphinx -q -E -W --keep-going -b html docs build/docs
+	@echo build/docs/index.html
 
 lint: setup  ## ruff, mypy, and what the C compiler warns of
 	@.venv/bin/ruff check

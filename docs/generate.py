@@ -11,6 +11,8 @@ from pathlib import Path
 from textwrap import fill
 
 from benchmarks.versus.report import page as figures
+from docs import reference_pages
+from router.assets import asset
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.metrics import (
     CLIENT_DROP_REASONS,
@@ -25,6 +27,8 @@ from router.compiler.metrics import (
     TOPIC_STATES,
 )
 from router.errors import Code
+from router.rehearsal.reading import SCHEMA as TEST_SCHEMA
+from router.table.schema import table_schema
 from tests.bad_tables.corpus import HERE as CORPUS
 from tests.bad_tables.corpus import BadTable, good, sections
 
@@ -32,6 +36,22 @@ HERE = Path(__file__).parent
 RESULTS = HERE.parent / "benchmarks" / "results.json"
 WIDTH = 118
 _MADE = "<!-- Made by docs/generate.py; edit the code, then run it again. -->\n"
+_KEYS = """\
+How they work together is in [the route table](table.md). Keys inside a key are written with a dot.
+
+A **time** has its unit: `500us`, `20ms`, `1.5 s`, `10min`, `1h`. A **size** is in `B`, `kB`, `KiB`, `MB`, `MiB`, on
+disk also `GB`, `GiB`. A **rate** is in `Hz`, or a number. `${NAME}` and `${NAME:-default}` may stand in any value.
+
+At the top:"""
+_TEST_KEYS = """\
+[Testing tables](../guides/test-tables.md) says how they work together. A **time** has its unit: `300ms`, `2 s`.
+
+At the top:"""
+_COMMANDS = """\
+`router VERB --help` says the same. Every command is about `routes/rover.yaml`, unless `-t TABLE` or the variable
+`ROUTER_TABLE` names another table. `eval "$(router --completion bash)"`, or `zsh`, has the shell complete verbs and
+options; in fish it is `router --completion fish | source`.
+"""
 _COUNTERS = """\
 Every series exists at 0 from the start. The counters balance. Per listener, received = rejected + accepted. Per route
 and target, accepted = delivered + dropped + filtered + collected + waiting, and what the router holds back: open
@@ -42,7 +62,7 @@ A [gateway](table.md#gateways) has its name as `listener` and as `route`. What i
 its transport (`udp`, `tcp`, `websocket`, `zenoh`) as its destination; what clients send has `clients` as its source.
 For what is not published of that, the reasons are those of routes. A deadman of a topic that is let in has gateway and
 topic for its route: `vr_headset:/cmd_vel`. Requests for schemas that are answered are datagrams received, and neither
-rejected nor accepted. [Gateways](../guides/gateways.md#metrics) has how these counters balance."""
+rejected nor accepted. [Gateways](gateway-protocol.md#counters) has how these counters balance."""
 _OWN = """\
 [Recordings](../guides/record-and-replay.md) and taps get datagrams beside routing: what they miss is counted here only.
 A reload keeps all counters: the series of a route that is gone stays as long as the process, if it counted anything."""
@@ -56,14 +76,30 @@ it in their queues by then; with `ROUTER_CARRIER=python`, and for messages from 
 bounds, in microseconds:"""
 
 
+def keys_page() -> str:
+    """Every key of a table, from its schema."""
+    head = f"# Keys of a table\n\n{_MADE}\n{_KEYS}\n\n"
+    return head + reference_pages.table_keys(table_schema())
+
+
+def test_keys_page() -> str:
+    """Every key of a test file, from its schema."""
+    head = f"# Keys of a test file\n\n{_MADE}\n{_TEST_KEYS}\n\n"
+    return head + reference_pages.test_keys(json.loads(asset(TEST_SCHEMA).read_text(encoding="utf-8")))
+
+
+def commands_page() -> str:
+    """Every verb, from its parser."""
+    return "\n".join(["# Commands", "", _MADE, _COMMANDS, *reference_pages.commands(), ""])
+
+
 def functions_page() -> str:
     """The functions of the expression language, from their declarations."""
-    lines = ["# Functions in expressions", "", _MADE]
+    lines = ["# Functions in expressions", "", _MADE, "| function | meaning | examples |", "|---|---|---|"]
     for function in FUNCTIONS.values():
-        lines += [f"## `{function.signature}`", "", fill(function.summary, WIDTH), ""]
-        lines += [f"- `{expression}` is `{value!r}`" for expression, value in function.examples]
-        lines += [""]
-    lines += ["## `has(field)`", "", "Whether a submessage or an optional field is set, as in `when: has(bbox)`.", ""]
+        examples = "<br>".join(f"`{expression}` is `{value!r}`" for expression, value in function.examples)
+        lines.append(f"| `{function.signature}` | {function.summary} | {examples} |")
+    lines += ["| `has(field)` | Whether a submessage or an optional field is set. | `when: has(bbox)` |", ""]
     return "\n".join(lines)
 
 
@@ -142,6 +178,9 @@ def figures_page() -> str:
 
 
 PAGES = {
+    "reference/keys.md": keys_page,
+    "reference/test-keys.md": test_keys_page,
+    "reference/commands.md": commands_page,
     "reference/functions.md": functions_page,
     "reference/metrics.md": metrics_page,
     "reference/findings.md": findings_page,

@@ -17,6 +17,7 @@ from typing import IO
 
 import pytest
 
+from router.assets import asset
 from router.compiler import check_table
 from router.gateway.documents import PublishRequest, request
 from router.gateway.json_codec import decoder, encoder
@@ -24,6 +25,7 @@ from router.gateway.json_types import Style, schema_text
 from router.gateway.packets import Packet, compress, pack, unpack
 from router.table.schema import table_schema
 from router.types.ros import ros_interfaces
+from tests.docs_commands import file_name
 from tests.gateway.fake_gateway import FakeGateway
 from tests.ports import free_port
 from tests.tables import ROUTES
@@ -33,6 +35,7 @@ ROVER = ROUTES / "rover.yaml"
 PAGES = runpy.run_path(str(DOCS / "generate.py"))["PAGES"]
 PATIENCE = 30.0
 TABLE_PAGES = ("reference/table.md", "guides/gateways.md", "../README.md")
+PROTOCOL = "reference/gateway-protocol.md"
 
 
 def examples(page: str, language: str) -> list[str]:
@@ -45,9 +48,41 @@ def test_page_is_what_the_code_says(name: str) -> None:
     assert (DOCS / name).read_text(encoding="utf-8") == PAGES[name](), "run `python docs/generate.py`"
 
 
+@pytest.mark.parametrize(
+    ("page", "schema"), [("keys", "schemas/route-table.schema.json"), ("test-keys", "schemas/table-test.schema.json")]
+)
+def test_every_key_of_a_schema_is_on_its_page(page: str, schema: str) -> None:
+    text = (DOCS / f"reference/{page}.md").read_text(encoding="utf-8")
+    shown = {line.split("`")[1].rpartition(".")[2] for line in text.splitlines() if line.startswith("| `")}
+    assert set(keys(json.loads(asset(schema).read_text(encoding="utf-8")))) - shown == set()
+
+
+def keys(schema: object) -> Iterator[str]:
+    """The keys that a schema declares, apart from what it says of whole tables."""
+    if not isinstance(schema, dict):
+        return
+    for name, value in schema.items():
+        if name == "properties":
+            yield from value
+        if name not in ("if", "complete", "complete_route", "complete_gateway"):
+            yield from keys(value)
+
+
+OTHER_YAML = ("guides/test-tables.md",)
+"""Pages whose YAML is no table. A block that is a whole file, tests/test_docs_commands.py writes."""
+
+
 def table_examples() -> Iterator[str]:
     """Some show routes without the key above them."""
-    for example in (example for page in TABLE_PAGES for example in examples(page, "yaml")):
+    user_pages = (
+        str(page.relative_to(DOCS))
+        for folder in ("start", "guides", "troubleshooting")
+        for page in (DOCS / folder).glob("*.md")
+    )
+    pages = ["../README.md", "index.md", "reference/table.md", *sorted(user_pages)]
+    for example in (text for page in pages if page not in OTHER_YAML for text in examples(page, "yaml")):
+        if file_name(example.partition("\n")[0]):
+            continue
         bare = not re.match(rf"#|({'|'.join(table_schema()['properties'])}):", example)
         yield "routes:\n" + indent(example, "  ") if bare else example
 
@@ -66,7 +101,7 @@ def test_examples_with_gateways_only_need_nothing_but_the_version(tmp_path: Path
     whole = [text for text in examples(page, "yaml") if "\ngateways:" in f"\n{text}"]
     assert whole
     for example in whole:
-        version = "" if example.startswith("version:") else "version: 1\n"
+        version = "" if re.search(r"^version:", example, re.MULTILINE) else "version: 1\n"
         table.write_text(version + example)
         assert list(map(str, check_table(table, {}).diagnostics)) == []
 
@@ -85,6 +120,12 @@ def anchors(page: Path) -> set[str]:
     }
 
 
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.name)
+def test_pages_of_the_site_do_not_link_to_files_outside(page: Path) -> None:
+    links = re.findall(r"\]\((?!\w+://)([^)\s#]+)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not (page.parent / link).resolve().is_relative_to(DOCS.resolve())] == []
+
+
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
 def test_links_to_files_and_headings_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\((?!\w+://)([^)\s#]*)(?:#([^)\s]*))?\)", page.read_text(encoding="utf-8"))
@@ -93,7 +134,7 @@ def test_links_to_files_and_headings_lead_somewhere(page: Path) -> None:
     assert wrong == []
 
 
-# -- docs/guides/gateways.md ----------------------------------------------------------------------------------------
+# -- docs/reference/gateway-protocol.md --------------------------------------------------------------------------------
 
 VECTOR = ros_interfaces().get("geometry_msgs/msg/Vector3")
 TIME = 1700000000.25
@@ -106,15 +147,15 @@ def vector_packet(**values: float) -> Packet:
 
 
 def test_the_packet_that_is_taken_apart_is_one_of_the_gateway() -> None:
-    [example] = examples("guides/gateways.md", "hex")
+    [example] = examples(PROTOCOL, "hex")
     data = bytes.fromhex("".join(line.partition("   ")[0] for line in example.splitlines()))
     assert data == pack(vector_packet(x=1.0, y=0.1, z=-2.5))
-    assert f"These {len(data)} bytes" in (DOCS / "guides/gateways.md").read_text(encoding="utf-8")
+    assert f"These {len(data)} bytes" in (DOCS / PROTOCOL).read_text(encoding="utf-8")
 
 
 def test_schema_and_documents_are_as_they_are_shown() -> None:
     assert VECTOR is not None
-    schema, sent, received = examples("guides/gateways.md", "json")
+    schema, sent, received = examples(PROTOCOL, "json")
     assert json.loads(schema) == json.loads(schema_text(VECTOR))
     data = next(line for line in map(json.loads, sent.splitlines()) if line["op"] == "data")
     cdr = decoder(VECTOR, Style.PLAIN)(json.dumps(data["data"]).encode())
@@ -130,7 +171,7 @@ def test_schema_and_documents_are_as_they_are_shown() -> None:
 @contextmanager
 def program(folder: Path, name: str, *arguments: object) -> Iterator[IO[str]]:
     """What an example that begins with its own name prints, while it runs."""
-    [text] = (text for text in examples("guides/gateways.md", "python") if text.startswith(f"# {name}: python {name} "))
+    [text] = (text for text in examples(PROTOCOL, "python") if text.startswith(f"# {name}: python {name} "))
     (folder / name).write_text(text)
     command = [sys.executable, name, *map(str, arguments)]
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as running:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".svg", ".mmd", ".dot")
 _DESCRIPTION = """Draw who sends which payload cases, and where each goes: an SVG that any browser shows, light or dark
-as the viewer likes, with addresses, types and conditions under the pointer; or text for Mermaid (.mmd) or Graphviz
-(.dot)."""
+as the viewer likes, with a legend, and with addresses, types and conditions under the pointer; or text for Mermaid
+(.mmd) or Graphviz (.dot)."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -53,8 +53,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _drawn(table: RouteTable, suffix: str) -> str:
     from router.observe.route_map import route_map
-    from router.tools.graph import dot, mermaid, svg
+    from router.tools.graph import dot, mermaid
+    from router.tools.graph_svg import svg
 
+    title = table.path.name
     if suffix == ".svg":
-        return svg(route_map(table), table.path.name)
-    return dot(table, table.path.name) if suffix == ".dot" else mermaid(table)
+        return svg(route_map(table), title, f"{table.node.name}: {_counted(table)}")
+    return dot(table, title) if suffix == ".dot" else mermaid(table, title)
+
+
+def _counted(table: RouteTable) -> str:
+    parts = [plural(len(table.routes), "route"), plural(len(table.endpoints), "endpoint")]
+    return ", ".join(parts + ([plural(len(table.gateways), "gateway")] if table.gateways else []))

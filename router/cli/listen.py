@@ -50,7 +50,8 @@ _PLACES = """places:
   tcp://HOST:PORT       a gateway's TCP, connected to again and again
   ws://HOST:PORT        a gateway's websocket, likewise
   zenoh://KEY           a gateway's key; ?connect=tcp/10.0.0.1:7447, also
-                        listen=LOCATOR and mode=peer|client|router
+                        listen=LOCATOR and mode=peer|client|router; or
+                        ?config=FILE of Zenoh's, as for certificates
   envelope://[HOST:]PORT    envelopes, as boards and basestation get them
   envelope://NAME       the same at the address of an endpoint or listener
   topic://NAME          a ROS topic"""

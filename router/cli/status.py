@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, BAD_USAGE, NETWORK_FAULT, OK, Subparsers, add_verb
+from router.cli.findings import plural
 from router.cli.tool_options import add_router_options, running_url
 from router.errors import TransportError
 
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"state": state, "url": url, "problems": problems, "received": received}))
     else:
-        details = [*problems, *([] if received is None else [f"{received} datagrams received"])]
+        details = [*problems, *([] if received is None else [f"{plural(received, 'datagram')} received"])]
         print(f"{state}: {'; '.join(details)}")
     return code
 

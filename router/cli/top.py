@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
 ORDERS = ("table", "rate", "drops", "age", "latency")
 _DESCRIPTION = """Show each route of a running router: messages per second, where they went, what was dropped and why,
-the time since the last one, and how long routes took in the middle (p50) and at worst, but for one of 100 (p99). On a
-terminal it is shown again and again, and keys sort it."""
+the time since the last one, and how long routes took in the middle (p50) and at worst, but for one of 100 (p99). It
+begins with what is wrong and when each endpoint was last heard. `!` marks what is wrong now, `+2` targets that have no
+room. On a terminal it is shown again and again; keys sort and scroll it."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -63,11 +64,11 @@ def _print_json(url: str, order: Order, interval: float) -> None:
 def _show_once(url: str, order: Order, interval: float) -> None:
     from rich.console import Console
 
-    from router.tools.top_view import page
+    from router.tools.top_view import Page
 
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH)
     with console.capture() as shown:  # rich ends the process where a pipe is closed, and `main` has a code for that
-        console.print(page(_look(url, interval), order))
+        console.print(Page(_look(url, interval), order))
     print(shown.get(), end="")
 
 
@@ -91,10 +92,10 @@ def _show(url: str, order: Order, interval: float) -> None:
 
     from router.tools.running_router import metrics
     from router.tools.top import Order, Window, view
-    from router.tools.top_view import keys, screen
+    from router.tools.top_view import Screen, keys
 
     console, orders = Console(), {each.key: each for each in Order}
-    window, note = Window(), ""
+    window, note, first = Window(), "", 0
     window.add(metrics(url))
     with Live(console=console, screen=True, auto_refresh=False) as live, keys() as wait_for_key:
         key, due = "", 0.0
@@ -110,10 +111,12 @@ def _show(url: str, order: Order, interval: float) -> None:
                         window.clear()
                     window.add(newest)
                     note = ""
-            shown = view(*window.ends, time.time())
-            live.update(screen(shown, f"router top {url}", order, console.height, note), refresh=True)
+            seen = view(*window.ends, time.time())
+            shown = Screen(seen, f"router top {url}", order, console.height, note, first)
+            live.update(shown, refresh=True)
             try:
                 key = wait_for_key(max(due - time.monotonic(), 0.0))
             except KeyboardInterrupt:
                 return
+            first = 0 if key in orders else shown.moved(key, console.width)
             order = orders.get(key, order)

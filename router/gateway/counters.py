@@ -42,6 +42,7 @@ class GatewayCounters:
         self._clients = counters.index("gateway_clients", name)
         self._topics = [counters.index("gateway_topics", name, state) for state in TOPIC_STATES]
         self._contended = counters.index("gateway_key_conflicts", name) if settings.zenoh else None
+        self._connections = counters.index("gateway_connections", name) if settings.zenoh else None
         self._lost = {reason: counters.index("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
 
     def received(self, messages: int) -> None:
@@ -92,6 +93,11 @@ class GatewayCounters:
         """Another gateway has the same Zenoh key."""
         if self._contended is not None:
             self._counts[self._contended] += 1
+
+    def connected(self, number: int) -> None:
+        """So many other Zenoh routers and peers are connected."""
+        if self._connections is not None:
+            self._counts[self._connections] = number
 
     def clients(self, number: int) -> None:
         self._counts[self._clients] = number

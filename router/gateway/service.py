@@ -104,6 +104,9 @@ class GatewayService:
     def contended(self) -> None:
         self._counters.contended()
 
+    def connected(self, number: int) -> None:
+        self._counters.connected(number)
+
     def snapshot(self) -> list[Frame]:
         return self._topics.snapshot()
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Coroutine, Iterable, Iterator
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -229,7 +230,12 @@ def _new_transport(settings: Gateway, events: Events) -> Transport:
     if settings.transport.value is TransportKind.TCP:
         return TcpTransport(address, events, limits, prefixed=settings.format is GatewayFormat.GATEWAY_V1)
     text = settings.format is GatewayFormat.JSON
-    return WebsocketTransport(address, events, limits, text=text, page=PAGE.read_bytes())
+    return WebsocketTransport(address, events, limits, text=text, page=_page(settings.name))
+
+
+def _page(name: str) -> bytes:
+    """Return the page with the gateway's name in its title, from where its script takes it."""
+    return PAGE.read_bytes().replace(b"<title>Gateway</title>", b"<title>Gateway %b</title>" % escape(name).encode())
 
 
 def _exclude_each_other(one: Gateway, other: Gateway) -> bool:

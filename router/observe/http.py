@@ -6,7 +6,8 @@
     GET  /ready        200 while everything is open
     GET  /tap          what is received, before routing (see tap): ?case=NAME&from=ENDPOINT, each several times
     POST /-/reload     {"ok", "text", "findings"}: 200, or 422 where nothing was changed
-    POST /record/save  {"ok", "file"}: 200; {"ok", "text"}: 409 where it failed, 404 where nothing is kept
+    POST /record/save  {"ok", "file"}: 200; {"ok", "text"}: 409 where it failed, 404 where nothing is kept; the status
+                       page may order this from any computer, gets the file's name only, and 429 within 10 s
 
 Each connection has a thread of low priority. Connections, sizes and times are bounded here; `responses` has what is
 answered.
@@ -41,7 +42,7 @@ from prometheus_client.exposition import gzip_accepted
 from router.errors import SourceSpan, StartError
 from router.log import logger
 from router.net.kernel import port_holder
-from router.observe.responses import Responder, Response, plain
+from router.observe.responses import SAVE, Responder, Response, plain
 from router.observe.running import Running
 from router.observe.status import Status
 from router.observe.tap import CONTENT_TYPE, Tap, TapRequestError, wanted
@@ -86,7 +87,7 @@ class HttpServer:
     def __init__(
         self, address: Address, span: SourceSpan, running: Running, save: Callable[[str], Path] | None
     ) -> None:
-        self._status = Status(running)
+        self._status = Status(running, save is not None)
         try:
             self._server = _Server(address, Responder(running, self._status, save))
         except OSError as error:
@@ -351,7 +352,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         self.close_connection = True  # a body is not read
-        self._for_own_computer(self._order)
+        path = self.path.partition("?")[0]
+        if path == SAVE and is_own_page(self.headers):
+            self._slow = lambda: self._order(self._responder.save_for_page)
+        else:
+            self._for_own_computer(lambda: self._order(lambda: self._responder.post(path)))
 
     def _for_own_computer(self, serve: Callable[[], None]) -> None:
         why = refusal(self.client_address[0], self.connection.getsockname()[0], self.headers)
@@ -360,9 +365,9 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._respond(plain(HTTPStatus.FORBIDDEN, why))
 
-    def _order(self) -> None:
+    def _order(self, order: Callable[[], Response]) -> None:
         with self._ordering, self._connections.busy(self.connection):
-            self._respond(self._responder.post(self.path.partition("?")[0]))
+            self._respond(order())
 
     def _respond(self, response: Response) -> None:
         if gzip_accepted(self.headers.get("Accept-Encoding", "")):
@@ -430,6 +435,16 @@ def refusal(peer: str, own: str, headers: Message) -> str | None:
     if len(hosts) != 1 or not _is_plain(hosts[0]):
         return "only by an IP address or localhost, not by a name"
     return None
+
+
+def is_own_page(headers: Message) -> bool:
+    """Return whether a browser asks for a page that came from this server, by an IP address or localhost.
+
+    A name is not believed: it may have been made to lead here only after a page of somebody else was loaded from it.
+    """
+    origins, hosts = headers.get_all("Origin", []), headers.get_all("Host", [])
+    is_same = len(hosts) == 1 and _is_plain(hosts[0]) and origins == [f"http://{hosts[0]}"]
+    return is_same and headers.get("Sec-Fetch-Site", "same-origin") == "same-origin"
 
 
 def is_own_computer(peer: str, own: str) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from http import HTTPStatus
+from math import ceil
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
@@ -21,7 +22,7 @@ from router.clock import wall_ns
 from router.errors import RouterError
 from router.observe.running import Running
 from router.observe.snapshot import COLLECTED_AT
-from router.observe.status import MEASURES, Status
+from router.observe.status import Status
 
 PAGE = Path(__file__).with_name("status_page.html")
 
@@ -32,6 +33,11 @@ LOOK_SECONDS = 0.05
 
 KEPT_SECONDS = 0.5
 """For so long a response that is costly to make is given to whoever asks for the same."""
+
+SAVE_SECONDS = 10.0
+"""From one order of a page to save until the next."""
+
+SAVE = "/record/save"
 
 GZIP_FROM = 1000
 """Bytes of a response that are worth compressing."""
@@ -93,6 +99,8 @@ class Responder:
         self._status = status
         self._cache = _Cache()
         self._save = save
+        self._page_saved = -SAVE_SECONDS  # monotonic, s
+        self._page_saving = threading.Lock()
         self._registry = CollectorRegistry()
         self._registry.register(running)
         ProcessCollector(registry=self._registry)
@@ -102,10 +110,10 @@ class Responder:
         self._get: Mapping[str, Callable[[Query], Response]] = {
             "/": lambda _: self._page,
             "/status.json": lambda _: self._cache.get("status", self._numbers),
-            "/map.json": self._map,
+            "/map.json": lambda _: self._map(),
             "/ready": lambda _: self._ready(),
         }
-        self._post = {"/-/reload": self._reload, "/record/save": self._save_recording}
+        self._post = {"/-/reload": self._reload, SAVE: self._save_recording}
 
     def get(self, path: str, query: Query) -> Response:
         if path in self._get:
@@ -132,12 +140,9 @@ class Responder:
             return self._post[path]()
         return plain(HTTPStatus.NOT_FOUND, f"there are {' and '.join(self._post)}")
 
-    def _map(self, query: Query) -> Response:
-        width = query.get("width", ["wide"])[0]
-        if width not in MEASURES:
-            return plain(HTTPStatus.BAD_REQUEST, f"there is no width '{width}': narrow, wide")
-        key = f"map {width} {self.running.program.table.sha256}"
-        return self._cache.get(key, lambda: _json(HTTPStatus.OK, self._status.map(width)))
+    def _map(self) -> Response:
+        key = f"map {self.running.program.table.sha256}"
+        return self._cache.get(key, lambda: _json(HTTPStatus.OK, self._status.map()))
 
     def healthz(self) -> Response:
         before, until = self.running.progress(), monotonic() + STUCK_SECONDS
@@ -164,3 +169,19 @@ class Responder:
             return _json(HTTPStatus.OK, {"ok": True, "file": str(self._save("http"))})
         except RouterError as error:
             return _json(HTTPStatus.CONFLICT, {"ok": False, "text": str(error)})
+
+    def save_for_page(self) -> Response:
+        """As POST /record/save, for a page in a browser anywhere: at most every SAVE_SECONDS, and without paths."""
+        with self._page_saving:
+            wait = self._page_saved + SAVE_SECONDS - monotonic()
+            if wait > 0 and self._save is not None:
+                text = f"a recording was saved just now: try again in {ceil(wait)} s"
+                return _json(HTTPStatus.TOO_MANY_REQUESTS, {"ok": False, "text": text})
+            self._page_saved = monotonic()
+        response = self._save_recording()
+        answer = json.loads(response.body)
+        if answer["ok"]:
+            answer["file"] = Path(answer["file"]).name
+        elif (record := self.running.program.table.record) is not None:
+            answer["text"] = answer["text"].replace(str(record.directory), record.directory.name)
+        return _json(response.status, answer)

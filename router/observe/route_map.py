@@ -1,4 +1,4 @@
-"""The map of a route table, for the status page and `router graph`: what sends what to whom, and its layout.
+"""The map of a route table: what sends what to whom, for the status page and `router graph`; and a layout for `graph`.
 
 Sources are on the left, payload cases in the middle, targets on the right. Edges carry the labels under which the
 metrics count what goes over them.
@@ -37,6 +37,7 @@ class Node:
     """An endpoint, a topic, a payload case, a gateway or its clients, in a column of the map.
 
     `key` is unique in a map. `about` says in a few words what the name does not: an address, a type, a ttl.
+    Endpoints have an `address` and a `role`, as in `kind: board`; clients of a gateway have an `address`.
     """
 
     key: str
@@ -44,6 +45,8 @@ class Node:
     kind: NodeKind
     name: str
     about: str = ""
+    address: str = ""
+    role: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +114,10 @@ def _targets(route: Route, table: RouteTable) -> Iterator[Node]:
 
 
 def _endpoint(endpoint: Endpoint, side: str, column: int) -> Node:
-    about = f"{endpoint.kind.value}, {endpoint.address.value}"
-    return Node(f"{side}:@{endpoint.name}", column, NodeKind.ENDPOINT, endpoint.name, about)
+    address, role = str(endpoint.address.value), endpoint.kind.value
+    return Node(
+        f"{side}:@{endpoint.name}", column, NodeKind.ENDPOINT, endpoint.name, f"{role}, {address}", address, role
+    )
 
 
 def _edges_of(route: Route) -> Iterator[Edge]:
@@ -141,10 +146,10 @@ def _gateway_nodes(gateway: Gateway, table: RouteTable) -> Iterator[Node]:
     excluded = ", ".join(pattern.text for pattern in gateway.exclude)
     about = f"{included} but {excluded}" if excluded else included
     yield Node(f"from:{_key(gateway)}", 0, NodeKind.TOPIC, "ROS topics", about)
-    place = gateway.address.value if gateway.address is not None else gateway.transport.value.value
-    yield Node(f"to:{_key(gateway)}", 2, NodeKind.CLIENTS, f"clients of {gateway.name}", str(place))
+    place = str(gateway.address.value if gateway.address is not None else gateway.transport.value.value)
+    yield Node(f"to:{_key(gateway)}", 2, NodeKind.CLIENTS, f"clients of {gateway.name}", place, place)
     for inbound in gateway.inbound:
-        yield Node(f"clients:{_key(gateway)}", 0, NodeKind.CLIENTS, f"clients of {gateway.name}", str(place))
+        yield Node(f"clients:{_key(gateway)}", 0, NodeKind.CLIENTS, f"clients of {gateway.name}", place, place)
         name = resolved(inbound.topic.topic.value, table.node)
         yield Node(f"to:{name}", 2, NodeKind.TOPIC, name, inbound.topic.type_name)
 
@@ -181,8 +186,6 @@ class Measures(NamedTuple):
 
 
 WIDE = Measures()
-NARROW = Measures(width=390, font=10, letter=5.8, letters=18, pad=4, row=20, between=4, gap=24, port=4, head=20)
-"""For a phone that is held upright."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 from router.clock import wall_ns
 from router.errors import shown_path
 from router.observe.last_values import LastValues
-from router.observe.route_map import NARROW, WIDE, Measures, RouteMap, route_map
+from router.observe.route_map import nodes_and_edges
 from router.observe.running import Running
 from router.observe.snapshot import BUCKETS, SERIES, Snapshot, snapshot
-
-MEASURES: dict[str, Measures] = {
-    "narrow": NARROW._replace(letters=17, letter=5.5),
-    "wide": WIDE._replace(width=880, letters=30, pad=22),
-}
-"""In wide boxes there is room for a number beside the name."""
+from router.table.model import RouteTable, Transport
 
 Json = dict[str, Any]
 
@@ -30,6 +26,7 @@ PATHS = {
     "route_last_message_timestamp_seconds": "routes {route} last",
     "deadman_active": "routes {route} deadman_active",
     "deadman_trips": "routes {route} deadman_trips",
+    "deadman_send_errors": "routes {route} deadman_errors {destination}",
     "gateway_clients": "routes {route} clients",
     "gateway_topics": "routes {route} topics {state}",
     "client_messages_dropped": "routes {route} clients_missed {reason}",
@@ -41,12 +38,15 @@ PATHS = {
     "datagrams_rejected": "listeners {listener} rejected {reason}",
     "unhandled": "unhandled {payload_case}",
     "publish_stalled_seconds": "stalled {topic}",
+    "record_dropped": "recording {reason}",
     "config_last_reload_successful": "reload ok",
     "config_last_reload_timestamp_seconds": "reload at",
 }
 """Where the values of each metric stand in the numbers: keys, and labels in braces."""
 
 IF_ANY = {
+    "deadman_send_errors",
+    "record_dropped",
     "messages_dropped",
     "messages_filtered",
     "messages_collected",
@@ -60,17 +60,19 @@ IF_ANY = {
 
 
 class Status:
-    """Thread-safe. Times are seconds of the router's wall clock."""
+    """Thread-safe. Times are seconds of the router's wall clock. `can_save`: whether the last datagrams are kept."""
 
-    def __init__(self, running: Running) -> None:
+    def __init__(self, running: Running, can_save: bool = False) -> None:
         self._running = running
+        self._can_save = can_save
         self._started = wall_ns() / 1e9
         self._values = LastValues(running)
 
     def numbers(self) -> Json:
         """Everything that changes. `map` says to which map it belongs, which changes with the table.
 
-        `started` is different for each run of the router: counters begin again there.
+        `started` is different for each run of the router: counters begin again there. `progress` stands still where
+        the receive thread is stuck.
         """
         running = self._running
         program = running.program
@@ -85,14 +87,16 @@ class Status:
             "map": table.sha256,
             "table": shown_path(table.path),
             "ready": running.is_ready,
+            "progress": running.progress(),
             **found,
             "values": self._values.of(program),
         }
 
-    def map(self, width: str) -> Json:
-        """The drawing, of a width of MEASURES. Raises KeyError for another."""
+    def map(self) -> Json:
+        """What does not change while a table runs. `keeps`: how many seconds can be saved, None where none."""
         table = self._running.program.table
-        return {"map": table.sha256, **_map_json(route_map(table, MEASURES[width]))}
+        kept = table.record.last if self._can_save and table.record is not None else None
+        return {"map": table.sha256, "keeps": None if kept is None else kept / 1e9, **_map_json(table)}
 
     def close(self) -> None:
         self._values.close()
@@ -103,7 +107,8 @@ def numbers(now: Snapshot) -> Json:
 
     `routes` has gateways as well. A route's `buckets` are cumulative, in the order of bounds.
     """
-    found: Json = {"routes": {}, "endpoints": {}, "listeners": {}, "unhandled": {}, "stalled": {}, "reload": {}}
+    groups = ("routes", "endpoints", "listeners", "unhandled", "stalled", "recording", "reload")
+    found: Json = {group: {} for group in groups}
     for metric, path in _PATHS.items():
         for labels, value in now.counts(metric).items():
             if value or metric not in IF_ANY:
@@ -131,39 +136,19 @@ def _steps(metric: str, path: str) -> tuple[str | int, ...]:
 _PATHS = {metric: _steps(metric, path) for metric, path in PATHS.items()}
 
 
-def _map_json(drawing: RouteMap) -> Json:
-    nodes = [
-        {
-            "key": box.node.key,
-            "column": box.node.column,
-            "kind": box.node.kind.value,
-            "name": box.node.name,
-            "about": box.node.about,
-            "label": box.label,
-            "box": [box.x, box.y, box.width, box.height],
-        }
-        for box in drawing.boxes
-    ]
-    links = [
-        {
-            "start": curve.edge.start,
-            "end": curve.edge.end,
-            "route": curve.edge.route,
-            "label": curve.edge.label,
-            "about": curve.edge.about,
-            "path": curve.path,
-        }
-        for curve in drawing.curves
-    ]
-    measures = drawing.measures
+def _map_json(table: RouteTable) -> Json:
+    """`pages`: the gateways that are a page for browsers, with the address that they wait at. `deadmen`: the payload
+    case that each route's deadman sends."""
+    nodes, edges = nodes_and_edges(table)
     return {
-        "size": [drawing.width, drawing.height],
-        "columns": drawing.columns,
-        "font": measures.font,
-        "pad": measures.pad,
-        "head": measures.head,
-        "port": measures.port,
-        "rates": measures.pad > NARROW.pad,
-        "nodes": nodes,
-        "links": links,
+        "name": table.node.name,
+        "listeners": {name: str(listener.address.value) for name, listener in table.listeners.items()},
+        "pages": {
+            gateway.name: list(gateway.address.value)
+            for gateway in table.gateways.values()
+            if gateway.transport.value is Transport.WEBSOCKET and gateway.address is not None
+        },
+        "deadmen": {route.name: route.deadman.case.value for route in table.routes if route.deadman is not None},
+        "nodes": [{**asdict(node), "kind": node.kind.value} for node in nodes],
+        "links": [asdict(edge) for edge in edges],
     }

@@ -10,6 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import ExitStack, suppress
+from pathlib import Path
 from typing import NamedTuple, Protocol
 from urllib.parse import parse_qs
 
@@ -20,7 +21,7 @@ from router.errors import Located, SourceSpan, UsageError, did_you_mean
 from router.gateway.packets import Packet, PacketError, pack
 from router.net.kernel import ask_for_receive_buffer, drops
 from router.table.addresses import Address
-from router.table.model import GatewayFormat, ZenohSettings
+from router.table.model import GatewayFormat, ZenohConfig, ZenohSettings
 from router.table.units import LARGEST_DATAGRAM
 from router.tools import udp
 from router.tools.gateway_messages import MOST_TEXT
@@ -327,15 +328,19 @@ def _local(text: str) -> Address:
 
 
 def _zenoh(text: str) -> ZenohSettings:
-    """`rovers/loki_1?mode=client&connect=tcp/10.0.0.1:7447`; several `connect` and `listen` are possible."""
+    """`rovers/loki_1?mode=client&connect=tcp/10.0.0.1:7447`, with several `connect` and `listen`; or `?config=FILE`."""
     key, _, query = text.partition("?")
     options = parse_qs(query, keep_blank_values=True)
-    known = ("mode", "connect", "listen")
+    known = ("mode", "connect", "listen", "config")
     if unknown := [name for name in options if name not in known]:
         raise UsageError(f"zenoh has no option '{unknown[0]}'", did_you_mean(unknown[0], known))
+    file = options.get("config", [None])[-1]
+    if file is not None and len(options) > 1:
+        raise UsageError("zenoh has 'config' alone", "write mode, connect and listen into that file")
     return ZenohSettings(
         key=Located(key, _SPAN),
         mode=options.get("mode", ["peer"])[-1],
         connect=tuple(options.get("connect", ())),
         listen=tuple(options.get("listen", ())),
+        config=None if file is None else ZenohConfig(_SPAN, "", Path(file)),
     )

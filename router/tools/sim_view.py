@@ -66,7 +66,7 @@ class SimView:
         sent = sum(cases.total() for cases in statistics.sent.values())
         received = sum(arrivals.count for _, arrivals in self._arrivals())
         line = f"{self._seconds:.0f} s: sent {sent}, received {received}"
-        if not received and statistics.is_answered and self._seconds > PATIENCE:
+        if sent and not received and statistics.is_answered and self._seconds > PATIENCE:
             line += " (is the router running with this table?)"
         if statistics.unsent:
             line += f", refused by the kernel {statistics.unsent}"

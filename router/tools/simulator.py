@@ -115,7 +115,8 @@ MOST_CHANGES = 100
 class Statistics:
     """Counts since the start. `sent` is by endpoint and by payload case, `inboxes` by endpoint.
 
-    `is_answered`: whether the table sends something back. `unsent` are datagrams that the kernel refused to take.
+    `is_answered`: whether a route forwards what endpoints send (what comes from ROS may not be published yet).
+    `unsent` are datagrams that the kernel refused to take.
     `changes` are those of the boards, the newest last.
     """
 
@@ -145,7 +146,7 @@ class Simulator:
     ) -> None:
         if not table.listeners:
             raise UsageError(f"{table.path} has no listeners: nobody receives what boards would send")
-        self.statistics = Statistics(is_answered=any(route.destinations for route in table.routes))
+        self.statistics = Statistics(is_answered=any(route.sources and route.destinations for route in table.routes))
         played = boards(wire, table, deadmen, self.statistics.changes.append)
         self.statistics.inboxes = {name: Inbox(wire, played.get(name)) for name in table.endpoints}
         self._wire = wire
@@ -196,7 +197,9 @@ class Simulator:
         except UsageError as error:
             if isinstance(error.__cause__, OSError) and error.__cause__.errno == errno.EADDRNOTAVAIL:
                 raise UsageError(
-                    str(error), "take a table with addresses of this machine: -t routes/sim.yaml"
+                    str(error),
+                    "play a table with addresses of this machine, such as 127.0.0.2; "
+                    "routes/sim.yaml lays them over the rover's",
                 ) from error
             raise
         self._opened.append(opened)

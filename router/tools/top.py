@@ -32,7 +32,8 @@ class Order(enum.Enum):
 @dataclass(frozen=True, slots=True)
 class TargetRow:
     """A destination or topic of a route, or the clients of a gateway: delivered messages in all and per second, those
-    that were dropped, and withheld ones. Of the dropped, `lost` are those that the table does not want gone.
+    that were dropped, and withheld ones. Of the dropped, `lost` are those that the table does not want gone;
+    `is_losing`: their number grew between the two snapshots.
     """
 
     name: str
@@ -41,6 +42,7 @@ class TargetRow:
     rate: float
     dropped: Mapping[str, int]
     filtered: int
+    is_losing: bool = False
 
     @property
     def lost(self) -> dict[str, int]:
@@ -77,10 +79,18 @@ class RouteRow:
     def lost(self) -> dict[str, int]:
         return unwanted(self.dropped)
 
+    @property
+    def is_losing(self) -> bool:
+        return any(target.is_losing for target in self.targets)
+
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """All routes, and what no route took, by reason. `silence`: seconds since each endpoint sent, None for never."""
+    """All routes, and what no route took, by reason.
+
+    `silence`: seconds since each endpoint sent, None for never. `silent`: the endpoints that were heard once, and not
+    for their `stale_after`.
+    """
 
     routes: tuple[RouteRow, ...]
     received: int
@@ -88,6 +98,7 @@ class View:
     rejected: Mapping[str, int]
     kernel_drops: int
     silence: Mapping[str, float | None] = field(default_factory=dict)
+    silent: tuple[str, ...] = ()
 
 
 class Window:
@@ -133,13 +144,16 @@ def view(before: Snapshot, after: Snapshot, now: float | None = None) -> View:
     for (_, reason), count in after.counts("datagrams_rejected").items():
         if count:
             rejected[reason] += int(count)
+    silence = {endpoint: _age(stamp, now) for (endpoint,), stamp in seen.items()}
+    patience = {endpoint: seconds for (endpoint,), seconds in after.counts("endpoint_stale_after_seconds").items()}
     return View(
         routes=tuple(_route_row(route, before, after, now) for route in routes),
         received=after.total("datagrams_received"),
         rate=_rate(before, after, "datagrams_received"),
         rejected=dict(rejected),
         kernel_drops=after.total("kernel_drops"),
-        silence={endpoint: _age(stamp, now) for (endpoint,), stamp in seen.items()},
+        silence=silence,
+        silent=tuple(name for name, age in silence.items() if age is not None and age > patience.get(name, math.inf)),
     )
 
 
@@ -188,15 +202,21 @@ def _targets(route: str, after: Snapshot) -> Iterator[tuple[str, str]]:
 
 
 def _target_row(metric: str, route: str, target: str, before: Snapshot, after: Snapshot) -> TargetRow:
-    dropped = after.of("messages_dropped", route)
+    dropped = _dropped(route, target, after)
     return TargetRow(
         name=target,
         is_topic=metric == "messages_published",
         delivered=after.total(metric, route, target),
         rate=_rate(before, after, metric, route, target),
-        dropped={reason: int(count) for (to, reason), count in dropped.items() if to == target and count},
+        dropped=dropped,
         filtered=after.total("messages_filtered", route, target),
+        is_losing=sum(unwanted(dropped).values()) > sum(unwanted(_dropped(route, target, before)).values()),
     )
+
+
+def _dropped(route: str, target: str, snapshot: Snapshot) -> dict[str, int]:
+    counts = snapshot.of("messages_dropped", route)
+    return {reason: int(count) for (to, reason), count in counts.items() if to == target and count}
 
 
 def _rate(before: Snapshot, after: Snapshot, metric: str, *labels: str) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import select
 import sys
@@ -10,28 +9,32 @@ import termios
 import time
 import tty
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 
-from rich.console import Group, RenderableType
-from rich.table import Table
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
-from router.table.units import duration
-from router.tools.top import Order, RouteRow, TargetRow, View, ordered, unwanted
+from router.observe.route_map import shortened
+from router.tools.top import Order, View, unwanted
+from router.tools.top_table import Column, RouteTable
+from router.tools.top_words import age_text, latency_text, reasons_text
 from router.values import rate_text
 
-Column = Callable[[RouteRow], Text]
-"""One more cell for a route."""
+_ENDPOINT_LINES = 4
+"""At most, on a screen; what is silent is also said above them."""
 
-_HEAD = 4
-"""Lines above the routes and the one below them."""
+_LETTERS = 24
+"""Of the name of an endpoint."""
+
+_SCROLLING = {"[A": "up", "[B": "down", "[5~": "page up", "[6~": "page down", "[H": "home", "[F": "end"}
+_ESCAPE = "\x1b"
 
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str]]:
-    """Yield a function that waits for a key, at most so many seconds, and returns it or "".
+    """Yield a function that waits for a key, at most so many seconds, and returns it (`q`, `page down`) or "".
 
     Until the context ends, keys come without Enter and are not echoed. Without a terminal there are none.
     """
@@ -43,7 +46,12 @@ def keys() -> Iterator[Callable[[float], str]]:
     readable.register(terminal, select.POLLIN)
 
     def wait(seconds: float) -> str:
-        return os.read(terminal, 1).decode(errors="replace") if readable.poll(seconds * 1000) else ""
+        if not readable.poll(seconds * 1000):
+            return ""
+        key = os.read(terminal, 1).decode(errors="replace")
+        if key == _ESCAPE and readable.poll(0):  # a terminal sends the whole sequence of a key at once
+            return _SCROLLING.get(os.read(terminal, 8).decode(errors="replace").replace("O", "["), "")
+        return key
 
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal)
@@ -58,72 +66,129 @@ def _sleep(seconds: float) -> str:
     return ""
 
 
-def screen(view: View, title: str, order: Order, height: int, note: str = "") -> RenderableType:
-    """At most `height` lines. `note` says what went wrong when the router was last asked."""
-    hints = ", ".join(f"{each.key} {each.value}" for each in Order)
-    foot = Text(f"sorted by {order.value}; keys: {hints}, q quit", style="dim", no_wrap=True, overflow="ellipsis")
-    head = Text(title, style="bold", no_wrap=True, overflow="ellipsis")
-    if note:
-        head.append(f"  {note}", style="bold red")
-    return Group(head, *_summary(view), route_table(view, order, height - _HEAD, _TIMES), foot)
+@dataclass(frozen=True, slots=True)
+class Screen:
+    """At most `height` lines. `note` says what went wrong when the router was last asked.
+
+    Routes are shown from number `first` on, as far as there is room for them.
+    """
+
+    view: View
+    title: str
+    order: Order
+    height: int
+    note: str = ""
+    first: int = 0
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        title = Text(self.title, style="bold", no_wrap=True, overflow="ellipsis")
+        if self.note:
+            title.append(f"  {self.note}", style="bold red")
+        yield title
+        yield from self._head(options.max_width)
+        table = self.table(options.max_width)
+        yield table
+        yield _foot(table)
+
+    def table(self, width: int) -> RouteTable:
+        room = self.height - len(self._head(width)) - 2
+        return RouteTable(self.view, self.order, room, TIMES, self.first)
+
+    def _head(self, width: int) -> list[Text]:
+        return _summary(self.view, width, min(_ENDPOINT_LINES, max(self.height // 6, 1)))
+
+    def moved(self, key: str, width: int) -> int:
+        """The number of the first route after a key was pressed."""
+        shown, last = self.table(width).shown, len(self.view.routes)
+        steps = {"up": -1, "down": 1, "page up": -len(shown), "page down": len(shown), "home": -last, "end": last}
+        return max(shown.start + steps.get(key, 0), 0)
 
 
-def page(view: View, order: Order) -> RenderableType:
+@dataclass(frozen=True, slots=True)
+class Page:
     """All of it, to be printed once."""
-    return Group(*_summary(view), route_table(view, order, len(view.routes) + 1, _TIMES))
+
+    view: View
+    order: Order
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield from _summary(self.view, options.max_width, len(self.view.silence))
+        yield RouteTable(self.view, self.order, len(self.view.routes) + 1, TIMES)
 
 
-def _summary(view: View) -> list[Text]:
-    """The whole router in a line, and the endpoints, with the deadmen that send, in another."""
-    about = Text(no_wrap=True, overflow="ellipsis")
-    for row in view.routes:
-        if row.is_tripped:
-            about.append(f"deadman of {row.route} sends  ", style="bold red")
-    if view.silence:
-        about.append("last heard: ", style="dim")
-    about.append(", ".join(f"{name} {age_text(seconds)}" for name, seconds in view.silence.items()), style="cyan")
-    return [Text(summary_line(view), no_wrap=True, overflow="ellipsis"), about]
+def _foot(table: RouteTable) -> Text:
+    foot = Text(style="dim", no_wrap=True, overflow="ellipsis")
+    shown, count = table.shown, len(table.view.routes)
+    if len(shown) < count:
+        foot.append(f"{shown.start + 1}-{shown.stop} of {count} ↑↓  ", style="bold")
+    foot.append("sort:")
+    for order in Order:
+        is_chosen = order is table.order
+        name = f"{order.key} {order.value}"
+        foot.append(f" [{name}]" if is_chosen else f"  {name}", style="bold not dim" if is_chosen else "")
+    return foot.append("  q quit")
 
 
-def route_table(view: View, order: Order, height: int, columns: Mapping[str, Column]) -> Table:
-    """At most `height` lines with the first routes in this order; the last line counts the others."""
-    table = Table(box=None, pad_edge=False, expand=True, header_style="bold")
-    table.add_column("route", no_wrap=True)
-    table.add_column("in/s", justify="right", no_wrap=True)
-    table.add_column("delivered per second", no_wrap=True, ratio=1, overflow="ellipsis")
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("drops", no_wrap=True, overflow="ellipsis")
-    rows, room = ordered(view.routes, order), height - 1
-    shown = rows if len(rows) <= room else rows[: max(room - 1, 0)]
-    for row in shown:
-        rate = Text(rate_text(row.rate), style="" if row.rate else "dim")
-        drops = Text(reasons_text(row.dropped) or "-", style="red" if row.lost else "dim")
-        table.add_row(row.route, rate, _targets_cell(row), *(column(row) for column in columns.values()), drops)
-    if len(shown) < len(rows):
-        table.add_row(Text(f"and {len(rows) - len(shown)} more", style="dim"))
-    return table
+def _summary(view: View, width: int, endpoint_lines: int) -> list[Text]:
+    """The whole router in a line or two, what is wrong with it, and when its endpoints were last heard."""
+    flow, losses = _summary_parts(view)
+    whole = f"{flow}, {losses}"
+    totals = [whole] if len(whole) <= width else [flow, losses]
+    lines = [Text(line, no_wrap=True, overflow="ellipsis") for line in totals]
+    if warnings := _warnings(view):
+        lines.append(Text("! " + "; ".join(warnings), style="bold red", no_wrap=True, overflow="ellipsis"))
+    return [*lines, *_last_heard(view, width, endpoint_lines)]
 
 
-def _targets_cell(row: RouteRow) -> Text:
-    """Destinations in cyan, topics in green, dim while nothing flows."""
-    cell = Text()
-    for target in row.targets:
-        cell.append(f"{target.name} ", style=_style(target))
-        cell.append(f"{rate_text(target.rate)}  ", style="" if target.rate else "dim")
-    return cell
+def _warnings(view: View) -> list[str]:
+    tripped = [row.route for row in view.routes if row.is_tripped]
+    silent = [f"{name} silent for {age_text(view.silence[name])}" for name in view.silent]
+    return silent + ([f"deadman sends: {', '.join(tripped)}"] if tripped else [])
 
 
-def _style(target: TargetRow) -> str:
-    if target.lost:
-        return "red"
-    if not target.rate:
-        return "dim"
-    return "green" if target.is_topic else "cyan"
+def _last_heard(view: View, width: int, most: int) -> list[Text]:
+    """The endpoints beside each other, in as many lines as they need; what has no room is counted."""
+    title = "last heard  "
+    items = [_heard(name, age, name in view.silent) for name, age in view.silence.items()]
+    lines = _packed(items, width - len(title))
+    texts = [Text("  ").join(line) for line in lines[:most]]
+    if hidden := len(items) - sum(map(len, lines[:most])):
+        last = lines[most - 1]
+        while last and len(texts[-1]) + len(more := f"  and {hidden} more") > width - len(title):
+            last, hidden = last[:-1], hidden + 1
+            texts[-1] = Text("  ").join(last)
+        texts[-1].append(more, style="dim")
+    heads = [Text(title, style="bold"), *(Text(" " * len(title)) for _ in texts[1:])][: len(texts)]
+    return [Text.assemble(*both, no_wrap=True, overflow="ellipsis") for both in zip(heads, texts, strict=True)]
+
+
+def _heard(name: str, age: float | None, is_silent: bool) -> Text:
+    """Always as wide, so that nothing moves while ages change."""
+    text = Text(f"{shortened(name, _LETTERS)} ")
+    if is_silent:
+        text = Text(f"!{text.plain}", style="bold red")
+    return text.append(f"{age_text(age):>6}", style="dim" if age is None else "cyan" if not is_silent else "")
+
+
+def _packed(items: Sequence[Text], width: int) -> list[list[Text]]:
+    lines: list[list[Text]] = []
+    room = 0
+    for item in items:
+        if not lines or room < len(item):
+            lines.append([])
+            room = width
+        lines[-1].append(item)
+        room -= len(item) + 2
+    return lines
 
 
 def summary_line(view: View) -> str:
     """The whole router in one line."""
+    return ", ".join(_summary_parts(view))
+
+
+def _summary_parts(view: View) -> tuple[str, str]:
+    """What flows, and what is lost."""
     delivered = sum(target.delivered for row in view.routes for target in row.targets)
     rate = sum(target.rate for row in view.routes for target in row.targets)
     gone = Counter(view.rejected)
@@ -134,39 +199,14 @@ def summary_line(view: View) -> str:
     if view.kernel_drops:
         lost["kernel_drops"] = view.kernel_drops
     return (
-        f"in {view.received} ({rate_text(view.rate)}/s), delivered {delivered} ({rate_text(rate)}/s), "
-        f"lost {reasons_text(lost) or 'none'}{'; as the table wants ' if wanted else ''}{reasons_text(wanted)}"
+        f"in {view.received} ({rate_text(view.rate)}/s), delivered {delivered} ({rate_text(rate)}/s)",
+        f"lost {reasons_text(lost) or 'none'}{'; as the table wants ' if wanted else ''}{reasons_text(wanted)}",
     )
 
 
-def reasons_text(dropped: Mapping[str, int]) -> str:
-    """`12 stale, 3 queue_full`, the largest first."""
-    by_count = sorted(dropped.items(), key=lambda item: (-item[1], item[0]))
-    return ", ".join(f"{count} {reason}" for reason, count in by_count)
-
-
-def age_text(seconds: float | None) -> str:
-    """`0.3 s`, `12 s`, `7 min`, `3 h`; `never` for None."""
-    if seconds is None:
-        return "never"
-    if seconds < 10:
-        return f"{seconds:.1f} s"
-    if seconds < 120:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
-
-
-def latency_text(seconds: float | None) -> str:
-    """`35 us`, `1.2 ms`; `-` for None."""
-    if seconds is None:
-        return "-"
-    if math.isinf(seconds):
-        return f"> {duration(HISTOGRAM_BOUNDS_NS[-1])}"
-    return f"{seconds * 1e6:.0f} us" if seconds < 1e-3 else f"{seconds * 1e3:.1f} ms"
-
-
-_TIMES: Mapping[str, Column] = {
-    "age": lambda row: Text(age_text(row.age), style="dim" if row.age is None else ""),
-    "p50": lambda row: Text(latency_text(row.median)),
-    "p99": lambda row: Text(latency_text(row.slowest)),
-}
+TIMES: Sequence[Column] = (
+    Column("p50", lambda row: Text(latency_text(row.median)), is_optional=True),
+    Column("p99", lambda row: Text(latency_text(row.slowest)), is_optional=True),
+    Column("age", lambda row: Text(age_text(row.age), style="dim" if row.age is None else "")),
+)
+"""What `router top` shows of a route besides its rates; the latencies where there is room."""

@@ -34,16 +34,15 @@ def browser(tmp_path: Path) -> Iterator[Browser]:
 
 
 def until_lost(page: Page) -> None:
-    page.until("document.querySelector('#silence').checkVisibility()")
-    assert page.text("#silence").startswith("No answer from the router since ")
-    assert not page.evaluate("document.querySelector('#well').checkVisibility()")
+    page.until("document.querySelector('#what').textContent.startsWith('Connection to the router lost ')")
+    assert page.evaluate("document.querySelector('#banner').className") == "bad"
     assert page.evaluate("document.querySelectorAll('.good').length") == 0
 
 
 def until_well(page: Page) -> None:
-    page.until("document.querySelector('#well').checkVisibility()")
-    page.until("!document.querySelector('#silence').checkVisibility()")
-    assert (page.text("#state"), page.text("#well")) == ("running", "Nothing is wrong.")
+    page.until("document.querySelector('#what').textContent === 'All is well'")
+    assert page.text("#state") == "running"
+    assert not page.evaluate("document.body.classList.contains('lost')")
 
 
 def feed(place: Site, datagrams: int) -> None:

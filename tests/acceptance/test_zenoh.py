@@ -1,26 +1,29 @@
-"""Zenoh gateways of running routers: certificates, access control, and two that have one key.
+"""Zenoh gateways of running routers: a fleet behind a hub, passwords, and two gateways that have one key.
 
-The first two are those of docs/guides/gateways.md. All of it on the loopback interface, without multicast.
+Certificates, rules, hub and table of the fleet are those of docs/guides/fleet.md. All of it on the loopback interface,
+without multicast.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 import signal
+import socket
 import subprocess
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import pytest
 import zenoh
 
-from tests.acceptance.gateway_clients import Scene, repeating, scene, twist
+from tests.acceptance.gateway_clients import Scene, repeating, scene
 from tests.acceptance.payloads import generated
-from tests.acceptance.ros_peer import RosPeer
+from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.site import RouterProcess, key, wait_until
 from tests.ports import free_port
 from tests.tables import PROTOS
@@ -28,7 +31,6 @@ from tests.test_docs import examples
 
 pytestmark = pytest.mark.slow  # discovery between three programs, with TLS
 
-KEY = "rovers/rover_1"
 ZENOH = """\
   earth:
     transport: {zenoh: {key: rovers/loki, listen: ["tcp/127.0.0.1:PORT"]}}
@@ -39,38 +41,82 @@ ZENOH = """\
 """
 
 
+MINE = "rovers/rover_1"
+DRIVE = {"/drive_motor": "comms/msg/DrivingBoardMotorMessage"}
+MOVE = ("/drive_motor", {"distance_to_go": 1.0, "turning_radius": 0.0})
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """What the commands of docs/guides/fleet.md make in a folder: certificates, and configurations of Zenoh."""
+
+    folder: Path
+    port: int
+
+    @property
+    def gateways(self) -> str:
+        """Of the table of all rovers."""
+        [table] = [text for text in examples("guides/fleet.md", "yaml") if text.startswith("# rover.yaml")]
+        return table.partition("gateways:\n")[2].replace("7447", str(self.port))
+
+    @contextmanager
+    def hub(self) -> Iterator[subprocess.Popen[bytes]]:
+        """The hub, by the page's command. Gateways and operators wait for it."""
+        [command] = [line for line in commands() if line.startswith("python -c ")]
+        python = command.removeprefix("python").removesuffix(" &")
+        running = subprocess.Popen(["/bin/sh", "-c", f"exec {sys.executable}{python}"], cwd=self.folder)
+        try:
+            yield running
+        finally:
+            running.kill()
+            running.wait(PATIENCE)
+
+    @contextmanager
+    def operator(self, name: str, others: str = "") -> Iterator[zenoh.Session]:
+        """A session with the certificate of `name`, an operator or rover, of the authority in `others`."""
+        text = (self.folder / "ann.json5").read_text().replace("/ann.", f"{others}/{name}.")
+        config: zenoh.Config = zenoh.Config.from_json5(text)
+        config.insert_json5("scouting/multicast/enabled", "false")
+        with zenoh.open(config) as session:
+            yield session
+
+    def drive(self, name: str, rover: str) -> None:
+        """The page's program, to its end."""
+        words = [sys.executable, "drive.py", f"{name}.json5", rover]
+        subprocess.run(words, cwd=self.folder, check=True, timeout=PATIENCE)
+
+
+def commands() -> list[str]:
+    """Those of the page, in order."""
+    joined = "".join(examples("guides/fleet.md", "console")).replace("\\\n> ", "")
+    return [line[2:] for line in joined.splitlines() if line.startswith("$ ")]
+
+
 @pytest.fixture(scope="module")
-def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the commands of docs/guides/gateways.md make there, and in `others` the same once more."""
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    """In `others` there are the same certificates of another authority."""
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl")
-    folder = tmp_path_factory.mktemp("certificates")
-    [commands] = [text for text in examples("guides/gateways.md", "sh") if "openssl" in text]
-    for place in (folder, folder / "others"):
+    made = Fleet(tmp_path_factory.mktemp("fleet"), free_port(kind=socket.SOCK_STREAM))
+    for program in examples("guides/fleet.md", "python"):
+        name = program.partition("\n")[0].removeprefix("# ")
+        (made.folder / name).write_text(program.replace("7447", str(made.port)))
+    certificates = [line for line in commands() if "openssl" in line]
+    for place in (made.folder, made.folder / "others"):
         place.mkdir(exist_ok=True)
-        local = commands.replace("192.168.0.11", "127.0.0.1")
-        subprocess.run(["/bin/sh", "-e", "-c", local], cwd=place, check=True, capture_output=True)
-    return folder
-
-
-def documented(language: str, certificates: Path) -> str:
-    [text] = [text for text in examples("guides/gateways.md", language) if "/etc/rover/zenoh" in text]
-    return text.replace("/etc/rover/zenoh", str(certificates)).replace("192.168.0.11:7447", "127.0.0.1:PORT")
+        for command in certificates:
+            subprocess.run(["/bin/sh", "-e", "-c", command], cwd=place, check=True, capture_output=True)
+    subprocess.run([sys.executable, "fleet.py"], cwd=made.folder, check=True)
+    return made
 
 
 @contextmanager
-def station(now: Scene, certificates: Path, name: str = "station", others: str = "") -> Iterator[zenoh.Session]:
-    """The base station of docs/guides/gateways.md, with the certificate of `name`."""
-    text = documented("json5", certificates).replace("PORT", str(now.ports["PORT"]))
-    text = text.replace("/station.", f"{others}/{name}.")
-    config: zenoh.Config = zenoh.Config.from_json5(text)
-    config.insert_json5("scouting/multicast/enabled", "false")
-    with zenoh.open(config) as session:
-        yield session
-
-
-def move() -> bytes:
-    return json.dumps({"op": "publish", "topic": "/cmd_vel", "time": time.time(), "data": twist(0.5)}).encode()
+def rover_1(fleet: Fleet, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
+    monkeypatch.setenv("ROVER", "rover_1")
+    monkeypatch.setenv("CERTIFICATES", str(fleet.folder))
+    with scene(folder, fleet.gateways) as now:
+        now.await_clients("fleet", 1)
+        yield now
 
 
 class Heard:
@@ -78,59 +124,101 @@ class Heard:
         self._samples: list[zenoh.Sample] = []
         session.declare_subscriber(where, self._samples.append)
 
-    def something(self) -> bool:
-        return bool(self._samples)
+    def payloads(self) -> list[str]:
+        return [sample.payload.to_string() for sample in self._samples]
+
+    def await_one(self, send: Callable[[], object]) -> None:
+        """Repeat `send` until something has come."""
+        with repeating(send):
+            wait_until(lambda: bool(self._samples), "a value")
 
 
-def test_who_has_the_right_certificate_reads_and_who_is_allowed_to_drives(tmp_path: Path, certificates: Path) -> None:
-    gateways = documented("yaml", certificates).removeprefix("gateways:\n")
-    with (
-        scene(tmp_path, gateways) as now,
-        RosPeer({"/cmd_vel": "geometry_msgs/msg/Twist"}) as peer,
-        station(now, certificates) as driver,
-        station(now, certificates, "guest") as guest,
-    ):
+def test_an_operator_reads_all_rovers_and_drives_his_own(
+    tmp_path: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with fleet.hub(), rover_1(fleet, tmp_path, monkeypatch) as now, RosPeer(DRIVE) as peer:
         now.peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
-        for session in (driver, guest):
-            heard = Heard(session, f"{KEY}/data/gw/word")
-            with repeating(partial(now.peer.say, "/gw/word", {"data": "x"})):
-                wait_until(heard.something, "a value")
-            answers = [reply.ok for reply in session.get(f"{KEY}/**", timeout=10.0)]
-            assert f"{KEY}/schema/std_msgs/msg/String" in [str(answer.key_expr) for answer in answers if answer]
-        received = key("datagrams_received", listener="earth")
-        for _ in range(5):
-            guest.put(f"{KEY}/inbound/cmd_vel", move())
-            guest.put(f"{KEY}/data/gw/word", b"forged")
-        with repeating(lambda: driver.put(f"{KEY}/inbound/cmd_vel", move())):
-            at_start = ("/cmd_vel", twist(0.0))
-            assert next(heard for heard in iter(peer.receive, None) if heard != at_start) == ("/cmd_vel", twist(0.5))
-        before = now.site.scrape()[received]
-        for _ in range(5):
-            guest.put(f"{KEY}/inbound/cmd_vel", move())
-        time.sleep(0.5)
-        assert now.site.scrape()[received] == before
+        with fleet.operator("ann") as ann, fleet.operator("ben") as ben:
+            for session in (ann, ben):
+                heard = Heard(session, f"{MINE}/data/gw/word")
+                heard.await_one(partial(now.peer.say, "/gw/word", {"data": "x"}))
+                answers = [reply.ok for reply in session.get(f"{MINE}/**", timeout=10.0)]
+                assert f"{MINE}/schema/std_msgs/msg/String" in [str(answer.key_expr) for answer in answers if answer]
+        received = key("datagrams_received", listener="fleet")
+        fleet.drive("ben", "rover_1")
+        assert now.site.scrape()[received] == 0
+        fleet.drive("ann", "rover_1")
+        assert now.site.scrape()[received] > 0
+        assert peer.receive() == MOVE
+
+
+def test_a_rover_publishes_below_its_own_key_only(tmp_path: Path, fleet: Fleet) -> None:
+    with fleet.hub(), fleet.operator("ann") as ann, fleet.operator("rover_1") as rover:
+        with fleet.operator("rover_2") as forger, fleet.operator("ben") as reader:
+            forged, own = Heard(ann, f"{MINE}/**"), Heard(ann, "rovers/rover_2/data/**")
+            commands = Heard(rover, f"{MINE}/inbound/**")
+            forger.liveliness().declare_token(f"{MINE}/owner/1/forger/host/1")
+
+            def forge() -> None:
+                for session in (forger, reader):
+                    session.put(f"{MINE}/data/word", "forged")
+                    session.put(f"{MINE}/inbound/drive_motor", "forged")
+                forger.put("rovers/rover_2/data/word", "its own")
+
+            own.await_one(forge)
+            time.sleep(0.5)  # for what would have come as well
+            assert (forged.payloads(), commands.payloads()) == ([], [])
+            assert [*rover.liveliness().get(f"{MINE}/owner/**", timeout=10.0)] == []
+        forged.await_one(lambda: rover.put(f"{MINE}/data/word", "real"))
+        assert set(forged.payloads()) == {"real"}
+        commands.await_one(lambda: ann.put(f"{MINE}/inbound/drive_motor", "real"))
+        assert set(commands.payloads()) == {"real"}
 
 
 @pytest.mark.parametrize("stranger", ["without", "of another authority", "by tcp"])
-def test_who_has_no_certificate_of_the_authority_does_not_get_in(
-    tmp_path: Path, certificates: Path, stranger: str
-) -> None:
-    gateways = documented("yaml", certificates).removeprefix("gateways:\n")
-    with scene(tmp_path, gateways) as now, ExitStack() as opened:
-        assert list(opened.enter_context(station(now, certificates)).get(f"{KEY}/data/x", timeout=10.0)) == []
+def test_who_has_no_certificate_of_the_authority_does_not_get_in(fleet: Fleet, stranger: str) -> None:
+    with fleet.hub(), ExitStack() as opened:
+        assert list(opened.enter_context(fleet.operator("ann")).get(f"{MINE}/data/x", timeout=10.0)) == []
+        if stranger == "of another authority":
+            with pytest.raises(zenoh.ZError, match="Unable to connect"), fleet.operator("ann", "/others"):
+                pass
+            return
         config: zenoh.Config = zenoh.Config()
         config.insert_json5("mode", '"client"')
         config.insert_json5("scouting/multicast/enabled", "false")
         protocol = "tcp" if stranger == "by tcp" else "tls"
-        config.insert_json5("connect/endpoints", f'["{protocol}/127.0.0.1:{now.ports["PORT"]}"]')
-        tls = "transport/link/tls"
-        config.insert_json5(f"{tls}/root_ca_certificate", f'"{certificates}/ca.pem"')
-        if stranger == "of another authority":
-            config.insert_json5(f"{tls}/enable_mtls", "true")
-            config.insert_json5(f"{tls}/connect_certificate", f'"{certificates}/others/station.pem"')
-            config.insert_json5(f"{tls}/connect_private_key", f'"{certificates}/others/station.key"')
+        config.insert_json5("connect/endpoints", f'["{protocol}/127.0.0.1:{fleet.port}"]')
+        config.insert_json5("transport/link/tls/root_ca_certificate", f'"{fleet.folder}/ca.pem"')
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             zenoh.open(config)
+
+
+def test_rovers_and_operators_find_a_hub_that_comes_back(
+    tmp_path: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ExitStack() as opened, fleet.hub() as hub, rover_1(fleet, tmp_path, monkeypatch) as now:
+        now.peer.open("/gw/word", "std_msgs/msg/String", keeps=True)
+        ann = opened.enter_context(fleet.operator("ann"))
+        hub.kill()
+        hub.wait(PATIENCE)
+        connections = key("gateway_connections", route="fleet")
+        wait_until(lambda: now.site.samples()[connections] == 0, "the loss")
+        opened.enter_context(fleet.hub())
+        Heard(ann, f"{MINE}/data/gw/word").await_one(partial(now.peer.say, "/gw/word", {"data": "x"}))
+        before = now.site.scrape()
+        fleet.drive("ann", "rover_1")
+        assert now.site.changes(before)[key("messages_published", route="fleet", topic="/drive_motor")] > 0
+
+
+def test_a_second_rover_of_the_same_name_waits_also_behind_the_hub(
+    tmp_path: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [tmp_path / name for name in ("first", "second")]
+    for folder in folders:
+        folder.mkdir()
+    with fleet.hub(), rover_1(fleet, folders[0], monkeypatch), scene(folders[1], fleet.gateways) as second:
+        wait_until(lambda: bool(second.router.events(WAITS)), "the conflict")
+        assert second.site.samples()['gateway_clients{route="fleet"}'] == 0
 
 
 WAITS = "another gateway has the Zenoh key: this gateway waits until it is free"

@@ -14,7 +14,8 @@ ROVER = ROUTES / "rover.yaml"
 
 
 @pytest.mark.parametrize(
-    ("suffix", "beginning"), [(".svg", "<svg "), (".mmd", "flowchart LR\n"), (".dot", 'digraph "rover.yaml" {\n')]
+    ("suffix", "beginning"),
+    [(".svg", "<svg "), (".mmd", "---\ntitle: 'rover.yaml'\n---\n"), (".dot", 'digraph "rover.yaml" {\n')],
 )
 def test_the_suffix_chooses_what_is_written(
     tmp_path: Path, suffix: str, beginning: str, capsys: pytest.CaptureFixture[str]

@@ -39,6 +39,7 @@ TROUBLES = "its last reload failed; sensor_board is silent for 8 s; the deadman 
     ("metrics", "healthz", "code", "line"),
     [
         (WELL, 200, OK, "running: 7 datagrams received\n"),
+        (WELL.replace('"rover"} 7', '"rover"} 1'), 200, OK, "running: 1 datagram received\n"),
         (WELL, 503, DEGRADED, "degraded: the receive thread is stuck; 7 datagrams received\n"),
         (
             ILL,

@@ -103,9 +103,9 @@ def test_on_a_terminal_keys_sort_and_end_it(served: str) -> None:
     command = [sys.executable, "-m", "router", "top", "--url", served, "--interval", "1min"]
     environment = {**os.environ, "TERM": "xterm"}
     with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment) as process:
-        read_until(ours, "sorted by table")
+        read_until(ours, "[t table]")
         os.write(ours, b"d")
-        read_until(ours, "sorted by drops")
+        read_until(ours, "[d drops]")
         os.write(ours, b"q")
         assert process.wait(PATIENCE) == OK
     assert termios.tcgetattr(theirs) == before

@@ -264,11 +264,12 @@ def test_an_ignored_gateway_has_no_series_no_address_and_no_name(check_text: Che
     assert names == {"it"}
 
 
-def test_conflicts_about_its_key_are_counted_of_a_zenoh_gateway_alone(check_text: CheckText) -> None:
+@pytest.mark.parametrize("metric", ["gateway_key_conflicts", "gateway_connections"])
+def test_its_network_is_counted_of_a_zenoh_gateway_alone(check_text: CheckText, metric: str) -> None:
     found = checked(check_text, f"far: {{transport: {{zenoh: {{key: a}}}}}}, it: {{{TCP}}}")
     assert found.program
-    conflicts = [each.labels for each, _ in found.program.counters.series() if each.metric == "gateway_key_conflicts"]
-    assert conflicts == [("far",)]
+    labels = [each.labels for each, _ in found.program.counters.series() if each.metric == metric]
+    assert labels == [("far",)]
 
 
 def test_every_series_of_a_gateway_is_there_from_the_start(check_text: CheckText) -> None:

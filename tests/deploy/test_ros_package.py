@@ -119,6 +119,7 @@ def test_colcon_meets_both_packages_and_neither_inside_the_other() -> None:
     found = {path.parent for path in ROOT.rglob("package.xml") if "/." not in str(path.relative_to(ROOT.parent))}
     ours = {path for path in found if "build" not in path.parts and "tests" not in path.parts}
     assert ours == {PACKAGE, ROOT / "schemas" / "comms"}
+    assert all("<license>Apache-2.0</license>" in (path / "package.xml").read_text() for path in ours)
     assert not (ROOT / "setup.py").exists()  # colcon would take the repository for a package
 
 

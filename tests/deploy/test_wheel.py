@@ -115,6 +115,12 @@ def test_the_carrier_comes_with_it_for_this_platform_and_any_python(wheel: Path,
     assert f"CDLL '{packages / 'router/carrier/native/libcarrier.so'}'" in loaded(packages)
 
 
+def test_the_licence_comes_with_it(packages: Path) -> None:
+    [metadata] = packages.glob("rover_router-*.dist-info")
+    assert "\nLicense-Expression: Apache-2.0\n" in (metadata / "METADATA").read_text()
+    assert (metadata / "licenses" / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+
+
 def test_without_a_compiler_it_is_for_any_platform_and_python_does_the_carriers_work(tmp_path: Path) -> None:
     wheel = build(tmp_path, CC="no-compiler")
     assert wheel.name.endswith("-py3-none-any.whl")

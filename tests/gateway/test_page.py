@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import itertools
 import json
 import re
@@ -11,8 +12,21 @@ from typing import Any
 
 import pytest
 
+from tests.gateway.accessibility import (
+    PHONE,
+    SIZES,
+    THEMES,
+    contrast_problems,
+    hidden_focus,
+    overflows,
+    show_at,
+    small_targets,
+    small_texts,
+    unnamed_controls,
+)
 from tests.gateway.browser import Browser, Page, executable
 from tests.gateway.fake_gateway import MIXED, PAGE, FakeGateway, data_document, field, schema
+from tests.gateway.pictures import IMAGE, TIMES, compressed_image, png, shown_pixel
 
 PROGRAM = executable()
 pytestmark = [
@@ -68,11 +82,11 @@ def choose(page: Page, name: str) -> None:
     page.until(f"document.querySelector('#chosen').textContent === {json.dumps(name)}")
 
 
-def tick(page: Page, topic: str, path: str) -> None:
-    """Clicks on the number in the tree, when it is there."""
-    box = f"[data-plot={json.dumps(topic + ':' + path)}]"
-    page.until(f"document.querySelector({json.dumps(box)}) !== null")
-    page.click(box)
+def plot(page: Page, topic: str, path: str) -> None:
+    """Clicks on the button beside the number, when it is there."""
+    button = f"[data-plot={json.dumps(topic + ':' + path)}]"
+    page.until(f"document.querySelector({json.dumps(button)}) !== null")
+    page.click(button)
 
 
 def received(gateway: FakeGateway) -> dict[str, Any]:
@@ -156,13 +170,35 @@ def test_the_tree_shows_the_full_value_and_follows_it(gateway: FakeGateway, page
     }
     gateway.data("/imu", value)
     choose(page, "/imu")
-    page.until("document.querySelector('#tree').innerText.includes('x: 1.5')")
-    text = page.text("#tree")
+    page.until("document.querySelector('#tree').textContent.includes('x: 1.5')")
+    text = page.evaluate("document.querySelector('#tree').textContent")
     for line in ("id: 9223372036854775809", "on: true", "[1]: null (NaN or infinite)", "[2]: 2", 'text: ""', "y: 3"):
         assert line in text
     gateway.data("/imu", {**value, "linear": {"x": 2.5}, "covariance": []})
-    page.until("document.querySelector('#tree').innerText.includes('x: 2.5')")
+    page.until("document.querySelector('#tree').textContent.includes('x: 2.5')")
     assert "[2]" not in page.text("#tree")
+
+
+def test_numbers_are_rounded_for_the_eye_and_exact_on_demand(gateway: FakeGateway, page: Page) -> None:
+    value = {"a": 0.1 + 0.2, "b": -1.5, "c": 2**64 - 1, "d": 9007199254740991, "e": 1e-7 / 3, "f": 12345678.9}
+    value |= {"latitude": 51.09931234567, "float32": 9.798620223999023}
+    gateway.data("/imu", value)
+    choose(page, "/imu")
+    page.until("document.querySelectorAll('#tree .number').length === 8")
+    shown = page.evaluate("[...document.querySelectorAll('#tree .number')].map(e => [e.textContent, e.title])")
+    assert shown == [
+        ["0.3", "0.30000000000000004"],
+        ["-1.5", ""],
+        ["18446744073709551615", ""],
+        ["9007199254740991", ""],
+        ["3.33333e-8", "3.3333333333333334e-8"],
+        ["12345679", "12345678.9"],
+        ["51.099312", "51.09931234567"],
+        ["9.79862", ""],
+    ]
+    page.evaluate("document.querySelector('#tree .plot').focus({ focusVisible: true })")
+    beside = "getComputedStyle(document.querySelector('#tree .number'), '::after').content"
+    assert page.evaluate(beside) == '" = 0.30000000000000004"'
 
 
 def test_long_arrays_are_opened_in_parts(gateway: FakeGateway, page: Page) -> None:
@@ -171,9 +207,9 @@ def test_long_arrays_are_opened_in_parts(gateway: FakeGateway, page: Page) -> No
     page.until("document.querySelector('#tree').innerText.includes('[10000]')")
     assert page.evaluate("document.querySelectorAll('#tree *').length") < 100
     page.click("#tree details details summary")
-    page.until("document.querySelectorAll('#tree input').length === 100")
+    page.until("document.querySelectorAll('#tree .plot').length === 100")
     page.click("#tree .more:not([hidden])")
-    page.until("document.querySelectorAll('#tree input').length === 200")
+    page.until("document.querySelectorAll('#tree .plot').length === 200")
     assert "… (100000 characters)" in page.text("#tree")
 
 
@@ -181,7 +217,8 @@ def coloured(page: Page, colour: str) -> list[int]:
     """Columns of the canvas that have a pixel in one of the plot's colours, within the axes."""
     page.evaluate("render()")
     expression = f"""(() => {{
-        const canvas = document.querySelector('canvas'), probe = document.createElement('canvas').getContext('2d');
+        const canvas = document.querySelector('#plot canvas');
+        const probe = document.createElement('canvas').getContext('2d');
         probe.fillStyle = getComputedStyle(canvas).getPropertyValue({json.dumps(colour)}); probe.fillRect(0, 0, 1, 1);
         const [r, g, b] = probe.getImageData(0, 0, 1, 1).data, {{width, height}} = canvas;
         const pixels = canvas.getContext('2d').getImageData(0, 0, width, height).data, columns = [];
@@ -198,25 +235,38 @@ def coloured(page: Page, colour: str) -> list[int]:
 def test_chosen_numbers_are_plotted_with_their_bounds(gateway: FakeGateway, page: Page) -> None:
     gateway.data("/imu", {"linear": {"x": 1}, "ranges": [0, 8]})
     choose(page, "/imu")
-    tick(page, "/imu", "linear.x")
-    tick(page, "/imu", "ranges[1]")
+    plot(page, "/imu", "linear.x")
+    plot(page, "/imu", "ranges[1]")
     for value in range(6):
         gateway.data("/imu", {"linear": {"x": value}, "ranges": [0, 8]})
-    page.until("document.querySelector('#legend').innerText.includes('/imu linear.x: 5 (min 0, max 5)')")
-    assert "/imu ranges[1]: 8 (min 8, max 8)" in page.text("#legend")
+    page.until("document.querySelector('#legend li').title === '/imu linear.x: 5, 0 to 5'")
+    assert " ".join(page.text("#legend").split()) == "linear.x /imu 5 0 to 5 ✕ ranges[1] /imu 8 8 to 8 ✕"
     assert coloured(page, "--plot-0")
     assert coloured(page, "--plot-1")
-    assert "linear.x: 5 (min 0, max 5)" in page.evaluate("document.querySelector('canvas').getAttribute('aria-label')")
+    assert "linear.x: 5, 0 to 5" in page.evaluate("document.querySelector('#plot canvas').getAttribute('aria-label')")
     page.click("#legend button")
     page.until("document.querySelectorAll('#legend li').length === 1")
     assert coloured(page, "--plot-0") == []
-    assert page.evaluate("document.querySelectorAll('#tree input:checked').length") == 1
+    assert page.evaluate("document.querySelectorAll('#tree [aria-pressed=true]').length") == 1
+
+
+def test_numbers_are_plotted_with_the_keyboard(gateway: FakeGateway, page: Page) -> None:
+    gateway.data("/imu", {"x": 1.25})
+    choose(page, "/imu")
+    assert page.evaluate("document.querySelector('#plot').checkVisibility()") is False
+    button = "document.querySelector('[data-plot=\"/imu:x\"]')"
+    page.until(f"{button} !== null")
+    page.evaluate(f"{button}.focus()")
+    for pressed in ("true", "false"):
+        page.key("Enter")
+        page.until(f"{button}.ariaPressed === '{pressed}'")
+        assert page.evaluate("document.querySelector('#plot').checkVisibility()") is (pressed == "true")
 
 
 def test_a_gap_in_the_values_is_a_gap_in_the_plot(gateway: FakeGateway, page: Page) -> None:
     gateway.data("/imu", {"x": 1.0})
     choose(page, "/imu")
-    tick(page, "/imu", "x")
+    plot(page, "/imu", "x")
     # Three stretches of a minute, without waiting for one: a value every half second, silence, values, NaN, values.
     page.evaluate("""(() => {
         const [series] = plots.values(), now = performance.now();
@@ -239,10 +289,10 @@ def test_a_topic_plotted_stays_plotted_while_another_is_looked_at(gateway: FakeG
     gateway.data("/a", {"x": 1})
     gateway.data("/b", {"y": 1})
     choose(page, "/a")
-    tick(page, "/a", "x")
+    plot(page, "/a", "x")
     choose(page, "/b")
     gateway.data("/a", {"x": 4})
-    page.until("document.querySelector('#legend').innerText.includes('/a x: 4 (min 1, max 4)')")
+    page.until("document.querySelector('#legend li').title === '/a x: 4, 1 to 4'")
 
 
 def test_extreme_numbers_are_plotted(gateway: FakeGateway, page: Page) -> None:
@@ -251,7 +301,7 @@ def test_extreme_numbers_are_plotted(gateway: FakeGateway, page: Page) -> None:
         topic = f"/extreme_{number}"
         gateway.data(topic, {"x": values[0]})
         choose(page, topic)
-        tick(page, topic, "x")
+        plot(page, topic, "x")
         for value in values:
             gateway.data(topic, {"x": value})
     gateway.data("/done", {})
@@ -265,8 +315,8 @@ def test_the_address_keeps_what_is_chosen(browser: Browser, gateway: FakeGateway
     opened.until("document.querySelector('#state').textContent === 'connected'")
     gateway.list_topics(["/imu", "/odom"])
     gateway.say(data_document("/imu", {"linear": {"x": 3}}), data_document("/odom", {"list": [1, 2]}))
-    opened.until("/linear.x: 3 .*list.1.: 2 /s.test(document.querySelector('#legend').innerText)")
-    tick(opened, "/imu", "linear.x")
+    opened.until("/linear.x\\s.imu\\s3\\s.*list.1.\\s.odom\\s2\\s/s.test(document.querySelector('#legend').innerText)")
+    plot(opened, "/imu", "linear.x")
     opened.until("!location.hash.includes('field')")
     opened.call("Page.reload")
     opened.until(
@@ -274,6 +324,55 @@ def test_the_address_keeps_what_is_chosen(browser: Browser, gateway: FakeGateway
     )
     assert opened.evaluate("[...plots.keys()]") == ["/odom:list[1]"]
     opened.close()
+
+
+# Pictures
+
+
+@pytest.mark.parametrize(("kind", "told"), [("png", "bgr8; png compressed bgr8"), ("jpeg", "jpeg")])
+def test_a_compressed_image_shows_its_picture(gateway: FakeGateway, page: Page, kind: str, told: str) -> None:
+    draw = f"""(() => {{
+        const canvas = Object.assign(document.createElement('canvas'), {{ width: 40, height: 30 }});
+        const context = canvas.getContext('2d');
+        context.fillStyle = '#c80000'; context.fillRect(0, 0, 40, 30);
+        return canvas.toDataURL('image/{kind}').split(',')[1];
+    }})()"""
+    data = base64.b64decode(page.evaluate(draw))
+    gateway.list_topics(["/camera"], type_name=IMAGE, rate=5.0)
+    gateway.data("/camera", compressed_image(data, told), IMAGE)
+    choose(page, "/camera")
+    caption = f"{told}, 40 {TIMES} 30, {len(data) / 1000:.1f} kB, 5.0 Hz"
+    page.until(f"document.querySelector('#picture figcaption').textContent === {json.dumps(caption)}")
+    red, green, blue, _ = shown_pixel(page)
+    assert red > 190
+    assert green < 10
+    assert blue < 10
+    gateway.data("/camera", compressed_image(png(8, 4, (0, 0, 255)), "png"), IMAGE)
+    page.until(f"document.querySelector('#picture figcaption').textContent.startsWith('png, 8 {TIMES} 4, ')")
+    assert shown_pixel(page) == [0, 0, 255, 255]
+    gateway.data("/imu", {"x": 1})
+    choose(page, "/imu")
+    assert page.evaluate("document.querySelector('#picture').checkVisibility()") is False
+
+
+def test_what_is_no_picture_is_not_decoded(gateway: FakeGateway, page: Page) -> None:
+    good = png(2, 2, (0, 0, 0))
+    for data, told, reason in (
+        (good, "16UC1; compressedDepth png", "its format is neither JPEG nor PNG"),
+        (good, "svg", "its format is neither JPEG nor PNG"),
+        (b"<svg xmlns='http://www.w3.org/2000/svg'/>", "png", "its data are neither JPEG nor PNG"),
+        (b"", "jpeg", "its data are neither JPEG nor PNG"),
+        (b"\xff\xd8\xff", "jpeg", "its data are neither JPEG nor PNG"),
+        (good[:16] + b"\0\0\xff\xff\0\0\xff\xff" + good[24:], "png", f"65535 {TIMES} 65535 pixels are too many"),
+        (good[:40], "png", ""),
+        ("not a list", "png", "its format is neither JPEG nor PNG"),
+    ):
+        gateway.data("/camera", compressed_image(data, told), IMAGE)
+        choose(page, "/camera")
+        page.until(f"document.querySelector('#picture figcaption').textContent.startsWith('No picture: {reason}')")
+        assert page.evaluate("document.querySelector('#picture canvas').checkVisibility()") is False
+        gateway.data("/camera", compressed_image(good, "png"), IMAGE)
+        page.until("document.querySelector('#picture canvas').checkVisibility()")
 
 
 # Sending
@@ -476,7 +575,7 @@ def test_hostile_text_stays_text(browser: Browser, gateway: FakeGateway) -> None
     gateway.list_topics([HOSTILE], type_name=HOSTILE)
     gateway.data(HOSTILE, {HOSTILE: HOSTILE, "n": {"__proto__": 1}, "constructor": [1]}, type_name=HOSTILE)
     choose(page, HOSTILE)
-    tick(page, HOSTILE, "constructor[0]")
+    plot(page, HOSTILE, "constructor[0]")
     page.click("[form=form]")
     gateway.say({"op": "rejected", "reason": HOSTILE, "detail": HOSTILE, "topic": HOSTILE})
     page.until("document.querySelector('#sent').textContent.includes('onerror')")
@@ -488,6 +587,9 @@ def test_hostile_text_stays_text(browser: Browser, gateway: FakeGateway) -> None
 
 def test_nothing_comes_from_elsewhere() -> None:
     text = PAGE.read_text(encoding="utf-8")
+    icon = r"""<link rel="icon" href="data:image/svg\+xml,<svg xmlns='http://www.w3.org/2000/svg' [^"]*">"""
+    text, icons = re.subn(icon, "", text)
+    assert icons == 1
     assert not re.search(
         r"https?://|\bsrc=|\bhref=|@import|url\(|\beval\(|innerHTML|insertAdjacentHTML|document\.write", text
     )
@@ -501,9 +603,76 @@ def test_topics_are_found_and_chosen_with_the_keyboard(gateway: FakeGateway, pag
     page.until("document.querySelector('#chosen').textContent === '/b/odom'")
 
 
+def is_seen(page: Page, selector: str) -> bool:
+    found: bool = page.evaluate(f"document.querySelector('{selector}').checkVisibility({{visibilityProperty: true}})")
+    return found
+
+
+@pytest.mark.parametrize("way", ["button", "Escape", "back"])
+def test_on_a_phone_a_topic_opens_a_sheet(gateway: FakeGateway, page: Page, way: str) -> None:
+    show_at(page, PHONE)
+    gateway.data("/imu", {"x": 1})
+    choose(page, "/imu")
+    page.until("document.querySelector('#tree').textContent.includes('x: 1')")
+    box = page.evaluate("document.querySelector('#detail').getBoundingClientRect().toJSON()")
+    assert (box["left"], box["top"], box["width"], box["height"]) == (0, 0, *PHONE)
+    assert [is_seen(page, part) for part in ("#topics", "header", "#tree")] == [False, False, True]
+    if way == "button":
+        page.click("#detail .back")
+    elif way == "Escape":
+        page.key("Escape")
+    else:
+        page.evaluate("history.back()")
+    page.until("document.body.dataset.sheet === ''")
+    assert [is_seen(page, part) for part in ("#topics", "header", "#tree")] == [True, True, False]
+    assert page.evaluate("document.activeElement.textContent") == "/imu"
+    page.evaluate("history.forward()")
+    page.until("document.querySelector('#tree').checkVisibility()")
+    show_at(page, (1440, 900))
+    assert [is_seen(page, part) for part in ("#topics", "header", "#tree")] == [True, True, True]
+
+
+def test_a_repeated_message_ends_with_its_sheet(gateway: FakeGateway, page: Page) -> None:
+    show_at(page, PHONE)
+    page.click("#open-send")
+    page.click("#repeat")
+    received(gateway)
+    page.key("Escape")
+    page.until("document.body.dataset.sheet === ''")
+    assert page.evaluate("repeating") == 0
+
+
+@pytest.mark.parametrize("theme", THEMES)
+@pytest.mark.parametrize("size", SIZES)
+def test_nothing_is_too_faint_too_small_or_too_wide(
+    gateway: FakeGateway, page: Page, size: tuple[int, int], theme: str
+) -> None:
+    gateway.list_topics([f"/a_rather_long_namespace/topic_{number}" for number in range(30)] + ["/imu", "/stale"])
+    gateway.data("/imu", {"linear": {"x": 0.12345678901234567, "y": -1}, "text": "x" * 300, "list": list(range(99))})
+    show_at(page, size, theme)
+    checks = (contrast_problems, unnamed_controls, overflows, small_texts, small_targets, hidden_focus)
+
+    def found() -> list[str]:
+        return [f"{check.__name__}: {problem}" for check in checks for problem in check(page)]
+
+    page.until(f"{row('/imu')} !== null")
+    assert found() == []
+    choose(page, "/imu")
+    plot(page, "/imu", "linear.x")
+    plot(page, "/imu", "linear.y")
+    page.evaluate("render()")
+    assert found() == []
+    if size == PHONE:
+        page.key("Escape")
+        page.until("document.body.dataset.sheet === ''")
+        page.click("#open-send")
+        assert found() == []
+
+
 def test_every_control_has_a_name_for_assistive_technology(gateway: FakeGateway, page: Page) -> None:
     gateway.data("/imu", {"x": 1, "list": [1]})
     choose(page, "/imu")
+    plot(page, "/imu", "x")
     choose_target(page, "/mode")
     page.call("Accessibility.enable")
     nodes = page.call("Accessibility.getFullAXTree")["nodes"]

@@ -243,6 +243,23 @@ async def test_a_router_that_is_not_there_yet_is_tried_again(monkeypatch: pytest
 
 
 @asynchronous
+async def test_a_network_that_is_lost_and_found_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gateway_zenoh, "CONNECTIONS_SECONDS", 0.05)
+    events, where = Events(), locator()
+    with capture_logs() as logs, session("router", listen=where) as hub:
+        async with opened(ZenohTransport(settings("client", connect=(where,)), events, MOST)):
+            await until(lambda: events.connections == [1])
+            hub.close()  # type: ignore[no-untyped-call]
+            await until(lambda: events.connections == [1, 0])
+            with session("router", listen=where):
+                await until(lambda: events.connections == [1, 0, 1])
+                assert [log["event"] for log in logs if log["event"].startswith("the Zenoh network")] == [
+                    "the Zenoh network is lost: Zenoh tries to connect again",
+                    "the Zenoh network is there again",
+                ]
+
+
+@asynchronous
 async def test_a_port_that_is_taken_is_refused_with_who_has_it() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         where = f"tcp/127.0.0.1:{taken.getsockname()[1]}"

@@ -32,6 +32,7 @@ class Events:
     failures: list[tuple[Client | None, Exception, int]] = field(default_factory=list)
     shown: list[Frame] = field(default_factory=list)
     contentions: int = 0
+    connections: list[int] = field(default_factory=list)
     on_drained: Callable[[Client], None] | None = None
 
     def joined(self, client: Client) -> None:
@@ -61,6 +62,9 @@ class Events:
 
     def contended(self) -> None:
         self.contentions += 1
+
+    def connected(self, number: int) -> None:
+        self.connections.append(number)
 
     def snapshot(self) -> Sequence[Frame]:
         return self.shown

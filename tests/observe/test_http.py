@@ -6,6 +6,7 @@ import errno
 import gzip
 import http.client
 import json
+import re
 import select
 import socket
 import struct
@@ -23,9 +24,17 @@ from router.errors import Code, Diagnostic, RouterError, SourceSpan
 from router.log import logger
 from router.observe import http as server_module
 from router.observe import responses, status
-from router.observe.http import MAX_ANSWERING, MAX_FROM_OTHERS, MAX_PER_HOST, MAX_TAPS, HttpServer, refusal
+from router.observe.http import (
+    MAX_ANSWERING,
+    MAX_FROM_OTHERS,
+    MAX_PER_HOST,
+    MAX_TAPS,
+    HttpServer,
+    is_own_page,
+    refusal,
+)
 from router.observe.responses import plain
-from router.observe.route_map import Measures, RouteMap, route_map
+from router.observe.route_map import Edge, Node, nodes_and_edges
 from router.observe.running import ReloadResult
 from router.observe.tap import MAGIC
 from router.table.addresses import Address
@@ -139,7 +148,6 @@ def test_what_there_is_not_is_said(server: HttpServer) -> None:
     assert ask(server, "/nothing").status == 404
     assert ask(server, "/-/nothing", "POST").status == 404
     assert ask(server, "/-/reload").status == 405
-    assert ask(server, "/map.json?width=huge").status == 400
     assert ask(server, "/map.json?" + "width=wide&" * 1000).status == 400
 
 
@@ -178,6 +186,94 @@ def test_a_page_in_a_browser_can_neither_order_nor_tap(server: HttpServer, metho
         {"Host": "127.0.0.1.example.org"},
     ):
         assert ask(server, path, method, headers).status == 403, headers
+
+
+def own_page(server: HttpServer, **others: str) -> dict[str, str]:
+    """What a browser sends of itself for the status page, with the headers of `others` in place of its own."""
+    host = str(server.address)
+    own = {"Host": host, "Origin": f"http://{host}", "Sec-Fetch-Site": "same-origin"}
+    return {**own, **{name.replace("_", "-"): value for name, value in others.items()}}
+
+
+def test_the_own_page_can_save_and_learns_no_path(server: HttpServer, saved: list[Path | RouterError]) -> None:
+    answer = ask(server, "/record/save", "POST", own_page(server))
+    assert (answer.status, answer.json) == (200, {"ok": True, "file": "last.mcap"})
+
+
+def test_why_the_own_page_could_not_save_has_no_path(
+    server: HttpServer, running: FakeRunning, saved: list[Path | RouterError]
+) -> None:
+    record = running.program.table.record
+    assert record is not None
+    saved[0] = RouterError(f"cannot write to {record.directory}: No space left on device")
+    answer = ask(server, "/record/save", "POST", own_page(server))
+    assert answer.status == 409
+    assert answer.json["text"] == f"cannot write to {record.directory.name}: No space left on device"
+
+
+def test_pages_save_once_in_ten_seconds_and_the_command_line_whenever_it_likes(
+    server: HttpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert ask(server, "/record/save", "POST", own_page(server)).status == 200
+    refused = ask(server, "/record/save", "POST", own_page(server))
+    assert refused.status == 429
+    assert re.fullmatch(r"a recording was saved just now: try again in ([1-9]|10) s", refused.json["text"])
+    assert ask(server, "/record/save", "POST").status == 200
+    monkeypatch.setattr(responses, "SAVE_SECONDS", 0)
+    assert ask(server, "/record/save", "POST", own_page(server)).status == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "http://rover.example.org"},
+        {"Origin": "http://127.0.0.1"},
+        {"Origin": "http://127.0.0.1:1"},
+        {"Origin": "https://{host}"},
+        {"Origin": "null"},
+        {"Origin": ""},
+        {"Sec_Fetch_Site": "cross-site"},
+        {"Sec_Fetch_Site": "same-site"},
+        {"Host": "rover.example.org:{port}", "Origin": "http://rover.example.org:{port}"},
+        {"Host": "127.0.0.1.example.org:{port}", "Origin": "http://127.0.0.1.example.org:{port}"},
+    ],
+    ids=str,
+)
+def test_a_page_from_elsewhere_cannot_save(server: HttpServer, headers: dict[str, str]) -> None:
+    host, port = str(server.address), str(server.address.port)
+    sent = {name: value.replace("{host}", host).replace("{port}", port) for name, value in headers.items()}
+    assert ask(server, "/record/save", "POST", own_page(server, **sent)).status == 403
+    assert ask(server, "/record/save", "POST", own_page(server)).status == 200  # nothing was saved before
+
+
+def test_a_browser_that_does_not_say_which_page_asks_cannot_save(server: HttpServer) -> None:
+    headers = own_page(server)
+    del headers["Origin"]
+    assert ask(server, "/record/save", "POST", headers).status == 403
+
+
+def test_the_own_page_can_save_and_nothing_else(server: HttpServer) -> None:
+    assert ask(server, "/-/reload", "POST", own_page(server)).status == 403
+    assert ask(server, "/tap", "GET", own_page(server)).status == 403
+
+
+@pytest.mark.parametrize(
+    ("hosts", "origins", "is_own"),
+    [
+        (["192.168.0.5:9108"], ["http://192.168.0.5:9108"], True),
+        (["localhost:9108"], ["http://localhost:9108"], True),
+        (["192.168.0.5:9108"], ["http://192.168.0.6:9108"], False),
+        (["192.168.0.5:9108", "192.168.0.5:9108"], ["http://192.168.0.5:9108"], False),
+        (["192.168.0.5:9108"], ["http://192.168.0.5:9108", "http://192.168.0.5:9108"], False),
+        ([], ["http://192.168.0.5:9108"], False),
+    ],
+)
+def test_whose_page_asks_is_told_by_its_origin(hosts: list[str], origins: list[str], is_own: bool) -> None:
+    headers = Message()
+    for name, values in (("Host", hosts), ("Origin", origins)):
+        for value in values:
+            headers[name] = value
+    assert is_own_page(headers) == is_own
 
 
 @pytest.mark.parametrize(
@@ -407,19 +503,18 @@ def test_metrics_are_collected_once_for_all_that_ask_within_half_a_second(
 def test_what_the_page_asks_for_is_made_once_for_all_that_look(
     server: HttpServer, running: FakeRunning, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn = list[Measures]()
+    mapped = list[RouteTable]()
 
-    def drawing(table: RouteTable, measures: Measures) -> RouteMap:
-        drawn.append(measures)
-        return route_map(table, measures)
+    def mapping(table: RouteTable) -> tuple[list[Node], list[Edge]]:
+        mapped.append(table)
+        return nodes_and_edges(table)
 
-    monkeypatch.setattr(status, "route_map", drawing)
+    monkeypatch.setattr(status, "nodes_and_edges", mapping)
     monkeypatch.setattr(responses, "KEPT_SECONDS", 3600)
     assert len({ask(server, "/status.json").text for _ in range(5)}) == 1
     assert running.collected == 1
-    for width in ("wide", "narrow"):
-        assert len({ask(server, f"/map.json?width={width}").text for _ in range(5)}) == 1
-    assert len(drawn) == 2
+    assert len({ask(server, "/map.json").text for _ in range(5)}) == 1
+    assert len(mapped) == 1
 
 
 def answers(server: HttpServer) -> bool:

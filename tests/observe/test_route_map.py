@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.observe.route_map import NARROW, WIDE, Measures, NodeKind, nodes_and_edges, route_map, shortened, spread
+from router.observe.route_map import NodeKind, nodes_and_edges, route_map, shortened, spread
 from router.table.model import ANY
 from tests.tables import ROUTES
 
@@ -27,11 +27,8 @@ def program_of(name: str) -> Program:
 
 
 @pytest.mark.parametrize("name", TABLES)
-@pytest.mark.parametrize("measures", [WIDE, NARROW], ids=["wide", "narrow"])
-def test_no_box_overlaps_another_and_links_run_from_the_right_of_a_box_to_the_left_of_another(
-    name: str, measures: Measures
-) -> None:
-    drawing = route_map(program_of(name).table, measures)
+def test_no_box_overlaps_another_and_links_run_from_the_right_of_a_box_to_the_left_of_another(name: str) -> None:
+    drawing = route_map(program_of(name).table)
     for box in drawing.boxes:
         assert 0 <= box.x < box.x + box.width <= drawing.width
         assert 0 <= box.y < box.y + box.height <= drawing.height

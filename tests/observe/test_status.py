@@ -79,14 +79,33 @@ def test_every_series_that_the_page_knows_exists() -> None:
     assert PATHS.keys() >= IF_ANY
 
 
-@pytest.mark.parametrize("width", ["narrow", "wide"])
-def test_every_line_of_the_map_has_its_numbers(shown: Status, width: str) -> None:
-    drawn, said = (json.loads(json.dumps(each, allow_nan=False)) for each in (shown.map(width), shown.numbers()))
+def test_every_line_of_the_map_has_its_numbers(shown: Status) -> None:
+    drawn, said = (json.loads(json.dumps(each, allow_nan=False)) for each in (shown.map(), shown.numbers()))
     columns = {node["key"]: node["column"] for node in drawn["nodes"]}
     assert drawn["map"] == said["map"]
     for link in drawn["links"]:
         side = "sources" if columns[link["end"]] == 1 else "targets"
         assert link["label"] in said["routes"][link["route"]][side], link
+
+
+def test_the_map_says_what_the_page_leads_to_and_what_endpoints_are(shown: Status) -> None:
+    drawn = shown.map()
+    assert (drawn["name"], drawn["keeps"]) == ("rover_router", None)
+    assert drawn["pages"] == {"dashboard": ["127.0.0.1", 28765]}
+    assert drawn["deadmen"]["manual_drive"] == "manual_brake"
+    board = next(node for node in drawn["nodes"] if node["key"] == "from:@sensor_board")
+    assert (board["address"], board["role"]) == ("127.0.0.30:25008", "board")
+
+
+def test_the_map_says_how_much_can_be_saved(running: FakeRunning) -> None:
+    with closing(Status(running, can_save=True)) as shown:
+        assert shown.map()["keeps"] == 60.0
+
+
+def test_a_stuck_thread_makes_no_progress(running: FakeRunning, shown: Status) -> None:
+    assert shown.numbers()["progress"] != shown.numbers()["progress"]
+    running.is_stuck = True
+    assert shown.numbers()["progress"] == shown.numbers()["progress"]
 
 
 def test_a_last_value_comes_from_what_is_received_while_somebody_looks(running: FakeRunning, shown: Status) -> None:

@@ -267,7 +267,7 @@ def test_a_mistake_is_underlined_where_it_is(
             "version": ("Version", "version of the route-table language"),
             "protos": ("Proto folder", "relative to this file"),
             "framing": ("Framing", "remove trailing zero bytes"),
-            "source: [": ("Source", "'any' is whoever does"),
+            "source: [": ("Source", "'any' is every sender"),
             "when": ("When", "boolean expression"),
             "deadline": ("Deadline", "longest time between two messages"),
             "auto: true": ("Auto", "Fields of the same name"),

@@ -7,6 +7,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import pytest
 import zenoh
@@ -14,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.sync.server import ServerConnection, serve
 
-from router.errors import Located
+from router.errors import Located, UsageError
 from router.gateway.packets import unpack
 from router.table.addresses import Address
 from router.table.model import GatewayFormat, ZenohSettings
@@ -257,6 +258,31 @@ def test_zenoh_without_a_gateway_waits_for_one(rover: tuple[zenoh.Session, str],
         until(source, lambda: gateway.matching_status.matching)  # type: ignore[attr-defined]
         gateway.put(b"live")
         assert received(source, 1) == [b"live"]
+
+
+def test_zenoh_takes_a_configuration_of_its_library(
+    rover: tuple[zenoh.Session, str], said: Said, tmp_path: Path
+) -> None:
+    session, locator = rover
+    file = tmp_path / "station.json5"
+    file.write_text(f'{{mode: "client", connect: {{endpoints: ["{locator}"]}}}}')
+    session.declare_queryable("rovers/loki_1/**", lambda query: query.reply("rovers/loki_1/data/imu", b"latest"))
+    with closing(open_source(f"zenoh://rovers/loki_1?config={file}", None, None, said.append)) as source:
+        source.ask()
+        assert received(source, 1) == [b"latest"]
+
+
+def test_a_configuration_that_zenoh_refuses_is_named_and_not_quoted(tmp_path: Path, said: Said) -> None:
+    file = tmp_path / "station.json5"
+    place = f"zenoh://rovers/loki_1?config={file}"
+    with pytest.raises(UsageError, match=r"station\.json5: No such file"):
+        open_source(place, None, None, said.append)
+    file.write_text('{transport: {auth: {usrpwd: {user: "a", password: 4711}}}}')
+    with pytest.raises(UsageError, match=r"station\.json5: ") as refused:
+        open_source(place, None, None, said.append)
+    assert "4711" not in str(refused.value)
+    with pytest.raises(UsageError, match="'config' alone"):
+        open_source(f"{place}&mode=client", None, None, said.append)
 
 
 def test_zenoh_tells_what_a_gateway_could_not_answer(rover: tuple[zenoh.Session, str], said: Said) -> None:

@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from router.observe.route_map import nodes_and_edges, route_map
+from router.observe.route_map import NodeKind, nodes_and_edges, route_map
 from router.table.model import RouteTable
-from router.tools.graph import dot, mermaid, svg
+from router.tools.graph import LEGEND, dot, mermaid
+from router.tools.graph_svg import svg
+from tests.gateway.browser import Browser, executable
 from tests.tables import PROTOS, ROUTES
 
 DOT = shutil.which("dot")
@@ -48,17 +50,63 @@ def checked_table(path: Path) -> RouteTable:
 def test_the_picture_has_a_box_and_a_line_for_everything(table: RouteTable) -> None:
     drawing = route_map(table)
     picture = ET.fromstring(svg(drawing, 'a "title" <&>'))  # noqa: S314 - our own
-    assert len(list(picture.iter(f"{SVG}rect"))) == len(drawing.boxes)
-    assert len(list(picture.iter(f"{SVG}path"))) == len(drawing.curves)
+    titled = [group.get("class", "") for group in picture.iter(f"{SVG}g") if group.find(f"{SVG}title") is not None]
+    assert sum("node" in classes.split() for classes in titled) == len(drawing.boxes)
+    assert sum("edge" in classes.split() for classes in titled) == len(drawing.curves)
     said = "".join(picture.itertext())
     assert all(box.node.name in said and box.node.about in said for box in drawing.boxes)
     assert all(curve.edge.about in said for curve in drawing.curves)
+
+
+def test_the_picture_says_what_it_is_about_and_what_its_shapes_mean(table: RouteTable) -> None:
+    drawing = route_map(table)
+    picture = ET.fromstring(svg(drawing, "boat.yaml", "boat: 2 routes"))  # noqa: S314 - our own
+    said = [text.text for text in picture.iter(f"{SVG}text")]
+    assert said[:2] == ["boat.yaml", "boat: 2 routes"]
+    kinds = {box.node.kind for box in drawing.boxes}
+    assert {kind for kind, text in LEGEND.items() if text in said} == kinds
+    assert set(LEGEND) == set(NodeKind)
+
+
+def test_routes_that_halt_boards_are_marked() -> None:
+    table = checked_table(ROUTES / "rover.yaml")
+    guarded = sum(route.ttl is not None or route.deadman is not None for route in table.routes)
+    assert 0 < guarded < len(table.routes)
+    assert svg(route_map(table), "").count('class="halt"') == guarded + 1  # and one in the legend
 
 
 def test_it_refers_to_nothing_outside_itself(table: RouteTable) -> None:
     text = svg(route_map(table), "title").replace("http://www.w3.org/2000/svg", "")
     for outside in ("http:", "https:", "url(", "@import", "href", "<script"):
         assert outside not in text
+
+
+OVERLAPS = """(() => {
+  const inside = (a, b) => a.left >= b.left && a.right <= b.right && a.top >= b.top && a.bottom <= b.bottom;
+  const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+  const box = (element) => element.getBoundingClientRect();
+  const texts = [...document.querySelectorAll("svg text")], whole = box(document.querySelector("svg"));
+  const wrong = texts.filter((text) => !inside(box(text), whole));
+  wrong.push(...texts.filter((a, i) => texts.slice(i + 1).some((b) => meet(box(a), box(b)))));
+  for (const node of document.querySelectorAll("svg .node")) {
+    if (!inside(box(node.querySelector("text")), box(node.querySelector(".shape")))) wrong.push(node);
+    const halt = node.querySelector(".halt");
+    if (halt && meet(box(halt), box(node.querySelector("text")))) wrong.push(node);
+  }
+  return wrong.map((element) => element.textContent);
+})()"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(executable() is None, reason="no Chromium here")
+def test_nothing_in_the_picture_overlaps(table: RouteTable, tmp_path: Path) -> None:
+    file = tmp_path / "routes.html"
+    file.write_text(svg(route_map(table), table.path.name, "boat: 2 routes"), encoding="utf-8")
+    browser = Browser(str(executable()), tmp_path)
+    try:
+        assert browser.open(file.as_uri()).evaluate(OVERLAPS) == []
+    finally:
+        browser.close()
 
 
 def test_browsers_that_darken_pages_on_their_own_leave_it_alone(table: RouteTable) -> None:
@@ -72,18 +120,20 @@ def test_dot_draws_every_node_and_edge(table: RouteTable) -> None:
     drawn = subprocess.run([str(DOT), "-Tplain"], input=text, capture_output=True, text=True, check=True)
     nodes, edges = nodes_and_edges(table)
     assert drawn.stderr == ""
-    assert drawn.stdout.count("\nnode ") == len(nodes)
+    assert drawn.stdout.count("\nnode ") == len(nodes) + len({node.kind for node in nodes})
     assert drawn.stdout.count("\nedge ") == len(edges)
 
 
 def test_mermaid_has_a_line_for_every_node_and_edge(table: RouteTable) -> None:
     nodes, edges = nodes_and_edges(table)
-    lines = mermaid(table).splitlines()
-    assert lines[0] == "flowchart LR"
-    drawn = [line for line in lines if re.fullmatch(r'    n\d+(\[|\(\(|\(\[)"[^"]*"(\]|\)\)|\]\))', line)]
-    links = [line for line in lines if re.fullmatch(r'  n\d+ -->(\|"[^"#<>]*"\|)? n\d+', line)]
+    lines = mermaid(table, "it's").splitlines()
+    assert lines[:4] == ["---", "title: 'it''s'", "---", "flowchart LR"]
+    label = r'(\["{text}"\]|\(\["{text}"\]\)|>"{text}"\]|\{{\{{"{text}"\}}\}}|\[\["{text}"\]\])'.format(text='[^"]*')
+    drawn = [line for line in lines if re.fullmatch(rf"    n\d+{label}", line)]
+    links = [line for line in lines if re.fullmatch(r'  n\d+ (-->|-\.->\|"[^"#<>]*"\|) n\d+', line)]
+    explained = [line for line in lines if re.fullmatch(rf"    [a-z]+{label}", line)]
     assert (len(drawn), len(links)) == (len(nodes), len(edges))
-    assert len(lines) == 1 + 2 * 3 + len(nodes) + len(edges)
+    assert len(explained) == len({node.kind for node in nodes})
 
 
 @pytest.mark.skipif(DOT is None, reason="Graphviz is not installed")

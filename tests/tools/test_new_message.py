@@ -142,9 +142,9 @@ def test_everything_that_has_to_know_of_it_is_written_and_nothing_else_changes(s
 
 def test_the_page_about_it_shows_what_is_written(site: Path) -> None:
     page = PAGE.read_text(encoding="utf-8")
-    command = re.search(r"^router (new .*?[^\\])\n", page, re.DOTALL | re.MULTILINE)
+    command = re.search(r"^\$ router (new .*?[^\\])\n", page, re.DOTALL | re.MULTILINE)
     assert command is not None
-    assert main(shlex.split(command[1].replace("\\\n", " "))) == OK
+    assert main(shlex.split(command[1].replace("\\\n>", " "))) == OK
     written = ["\n".join(map(str.strip, text.splitlines())) for text in contents(site).values()]
     shown = page.partition("## What it writes")[2].partition("## ")[0]
     blocks = re.findall(r"^ *```\w*\n(.*?)^ *```", shown, re.DOTALL | re.MULTILINE)

@@ -160,6 +160,16 @@ def test_a_taken_address_is_named_and_leaves_nothing_open(wire: Wire, table: Rou
         pass
 
 
+def test_an_address_of_another_machine_is_named_with_what_to_play_instead(
+    wire: Wire, table_path: Callable[..., Path]
+) -> None:
+    path = table_path()
+    path.write_text(path.read_text().replace("127.0.6.30", "192.0.2.30"))
+    with pytest.raises(UsageError, match=r"board: cannot bind .*: this machine has no such address") as caught:
+        Simulator(wire, read_table(path), seed=1)
+    assert "addresses of this machine" in caught.value.hint
+
+
 def test_stop_ends_a_run_from_another_thread(wire: Wire, table: RouteTable) -> None:
     with closing(Simulator(wire, table, seed=1)) as simulator:
         running = threading.Thread(target=simulator.run, args=(None, 1.0, lambda _: None))
@@ -247,6 +257,27 @@ def test_changes_are_told_since_a_time(wire: Wire) -> None:
 
 
 def test_silence_hints_at_a_missing_router(wire: Wire) -> None:
+    statistics = Statistics()
+    statistics.sent["board"]["plain"] = 7
+    view = SimView(wire, statistics)
+    view.update(5.0)
+    assert view.headline() == "5 s: sent 7, received 0 (is the router running with this table?)"
+
+
+def test_silence_hints_at_nothing_while_nothing_is_sent(wire: Wire) -> None:
     view = SimView(wire, Statistics())
     view.update(5.0)
-    assert view.headline() == "5 s: sent 0, received 0 (is the router running with this table?)"
+    assert view.headline() == "5 s: sent 0, received 0"
+
+
+def test_silence_hints_at_nothing_while_only_ros_could_send(wire: Wire, table_path: Callable[..., Path]) -> None:
+    path = table_path()
+    text = path.read_text().replace(
+        "every_kind: {source: board, destinations: [station]}", "every_kind: {source: board}"
+    )
+    path.write_text(text.replace("plain: {source: station,", "plain: {source: {topic: plain},"))
+    with played(wire, read_table(path)) as (simulator, _):
+        simulate(simulator, lambda: len(simulator.statistics.sent) == 1)
+        view = SimView(wire, simulator.statistics)
+        view.update(5.0)
+        assert "router running" not in view.headline()

@@ -10,8 +10,10 @@ from rich.console import Console
 
 from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.observe.snapshot import Counts, Snapshot, parse_metrics
-from router.tools.top import WINDOW, Order, Window, ordered, quantile, view
-from router.tools.top_view import age_text, latency_text, page, reasons_text, screen
+from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, quantile, view
+from router.tools.top_table import targets_text
+from router.tools.top_view import Page, Screen
+from router.tools.top_words import age_text, latency_text, reasons_text
 
 BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 NOW = 1_000_000.0
@@ -38,6 +40,7 @@ def snapshot(at: float, imu: int, gps: int = 0, **more: Counts) -> Snapshot:
         "messages_dropped": {("imu_info", "imu_data", "stale"): 0, ("gps_info", "basestation", "stale"): 3},
         "route_last_message_timestamp_seconds": {("imu_info",): NOW - 5, ("gps_info",): 0},
         "endpoint_last_seen_timestamp_seconds": {("sensor_board",): NOW - 1, ("arm_board",): 0},
+        "endpoint_stale_after_seconds": {("sensor_board",): 0.5, ("arm_board",): 0.5},
         "deadman_active": {("imu_info",): 1},
         "route_duration_seconds_bucket": {**buckets("imu_info", 0, imu), **buckets("gps_info", 0, 0, 0, 0, gps)},
     }
@@ -47,36 +50,126 @@ def snapshot(at: float, imu: int, gps: int = 0, **more: Counts) -> Snapshot:
 SEEN = view(snapshot(10, 0, 0), snapshot(12, 100, 10), NOW)
 
 
-def printed(shown: object, width: int = 120) -> list[str]:
+def lines_of(shown: object, width: int = 120) -> list[str]:
     console = Console(width=width, color_system=None)
     with console.capture() as capture:
         console.print(shown)
-    return [" ".join(line.split()) for line in capture.get().splitlines()]
+    return [line.rstrip() for line in capture.get().splitlines()]
+
+
+def printed(shown: object, width: int = 120) -> list[str]:
+    return [" ".join(line.split()) for line in lines_of(shown, width)]
 
 
 def test_a_page_has_all_of_it() -> None:
-    assert printed(page(SEEN, Order.TABLE)) == [
+    assert printed(Page(SEEN, Order.TABLE)) == [
         "in 113 (55/s), delivered 115 (55/s), lost 3 malformed, 3 stale",
-        "deadman of imu_info sends last heard: sensor_board 1.0 s, arm_board never",
-        "route in/s delivered per second age p50 p99 drops",
-        "imu_info 50 basestation 50 imu_data 0 5.0 s 15 us 20 us -",
-        "gps_info 5.0 basestation 5.0 never 150 us 199 us 3 stale",
+        "! sensor_board silent for 1.0 s; deadman sends: imu_info",
+        "last heard !sensor_board 1.0 s arm_board never",
+        "route in/s endpoints topics p50 p99 age drops",
+        "!imu_info 50 basestation 50 imu_data 0 15 us 20 us 5.0 s -",
+        "gps_info 5.0 basestation 5.0 150 us 199 us never 3 stale",
     ]
-    no_endpoints = replace(SEEN, silence={}, kernel_drops=7)
-    assert printed(page(no_endpoints, Order.TABLE))[:2] == [
+    well = replace(SEEN, silence={}, silent=(), kernel_drops=7)
+    assert printed(Page(well, Order.TABLE))[:2] == [
         "in 113 (55/s), delivered 115 (55/s), lost 7 kernel_drops, 3 malformed, 3 stale",
-        "deadman of imu_info sends",
+        "! deadman sends: imu_info",
     ]
 
 
-@pytest.mark.parametrize("height", [6, 7, 24])
+@pytest.mark.parametrize("height", [7, 8, 24])
 def test_a_screen_never_has_more_lines_than_there_are(height: int) -> None:
-    lines = printed(screen(SEEN, "title", Order.TABLE, height, "no answer"), width=60)
+    lines = printed(Screen(SEEN, "title", Order.TABLE, height, "no answer"), width=64)
     assert len(lines) <= height
-    assert max(map(len, lines)) <= 60
+    assert max(map(len, lines)) <= 64
     assert lines[0] == "title no answer"
-    assert lines[-1].startswith("sorted by table; keys: t table, r rate")
-    assert ("and 2 more" in lines) == (height < 7)
+    assert "sort: [t table] r rate" in lines[-1]
+    assert lines[-1].startswith("1-1 of 2") == (height < 8)
+
+
+def route(name: str, endpoints: int, topics: int, **more: object) -> RouteRow:
+    targets = [TargetRow(f"operators_basestation_{index}", False, 9, 1.5, {}, 0) for index in range(endpoints)]
+    targets += [TargetRow(f"sensor_board/{name}/raw_{index}", True, 9, 120.0, {}, 0) for index in range(topics)]
+    return replace(RouteRow(name, 9, 123.4, tuple(targets), 5.0, 15e-6, 20e-6), **more)  # type: ignore[arg-type]
+
+
+FULL = View(
+    tuple(route(f"measurement_{index}_of_a_very_long_name", index % 4, index % 5) for index in range(40)),
+    received=10**9,
+    rate=1234.5,
+    rejected={"source_mismatch": 123456, "rate_limited": 98765, "malformed": 3},
+    kernel_drops=1,
+    silence={f"board_number_{index}": 1.5 * index or None for index in range(9)},
+    silent=("board_number_8",),
+)
+
+
+@pytest.mark.parametrize(("width", "height"), [(60, 20), (80, 24), (100, 30), (160, 40)])
+def test_nothing_is_wrapped_and_every_route_shows_its_destinations(width: int, height: int) -> None:
+    lines = lines_of(Screen(FULL, "router top http://127.0.0.1:9108", Order.TABLE, height), width)
+    assert len(lines) == height
+    assert max(map(len, lines)) <= width
+    first = next(index for index, line in enumerate(lines) if line.startswith("route "))
+    for row, line in zip(FULL.routes, lines[first + 1 : -1], strict=False):
+        assert not row.targets or "1.5" in line or "120" in line, line
+
+
+@pytest.mark.parametrize("width", [80, 100, 160])
+def test_when_endpoints_were_last_heard_is_never_cut(width: int) -> None:
+    shown = " ".join(printed(Screen(FULL, "title", Order.TABLE, 24), width))
+    assert all(f"board_number_{index} {age_text(age)}" in shown for index, age in enumerate(FULL.silence.values()))
+
+
+def test_endpoints_without_room_are_counted() -> None:
+    lines = printed(Screen(FULL, "title", Order.TABLE, 12), 60)
+    heard = [line for line in lines if "board_number_0" in line or " more" in line]
+    assert heard == ["last heard board_number_0 never board_number_1 1.5 s", "board_number_2 3.0 s and 6 more"]
+
+
+def test_targets_are_shortened_in_their_middle_and_then_counted() -> None:
+    targets = route("imu", 0, 3).targets
+    assert targets_text(targets).plain == "  ".join(f"sensor_board/imu/raw_{index} 120" for index in range(3))
+    assert targets_text(targets, 50).plain == "senso…raw_0 120  senso…raw_1 120  senso…raw_2 120"
+    assert targets_text(targets, 42).plain == "sensor_…/raw_0 120  sensor_…/raw_1 120  +1"
+    assert targets_text(targets, 10).plain == "se…0 120 …"
+    assert targets_text((), 16).plain == ""
+
+
+def test_latencies_are_left_out_where_names_need_the_room() -> None:
+    heads = []
+    for width in range(80, 161):
+        lines = printed(Screen(FULL, "title", Order.TABLE, 24), width)
+        heads.append(next(line for line in lines if line.startswith("route ")))
+    assert list(dict.fromkeys(heads)) == [
+        "route in/s endpoints topics age drops",
+        "route in/s endpoints topics p99 age drops",
+        "route in/s endpoints topics p50 p99 age drops",
+    ]
+
+
+def test_keys_scroll_through_the_routes() -> None:
+    def shown(first: int, key: str) -> tuple[int, int]:
+        screen = Screen(FULL, "title", Order.TABLE, 24, first=first)
+        moved = replace(screen, first=screen.moved(key, 80)).table(80).shown
+        return moved.start, moved.stop
+
+    page = len(Screen(FULL, "title", Order.TABLE, 24).table(80).shown)
+    assert shown(0, "down") == (1, page + 1)
+    assert shown(1, "up") == (0, page)
+    assert shown(0, "up") == (0, page)
+    assert shown(0, "page down") == (page, 2 * page)
+    assert shown(0, "end") == (40 - page, 40)
+    assert shown(100, "up") == (39 - page, 39)
+    assert shown(20, "home") == (0, page)
+
+
+def test_what_is_lost_now_is_told_from_what_was_lost_before() -> None:
+    assert not SEEN.routes[1].is_losing
+    more: Counts = {("gps_info", "basestation", "stale"): 4.0}
+    (_, losing) = view(snapshot(10, 0), snapshot(12, 100, messages_dropped=more), NOW).routes
+    assert losing.is_losing
+    seen = replace(SEEN, routes=(losing,))
+    assert printed(Page(seen, Order.TABLE))[-1] == "gps_info 0 !basestation 0 - - never !4 stale"
 
 
 def test_targets_show_what_they_got_lost_and_were_spared() -> None:
@@ -181,6 +274,6 @@ def test_what_the_table_wants_gone_is_not_lost() -> None:
     seen = view(snapshot(0, 1), snapshot(1, 1, messages_dropped=dropped), NOW)
     row = seen.routes[0]
     assert (row.dropped, row.lost, row.targets[1].lost) == ({"stale": 2, "rate_limited": 8}, {"stale": 2}, {"stale": 2})
-    assert printed(page(seen, Order.TABLE))[0] == (
+    assert printed(Page(seen, Order.TABLE))[0] == (
         "in 4 (0/s), delivered 6 (0/s), lost 3 malformed, 2 stale; as the table wants 8 rate_limited"
     )

@@ -65,6 +65,9 @@ class Events(Protocol):
     def contended(self) -> None:
         """Another gateway owns, or claims, the same place in the network."""
 
+    def connected(self, number: int) -> None:
+        """So many other routers and peers of the network are connected now."""
+
     def snapshot(self) -> Sequence[Frame]:
         """Return all schemas and latest values, schemas first."""
 

@@ -22,6 +22,7 @@ from router.gateway.transport.binding import RETRY_SECONDS
 from router.gateway.transport.zenoh_session import (
     Owner,
     all_tokens,
+    connections,
     owner_of,
     owners,
     permanent,
@@ -41,6 +42,9 @@ PAUSE_SECONDS = 0.2
 
 LOOK_AGAIN_SECONDS = 2.0
 """Between two looks for the owner while waiting for the key, in case its going was not received."""
+
+CONNECTIONS_SECONDS = 1.0
+"""Between two looks at who is connected."""
 
 MOST_OTHERS = 100
 """Other owners of its key that a gateway remembers."""
@@ -125,7 +129,8 @@ class ZenohTransport:
         """Raises ZError."""
         self._session = await self._loop.run_in_executor(self._session_thread, self._open_session, config)
         if self._session is not None:
-            self._tasks.append(self._loop.create_task(self._mind_key(self._session)))
+            for task in (self._mind_key, self._mind_connections):
+                self._tasks.append(self._loop.create_task(task(self._session)))
 
     def _open_session(self, config: zenoh.Config) -> zenoh.Session | None:
         """Runs in the session's thread. Raises ZError. Returns None when the transport was closed meanwhile."""
@@ -144,6 +149,22 @@ class ZenohTransport:
                 logger.debug("Zenoh cannot be reached yet", key=self._key, why=short(error))
             else:
                 logger.info("Zenoh is reached", key=self._key)
+
+    async def _mind_connections(self, session: zenoh.Session) -> None:
+        """Report at each change to how many routers and peers the session is connected. Zenoh connects by itself."""
+        reported, was_lost = None, False
+        while True:
+            connected = await self._loop.run_in_executor(self._session_thread, connections, session)
+            if connected != reported:
+                self._events.connected(connected)
+                if not connected and reported:
+                    was_lost = True
+                    logger.warning("the Zenoh network is lost: Zenoh tries to connect again", key=self._key)
+                elif connected and was_lost:
+                    was_lost = False
+                    logger.info("the Zenoh network is there again", key=self._key)
+                reported = connected
+            await asyncio.sleep(CONNECTIONS_SECONDS)
 
     # -- the owner of the key ------------------------------------------------------------------------------------
 

@@ -63,6 +63,11 @@ def session_config(settings: ZenohSettings) -> zenoh.Config:
     return config
 
 
+def connections(session: zenoh.Session) -> int:
+    """Return to how many routers and peers a session is connected. Clients do not count."""
+    return len(session.info.routers_zid()) + len(session.info.peers_zid())
+
+
 def permanent(settings: ZenohSettings, error: str) -> str:
     """Return what to do about an error that does not pass by itself, "" for others."""
     if "not supported" in error:

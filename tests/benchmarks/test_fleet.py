@@ -1,0 +1,81 @@
+"""The benchmark of a fleet: what it makes of records and metrics, and a short run of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2")
+
+from benchmarks.fleet.figures import carried, first_after, imbalances
+from tests.acceptance.site import ROOT
+
+SENT = [(1, 1, 0), (1, 2, 1_000_000), (2, 1, 0)]
+COUNTED = Counter(
+    {
+        'messages_received_total{route="imu",source="sensor_board"}': 5,
+        'messages_published_total{route="imu",topic="imu"}': 5,
+        'messages_received_total{route="fleet",source="ros"}': 5,
+        'messages_sent_total{route="fleet"}': 5,
+        'datagrams_received_total{listener="fleet"}': 4,
+        'datagrams_rejected_total{listener="fleet",reason="malformed"}': 0,
+        'messages_received_total{route="fleet",source="clients"}': 4,
+        'messages_published_total{route="fleet",topic="/drive"}': 3,
+        'messages_dropped_total{reason="stale",route="fleet",target="/drive"}': 1,
+        'messages_received_total{route="drive",source="drive"}': 3,
+    }
+)
+
+
+def test_messages_are_told_apart_by_rover_and_number() -> None:
+    found = carried(SENT, [(1, 1, 2_000_000), (2, 1, 4_000_000), (2, 1, 5_000_000)], 2.0)
+    assert {name: found[name] for name in ("sent", "received", "lost", "twice", "never_sent")} == {
+        "sent": 3,
+        "received": 2,
+        "lost": 1,
+        "twice": 1,
+        "never_sent": 0,
+    }
+    assert found["per_second"] == 1.0
+    assert found["latency_ms"] == {"p50": 2.0, "p99": 4.0, "max": 4.0}
+
+
+def test_the_first_message_after_a_time_is_that_of_each_rover() -> None:
+    assert first_after(SENT, 500_000) == {1: 0.5}
+
+
+def test_sums_come_out_where_everything_is_accounted_for() -> None:
+    assert imbalances(COUNTED, (5, 5), (4, 3)) == []
+    assert imbalances(COUNTED, (5, 4), (6, 3)) == []  # the hub may lose some
+
+
+@pytest.mark.parametrize("series", [name for name, count in COUNTED.items() if count])
+def test_a_message_too_many_anywhere_is_found(series: str) -> None:
+    assert imbalances(COUNTED + Counter({series: 1}), (5, 5), (4, 3))
+
+
+@pytest.mark.slow
+def test_a_small_fleet_balances_its_books_and_brakes_without_hub_or_operator(tmp_path: Path) -> None:
+    user = ["--map-root-user"] if os.geteuid() else []
+    if any(shutil.which(name) is None for name in ("openssl", "unshare", "ip")):
+        pytest.skip("needs openssl, unshare and ip")
+    if subprocess.run(["unshare", "--net", *user, "true"], capture_output=True, check=False).returncode:  # noqa: S607
+        pytest.skip("needs the right to make a network namespace")
+    file = tmp_path / "fleet.json"
+    options = ["--rovers", "2", "--operators", "1", "--seconds", "2", "--json", str(file)]
+    command = [sys.executable, "-m", "benchmarks.fleet", *options]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=300)
+    assert run.returncode == 0, run.stdout + run.stderr
+    found = json.loads(file.read_text())
+    assert found["wrong"] == []
+    assert (found["hub"]["braked"], found["operator"]["braked"]) == (2, 2)
+    for way in ("rover_to_operator", "operator_to_rover"):
+        assert found["all"][way]["received"] > 0
+        assert found["all"][way]["never_sent"] == 0

@@ -1,0 +1,206 @@
+"""Every command of the README and of the pages for users, run from top to bottom of a page in a fresh clone."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from tests.docs_commands import Block, Command, File, blocks, commands, steps
+from tests.namespaces import computers
+
+ROOT = Path(__file__).parent.parent
+FOLDERS = ("start", "guides", "troubleshooting")
+PAGES = [ROOT / "README.md", *(page for folder in FOLDERS for page in sorted((ROOT / "docs" / folder).glob("*.md")))]
+NEEDS = ("git", "tar", "ip", "unshare")
+PATIENCE = 60.0
+"""Seconds that one command may take."""
+
+FIRST_LINE = 3.0
+"""Seconds that a background process has for its first line before the next command."""
+
+UNSAID = ("", "sh", "bash", "shell")
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+pages = pytest.mark.parametrize("page", PAGES, ids=name)
+
+
+@pages
+def test_each_block_says_what_it_is(page: Path) -> None:
+    found = [f"{name(page)}:{block.line - 1}" for block in blocks(page) if block.language in UNSAID]
+    assert found == [], "commands are in `console` blocks, other text in `text` blocks"
+
+
+@pages
+def test_each_block_with_commands_can_be_read(page: Path) -> None:
+    for block in blocks(page):
+        if block.language == "console":
+            assert list(commands(block))
+
+
+def test_output_is_compared_with_what_is_shown() -> None:
+    block = Block(
+        "console", 7, ("$ one \\", "> two", "a ... c", "...", "z", "# exit code 3", "$ three &", "ready"), True
+    )
+    one, three = commands(block)
+    assert (one.line, one.text, one.code, one.is_background) == (7, "one \\\ntwo", 3, False)
+    assert one.is_printed("a b c\nz\n")
+    assert one.is_printed("a b c  \n1\n2\nz\n\n")
+    assert not one.is_printed("a b\nz\n")
+    assert not one.is_printed("a b c\nz\nmore\n")
+    assert (three.line, three.is_background) == (13, True)
+    assert three.is_printed("ready\nmore\n")
+    assert not three.is_printed("more\n")
+
+
+@pytest.mark.slow
+@pages
+def test_commands_of_a_page_print_what_it_shows(page: Path, tmp_path: Path) -> None:
+    todo = steps(page)
+    if not any(isinstance(step, Command) for step in todo):
+        pytest.skip("it has no commands")
+    if missing := [program for program in NEEDS if shutil.which(program) is None]:
+        pytest.skip(f"needs {', '.join(missing)}")
+    clone = tmp_path / "rover-router"
+    fresh_clone(clone)
+    with shell(clone, tmp_path) as there:
+        for step in todo:
+            if isinstance(step, File):
+                there.write(step)
+            else:
+                there.run(step, f"{name(page)}:{step.line}")
+
+
+def fresh_clone(folder: Path) -> None:
+    """The checkout as it is, with changes that are not committed; its environment and library are built already.
+
+    By other programs, since tests may not read the tables of a team.
+    """
+    folder.mkdir()
+    copying = f"""
+        git -C {ROOT} ls-files -z --cached --others --exclude-standard |
+            tar -C {ROOT} --null --ignore-failed-read -T - -c 2> /dev/null | tar -x
+        ln -s {ROOT}/.venv .venv
+        cp {ROOT}/router/carrier/native/libcarrier.so router/carrier/native/ 2> /dev/null
+        echo 'echo "setup: .venv is up to date"' > deploy/setup.sh
+        git init -q && git add -A && git -c user.name=test -c user.email=test@localhost commit -qm clone
+    """
+    subprocess.run(["/bin/bash", "-c", copying], cwd=folder, check=True, timeout=PATIENCE)
+
+
+class Shell:
+    """A shell that goes through a page. `cd` and `export` last."""
+
+    def __init__(self, process: subprocess.Popen[str], folder: Path) -> None:
+        self._process = process
+        self._folder = folder
+        self._number = 0
+        self._jobs: dict[str, Path] = {}
+
+    def write(self, file: File) -> None:
+        """Where the shell is: an example may go on in a folder that a command has made."""
+        text = self._folder / "file"
+        text.write_text(file.text, encoding="utf-8")
+        path = f"'{file.path}'"
+        code, output = self._enter(f"mkdir -p $(dirname {path}) && cp {text} {path}")
+        assert code == 0, f"{file.path}: {output}"
+
+    def run(self, command: Command, place: str) -> None:
+        code, output = self._enter(command.text, place)
+        if command.is_background:
+            log = self._jobs[f"{place}: $ {command.text}"] = self._output(self._number)
+            seconds = PATIENCE if command.printed else FIRST_LINE
+            self._until(lambda: bool(read(log)) and command.is_printed(read(log)), seconds)
+            code, output = command.code, read(log)
+        if code != command.code:
+            self._fail(place, command.text, f"exit code {code} instead of {command.code}; it printed:\n{output}")
+        if not command.is_printed(output):
+            self._fail(place, command.text, "\n".join(["expected:", *command.printed, "", "got:", output]))
+
+    def _fail(self, place: str, text: str, what: str) -> NoReturn:
+        beside = [f"\nmeanwhile {job}\n{read(log)[-2000:]}" for job, log in self._jobs.items()]
+        pytest.fail("\n".join([f"{place}: $ {text}", what, *beside]), pytrace=False)
+
+    def end_jobs(self) -> None:
+        """As Ctrl-C does."""
+        if self._jobs and self._process.poll() is None:
+            self._enter("kill -INT $(jobs -p | sed 's/^/-/'); wait", patience=10.0)
+
+    def _enter(self, text: str, place: str = "", patience: float = PATIENCE) -> tuple[int, str]:
+        """Exit code and output of a command."""
+        self._number += 1
+        log, ended = self._output(self._number), self._folder / f"{self._number}.code"
+        assert self._process.stdin is not None
+        self._process.stdin.write(
+            f"{{ {text}\n}} < /dev/null > {log} 2>&1\necho $? > {ended}.new; mv {ended}.new {ended}\n"
+        )
+        self._process.stdin.flush()
+        self._until(lambda: ended.exists() or self._process.poll() is not None, patience)
+        if not ended.exists():
+            how = "the shell has ended" if self._process.poll() is not None else f"not over after {patience:.0f} s"
+            if place:
+                self._fail(place, text, f"{how}; it printed:\n{read(log)}")
+            return 1, how
+        return int(read(ended)), read(log)
+
+    def _output(self, number: int) -> Path:
+        return self._folder / f"{number}.txt"
+
+    def _until(self, condition: Callable[[], bool], seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while not condition() and time.monotonic() < until:
+            time.sleep(0.02)
+
+
+def read(file: Path) -> str:
+    return file.read_text(encoding="utf-8", errors="replace") if file.exists() else ""
+
+
+@contextmanager
+def shell(clone: Path, folder: Path) -> Iterator[Shell]:
+    """In a network and among processes of its own, all of which end with it."""
+    home, logs = folder / "home", folder / "logs"
+    home.mkdir()
+    logs.mkdir()
+    environment = {
+        "HOME": str(home),
+        "PATH": f"{clone}/.venv/bin:{os.environ['PATH']}",
+        "PYTHONPATH": str(clone),
+        "LANG": "C.UTF-8",
+        "COLUMNS": "120",
+        "ROS_DOMAIN_ID": "42",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    with computers("docs") as [computer]:
+        command = ["ip", "netns", "exec", computer.namespace, "unshare", "--pid", "--fork", "--kill-child"]
+        process = subprocess.Popen(
+            [*command, "bash", "--noprofile", "--norc"],
+            cwd=clone,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        try:
+            assert process.stdin is not None
+            process.stdin.write(
+                "set -m\n. .venv/env.sh\n"
+            )  # with job control, Ctrl-C reaches what is in the background
+            there = Shell(process, logs)
+            yield there
+            there.end_jobs()
+        finally:
+            process.kill()
+            process.wait()
