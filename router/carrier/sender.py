@@ -33,7 +33,7 @@ class NativeSender(Sender):
         return len(data)
 
     def close(self) -> None:
-        """Close the socket. Whoever sends later gets an OSError."""
+        """Close the socket. Sending afterwards raises OSError."""
         self._library.sender_end(self.address)
         super().close()
 

@@ -214,7 +214,7 @@ def _quantity(parse: Callable[[str], float], text: str, unit: str) -> float:
 
 
 def say(line: str) -> None:
-    """Print a line for whoever started the verb; stdout is for what it shows."""
+    """Print a line to stderr; stdout is for what the verb shows."""
     print(line, file=sys.stderr, flush=True)
 
 

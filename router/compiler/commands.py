@@ -237,7 +237,7 @@ class _Reading:
                     seconds, nanoseconds = self.found[step.seconds], self.found[step.nanoseconds]
                     self.moments[step.variable] = seconds.slot, nanoseconds.slot
                 case Object():
-                    pass  # whoever uses it needs Python
+                    pass  # what uses it needs Python
 
     def _take(self, step: Take) -> None:
         """A scalar, or the bytes of an array: its elements are as large as its alignment."""

@@ -72,7 +72,7 @@ METRICS = (
         "gateway_client_lag_seconds", "number", ("route", "client"), "For how long a client has not had everything."
     ),
     Metric("gateway_client_sent", "counter", ("route", "client"), "Frames handed to a client since it came."),
-    Metric("gateway_client_dropped", "counter", ("route", "client"), "Frames that newer ones replaced since it came."),
+    Metric("gateway_client_dropped", "counter", ("route", "client"), "Frames of the client that newer ones replaced."),
     Metric("client_messages_dropped", "counter", ("route", "reason"), "Messages that single clients did not get."),
     Metric("mirror_dropped", "counter", (), "Datagrams that recordings and taps missed, though they were routed."),
     Metric("recorded_datagrams", "counter", (), "Datagrams written to a recording."),

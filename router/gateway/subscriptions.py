@@ -221,7 +221,7 @@ class Subscriptions:
         """Use a subscription: `callback` is called for every message; without it, ask for `latest`.
 
         To change the selection, join again and leave the old subscription, which may be the same, afterwards. A
-        subscription of another type is closed, whoever uses it. Raises StartError, and then nobody uses it.
+        subscription of another type is closed for all its users. Raises StartError, and then nobody uses it.
         """
         ready = self._ready(wanted.type_name)
         for key in ((topic, False), (topic, True)):

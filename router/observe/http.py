@@ -402,7 +402,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command == "HEAD":
             return
         with closing(Tap(running.mirror, is_wanted)) as tap:
-            self._send()  # now, so that whoever has the response misses nothing that is sent after it
+            self._send()  # now, so that a client with the response misses nothing that is sent after it
             self._out = BytesIO()
             self._stream(tap.stream())
 

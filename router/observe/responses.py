@@ -32,7 +32,7 @@ STUCK_SECONDS = 2.0
 LOOK_SECONDS = 0.05
 
 KEPT_SECONDS = 0.5
-"""For so long a response that is costly to make is given to whoever asks for the same."""
+"""How long a response that is costly to make is reused for the same request."""
 
 SAVE_SECONDS = 10.0
 """From one order of a page to save until the next."""

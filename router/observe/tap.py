@@ -3,7 +3,7 @@
 The stream is MAGIC and then records, each behind its length: `<uint32 length> <uint8 kind> ...`, all little-endian.
 
     SEEN   <uint64 wall clock, ns> <4 bytes IPv4 address> <uint16 port> <uint8 length> <listener> <datagram>
-    LOST   <uint64 count>    so many were not sent, because whoever reads the stream is too slow
+    LOST   <uint64 count>    so many were not sent, because the reader of the stream is too slow
     ALIVE                    nothing was seen: once a second where there is nothing to send
 
 A datagram longer than the router takes is cut to one byte more than that.

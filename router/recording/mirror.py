@@ -140,7 +140,7 @@ class Mirror:
             self._deliver()
 
     def _deliver(self) -> None:
-        """Called by the thread, and after its end by whoever has joined it: never by two at once."""
+        """Called by the thread, and after its end by the thread that joined it: never by two at once."""
         batch = self._drain()
         if not batch:
             return

@@ -72,7 +72,7 @@ class RouterNode:
     def start(self, receive: Mapping[str, Receive], failed: Callable[[Exception], None]) -> None:
         """Pass each message to `receive[topic]`, in one thread. `failed` is called with what that raises.
 
-        Subscriptions of other topics are left to whoever takes their messages. Raises StartError.
+        Subscriptions of other topics are left to the code that takes their messages. Raises StartError.
         """
         self._failed = failed
         self._receive(self._subscriptions, receive)

@@ -531,4 +531,4 @@ _SYNTAX: Mapping[type, Callable[[Node, SourceSpan], object]] = {
     TopicPattern: _pattern,
     ZenohConfig: _zenoh_config,
 }
-"""Readers of what is more than a scalar or a mapping of keys; they get its node and its key's span."""
+"""Readers of values other than a scalar or a mapping of keys; they get its node and its key's span."""

@@ -98,10 +98,12 @@ def for_key(name: str, value: Node, path: Path, known: list[str]) -> str:
         return f"did you mean '{key}'?"
     if path[-1:] == ("deadman",) and "send" in known and isinstance(value, MappingNode):
         return f"a payload case stands under 'send': `send: {{{name}: ...}}`"
+    if owners := _owners(name, path):
+        return owners
     if path[:1] == ("routes",) and (key := _NAMED.get(str(path[-1]))):
         is_listed = isinstance(value, ScalarNode) and value.value is None
         return f"write a list: [{name}, ...]" if is_listed else f"write a list: [{{{key}: {name}, ...}}]"
-    return _owners(name, path) or did_you_mean(name, known, CLOSE)
+    return did_you_mean(name, known, CLOSE)
 
 
 def _owners(name: str, path: Path) -> str:

@@ -169,7 +169,7 @@ class Health:
             if peers:
                 yield problem(
                     "ROS",
-                    f"{peers:.0f} peers get nothing of topic {topic}, or are not heard there, for their {policy}",
+                    f"topic {topic}: no exchange with {peers:.0f} peer{'s' * (peers != 1)} of another {policy}",
                     f"`ros2 topic info -v {topic}` shows their QoS, `router explain {route}` ours",
                 )
 
@@ -179,7 +179,7 @@ class Health:
                 yield warning(
                     "router",
                     f"{route}: commands stopped coming, and the deadman sends in their place",
-                    "does whoever commands still send, often enough, and with a clock that agrees with this one?",
+                    "do commands still come, often enough, and from a clock that agrees with this one?",
                 )
 
 

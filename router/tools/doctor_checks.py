@@ -361,7 +361,8 @@ def ros(program: Program) -> Iterator[CheckResult]:
     if not wrong:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         types = len({plan.type_name for plan in plans})
-        yield fine("ROS", f"{middleware()} in domain {domain}, and the {types} message types of the table")
+        counted = f"{types} message type{'s' * (types != 1)}"
+        yield fine("ROS", f"{middleware()} in domain {domain}, and {counted} of the table")
 
 
 def carrier(variables: Mapping[str, str]) -> Iterator[CheckResult]:
@@ -413,7 +414,7 @@ def open_domain(program: Program, variables: Mapping[str, str]) -> Iterator[Chec
     if networks:
         yield warning(
             "ROS",
-            "whoever is in a network of this computer is in the ROS domain, and can publish commands: it is domain 0, "
+            "every computer in a network of this one is in the ROS domain, and can publish commands: it is domain 0, "
             f"and nodes are looked for by {', '.join(networks)}",
             "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST where all nodes are on this computer, as the service has it by "
             "itself; else a domain of your own, and docs/guides/security.md",

@@ -120,7 +120,7 @@ class MessageType:
 
     Compared by identity: a name has one MessageType per schema. Fields keep their declared order,
     which for ROS decides the bytes. Protobuf messages may contain themselves, so `fields` is filled
-    by whoever builds the type, once, and not changed afterwards. With `is_map_entry` a list of it is a
+    by the code that builds the type, once, and not changed afterwards. With `is_map_entry` a list of it is a
     protobuf map.
     """
 

@@ -291,6 +291,15 @@ def test_a_deadman_whose_command_never_came_is_no_alarm(running: FakeRunning, pa
     assert "Check the node that publishes the topic drive_motor." in page.text("#todo")
 
 
+def test_a_deadman_whose_commands_stopped_says_who_sends_them(running: FakeRunning, page: Page) -> None:
+    for name in ("deadman_active", "deadman_trips"):
+        running.count(name, "drive_motor", to=1)
+    until_said(page, "drive_motor: no commands: braking", "bad")
+    assert page.text("#todo") == (
+        "Check the node that publishes the topic drive_motor. Commands are obeyed as soon as they come."
+    )
+
+
 def test_a_board_that_cannot_be_stopped_comes_before_its_reasons(running: FakeRunning, page: Page) -> None:
     until_compared(page)
     running.count("datagrams_received", "rover", to=1)

@@ -29,6 +29,7 @@ from router.tools.doctor_checks import (
     ports,
     receive_buffers,
     recordings,
+    ros,
     shared_memory,
 )
 from tests.ports import free_port
@@ -84,6 +85,13 @@ def test_a_sound_place_has_no_problem(table: Path) -> None:
     assert texts(found, Grade.PROBLEM) == []
     assert {finding.about for finding in found} >= {"table", "ports", "buffers", "clock", "endpoints", "router"}
     assert all(finding.remedy for finding in found if finding.grade is not Grade.FINE)
+
+
+def test_message_types_are_counted(table: Path) -> None:
+    topic = "topic: {topic: ph, type: std_msgs/msg/Float32, fields: {data: ph_value}}"
+    program = rewritten(table, "[basestation]}\n  arm", f"[basestation], {topic}}}\n  arm")
+    [found] = ros(program)
+    assert found.text.endswith(", and 1 message type of the table")
 
 
 def test_what_carries_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -406,7 +414,7 @@ def test_who_was_never_heard_may_not_have_been_switched_on_yet(table: Path) -> N
         (
             'router_qos_incompatible{policy="reliability",route="ph_info",topic="ph"} 1',
             Grade.PROBLEM,
-            "1 peers get nothing of topic ph",
+            "topic ph: no exchange with 1 peer of another reliability",
         ),
         ('router_deadman_active{route="ph_info"} 1', Grade.WARNING, "the deadman sends"),
         ("router_config_last_reload_successful 0", Grade.PROBLEM, "its last reload failed"),

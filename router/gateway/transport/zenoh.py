@@ -502,7 +502,7 @@ def key_of(root: str, frame: Frame) -> str:
 
 
 def _reply(queries: Sequence[zenoh.Query], root: str, frames: Sequence[Frame]) -> zenoh.ZError | None:
-    """Answer queries; runs in a thread. Returns the last error: mostly, whoever asked has gone."""
+    """Answer queries; runs in a thread. Returns the last error: mostly, the asker has gone."""
     failure = None
     for query in queries:
         with query:
