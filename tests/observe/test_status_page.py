@@ -44,9 +44,11 @@ def running(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeRun
     """All endpoints were heard just now, and the page asks ten times as often."""
     monkeypatch.setattr(responses, "KEPT_SECONDS", 0)
     page = responses.PAGE.read_text(encoding="utf-8")
-    assert "const PERIOD = 1000;" in page
+    for slow in ("const PERIOD = 1000;", "const PERIOD_HIDDEN = 10000;"):
+        assert slow in page
+        page = page.replace(slow, f"{slow.partition('=')[0]}= 100;")
     hasty = tmp_path / "page.html"
-    hasty.write_text(page.replace("const PERIOD = 1000;", "const PERIOD = 100;"), encoding="utf-8")
+    hasty.write_text(page, encoding="utf-8")
     monkeypatch.setattr(responses, "PAGE", hasty)
     opened = FakeRunning(sim_program())
     for endpoint in opened.program.table.endpoints:
@@ -535,13 +537,31 @@ def test_before_the_first_answer_nothing_is_claimed(browser: Browser, running: F
     page.close()
 
 
-def test_a_page_that_was_hidden_claims_nothing_before_it_has_asked_again(page: Page) -> None:
+def hide(page: Page) -> None:
     page.evaluate("Object.defineProperty(document, 'hidden', {value: true, configurable: true})")
+
+
+def test_a_page_in_the_background_says_in_its_title_how_it_is(running: FakeRunning, page: Page) -> None:
+    page.until("document.title === '✓ rover_router'")
+    hide(page)
+    page.evaluate("answeredAt -= 5000; renderState()")
+    assert page.evaluate("document.title") == "✓ rover_router"
+    running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
+    page.until("document.title.startsWith('▲ rover_router: arm_board silent')")
+
+
+def test_after_a_pause_between_answers_no_thread_is_stuck(page: Page) -> None:
+    page.until("answers.length > 3")
+    earlier = "answers = [...answers.slice(0, -1).map((answer) => ({ ...answer, at: answer.at - 20 })), now()]"
+    assert page.evaluate(f"{earlier}; causes()") == []
+
+
+def test_a_page_that_was_hidden_claims_nothing_before_it_has_asked_again(page: Page) -> None:
+    hide(page)
     page.until("next !== 0")
-    page.evaluate("answeredAt -= 60000")
-    page.evaluate("delete document.hidden")
-    at_once = "comeBack(); [document.body.classList.contains('lost'), document.querySelector('#what').innerText]"
-    lost, said = page.evaluate(at_once)
+    come_back = "answeredAt -= 60000; delete document.hidden; comeBack();"
+    at_once = "[document.body.classList.contains('lost'), document.querySelector('#what').innerText]"
+    lost, said = page.evaluate(f"{come_back} {at_once}")
     assert lost
     assert said == "Connection to the router lost 60 s ago"
     until_said(page, "All is well", "good")
