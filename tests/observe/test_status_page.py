@@ -477,6 +477,20 @@ def test_pointing_shows_for_a_moment_and_clicking_keeps(page: Page) -> None:
     assert page.text("#name") == "Details"
 
 
+def test_a_reload_without_the_chosen_route_closes_its_details_and_one_with_it_opens_them(page: Page) -> None:
+    choose(page, "case:imu_info")
+    page.evaluate(f"{box('case:imu_info')}.dispatchEvent(new PointerEvent('pointerenter', {{pointerType: 'mouse'}}))")
+    without = """
+      const key = "case:imu_info";
+      const nodes = map.nodes.filter((node) => node.key !== key);
+      const links = map.links.filter(({ start, end }) => start !== key && end !== key);
+      show({ ...now(), map: "other" }, { ...map, map: "other", nodes, links });
+      [chosen, pointedAt, document.querySelector("#name").textContent]"""
+    assert page.evaluate(f"{{{without}}}") == [None, None, "Details"]
+    page.until("document.querySelector('#name').textContent === 'imu_info'")
+    assert page.evaluate(f"{box('case:imu_info')}.getAttribute('aria-expanded')") == "true"
+
+
 def test_the_keyboard_reaches_every_box_and_unfolds_its_topics(page: Page) -> None:
     reached = "[0, 1, 2].flatMap(boxes).every(({element}) => element.tabIndex === 0)"
     assert page.evaluate(reached)
