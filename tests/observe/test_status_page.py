@@ -346,6 +346,23 @@ def test_a_topic_without_a_subscriber_is_a_state_of_its_own(running: FakeRunning
     )
 
 
+def test_a_topic_of_a_case_that_falls_silent_keeps_its_state(running: FakeRunning, page: Page) -> None:
+    state = f"subscribed({line('case:imu_info', 'to:imu_data')})"
+    until_compared(page)
+    assert page.evaluate(state) == "unknown"
+    running.count("messages_filtered", "imu_info", "imu_data", to=9)
+    page.until(f"{state} === 'none'")
+    running.count("messages_published", "imu_info", "imu_data", to=9)
+    page.until(f"{state} === 'subscribed'")
+    assert page.evaluate(f"answers = [now()]; {state}") == "subscribed"
+
+
+def test_a_topic_with_a_condition_may_be_held_back_by_it(running: FakeRunning, page: Page) -> None:
+    page.evaluate(f"{line('case:imu_info', 'to:imu_data')}.about = 'when accel_x > 1'")
+    running.count("messages_filtered", "imu_info", "imu_data", to=9)
+    page.until(f"{box('case:imu_info')}.ariaLabel.endsWith('no subscriber, or held back by its condition')")
+
+
 def test_a_minute_of_rates_begins_without_a_peak(running: FakeRunning, browser: Browser, url: str) -> None:
     running.count("messages_received", "imu_info", "sensor_board", to=100_000)
     page = open_page(browser, url)
