@@ -9,7 +9,6 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from router.compiler.metrics import CLIENTS
 from router.compiler.topics import resolved
@@ -18,7 +17,20 @@ from router.table.model import ANY, ROS, Destination, Endpoint, Gateway, Route, 
 from router.table.units import duration
 
 COLUMNS = ("from", "payload case", "to")
-_MARGIN = 1
+FONT = 12.0
+LETTER = 7.0
+"""How wide a letter is on average."""
+MOST_LETTERS = 36
+"""Of a name that are shown."""
+PAD = 8.0
+HEAD = 24.0
+_ROW = 22.0
+_BETWEEN = 5.0
+_GAP = 120.0
+"""Between two columns."""
+_PORT = 6.0
+"""Between lines that meet a box on the same side."""
+_MARGIN = 1.0
 """For the borders of boxes."""
 
 
@@ -169,25 +181,6 @@ def _key(gateway: Gateway) -> str:
     return f"gateway:{gateway.name}"
 
 
-class Measures(NamedTuple):
-    """Sizes of a drawing. `letter` is how wide a letter is on average, `letters` how many of a name are shown at most,
-    `gap` the least room between two columns, `port` how thick a line may become."""
-
-    width: float = 0
-    font: float = 12
-    letter: float = 7
-    letters: int = 36
-    pad: float = 8
-    row: float = 22
-    between: float = 5
-    gap: float = 120
-    port: float = 6
-    head: float = 24
-
-
-WIDE = Measures()
-
-
 @dataclass(frozen=True, slots=True)
 class Box:
     """A node's place in the drawing. `label`: what of its name has room. `x`, `y`: the top left corner."""
@@ -210,12 +203,6 @@ class Curve:
     x1: float
     y1: float
 
-    @property
-    def path(self) -> str:
-        """The SVG path, level at both ends."""
-        middle = (self.x0 + self.x1) / 2
-        return f"M{self.x0:g},{self.y0:g}C{middle:g},{self.y0:g} {middle:g},{self.y1:g} {self.x1:g},{self.y1:g}"
-
 
 @dataclass(frozen=True, slots=True)
 class RouteMap:
@@ -226,38 +213,34 @@ class RouteMap:
     width: float
     height: float
     columns: tuple[float, ...]
-    measures: Measures
 
 
-def route_map(table: RouteTable, measures: Measures = WIDE) -> RouteMap:
+def route_map(table: RouteTable) -> RouteMap:
     """Lay a table out. Cases keep the order of the table; sources and targets are placed beside their cases."""
     nodes, edges = nodes_and_edges(table)
     columns = [[node for node in nodes if node.column == column] for column in range(len(COLUMNS))]
     places = {node.key: float(index) for index, node in enumerate(columns[1])}
     for column in (0, 2):
         columns[column].sort(key=lambda node: _mean(_others(node.key, edges, places)))
-    heights = {node.key: _height(node, edges, measures) for node in nodes}
-    tops = _tops(columns, edges, heights, measures)
-    spans = _spans(columns, measures)
+    heights = {node.key: _height(node, edges) for node in nodes}
+    tops = _tops(columns, edges, heights)
+    spans = _spans(columns)
     boxes = {
-        node.key: Box(
-            node, shortened(node.name, measures.letters), x, measures.head + tops[node.key], width, heights[node.key]
-        )
+        node.key: Box(node, shortened(node.name), x, HEAD + tops[node.key], width, heights[node.key])
         for column, (x, width) in zip(columns, spans, strict=True)
         for node in column
     }
-    bottom = max((box.y + box.height for box in boxes.values()), default=measures.head)
+    bottom = max((box.y + box.height for box in boxes.values()), default=HEAD)
     return RouteMap(
         boxes=tuple(boxes.values()),
-        curves=tuple(_curves(edges, boxes, measures)),
+        curves=tuple(_curves(edges, boxes)),
         width=spans[-1][0] + spans[-1][1] + _MARGIN,
-        height=bottom + measures.between,
+        height=bottom + _BETWEEN,
         columns=tuple(x for x, _ in spans),
-        measures=measures,
     )
 
 
-def shortened(name: str, letters: int) -> str:
+def shortened(name: str, letters: int = MOST_LETTERS) -> str:
     """The name with its middle left out where it is too long: what names differ in is mostly at an end."""
     if len(name) <= letters:
         return name
@@ -265,28 +248,21 @@ def shortened(name: str, letters: int) -> str:
     return f"{name[: kept - kept // 2]}…{name[len(name) - kept // 2 :]}"
 
 
-def _height(node: Node, edges: Sequence[Edge], measures: Measures) -> float:
+def _height(node: Node, edges: Sequence[Edge]) -> float:
     """Return a row, or more where so many edges meet on one side that they need it."""
     busiest = max(sum(edge.start == node.key for edge in edges), sum(edge.end == node.key for edge in edges))
-    return max(measures.row, busiest * measures.port)
+    return max(_ROW, busiest * _PORT)
 
 
-def _spans(columns: Sequence[Sequence[Node]], measures: Measures) -> list[tuple[float, float]]:
-    """Left edge and width of each column; what is left of `measures.width` goes between them."""
-    widths = [
-        max((len(shortened(node.name, measures.letters)) for node in column), default=0) * measures.letter
-        + 2 * measures.pad
-        for column in columns
-    ]
-    gap = max(measures.gap, (measures.width - 2 * _MARGIN - sum(widths)) / (len(columns) - 1))
-    return [(_MARGIN + sum(widths[:index]) + gap * index, width) for index, width in enumerate(widths)]
+def _spans(columns: Sequence[Sequence[Node]]) -> list[tuple[float, float]]:
+    """Left edge and width of each column."""
+    widths = [max((len(shortened(node.name)) for node in column), default=0) * LETTER + 2 * PAD for column in columns]
+    return [(_MARGIN + sum(widths[:index]) + _GAP * index, width) for index, width in enumerate(widths)]
 
 
-def _tops(
-    columns: Sequence[Sequence[Node]], edges: Sequence[Edge], heights: Mapping[str, float], measures: Measures
-) -> dict[str, float]:
+def _tops(columns: Sequence[Sequence[Node]], edges: Sequence[Edge], heights: Mapping[str, float]) -> dict[str, float]:
     """Return how far each node is below the head: cases at even distances, the others beside their neighbours."""
-    sizes = [[heights[node.key] + measures.between for node in column] for column in columns]
+    sizes = [[heights[node.key] + _BETWEEN for node in column] for column in columns]
     room = max(map(sum, sizes))
     spare = (room - sum(sizes[1])) / max(len(sizes[1]) - 1, 1)
     tops = {node.key: sum(sizes[1][:index]) + spare * index for index, node in enumerate(columns[1])}
@@ -325,14 +301,14 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-def _curves(edges: Sequence[Edge], boxes: Mapping[str, Box], measures: Measures) -> Iterator[Curve]:
-    starts = _ports([(edge.start, edge.end) for edge in edges], boxes, measures)
-    ends = _ports([(edge.end, edge.start) for edge in edges], boxes, measures)
+def _curves(edges: Sequence[Edge], boxes: Mapping[str, Box]) -> Iterator[Curve]:
+    starts = _ports([(edge.start, edge.end) for edge in edges], boxes)
+    ends = _ports([(edge.end, edge.start) for edge in edges], boxes)
     for edge, y0, y1 in zip(edges, starts, ends, strict=True):
         yield Curve(edge, boxes[edge.start].x + boxes[edge.start].width, y0, boxes[edge.end].x, y1)
 
 
-def _ports(ends: Sequence[tuple[str, str]], boxes: Mapping[str, Box], measures: Measures) -> list[float]:
+def _ports(ends: Sequence[tuple[str, str]], boxes: Mapping[str, Box]) -> list[float]:
     """Return how high each edge, of which a box and the one at its other end are given, meets the box.
 
     Those that meet there stand beside each other in the order of their other ends, and cross less.
@@ -341,7 +317,7 @@ def _ports(ends: Sequence[tuple[str, str]], boxes: Mapping[str, Box], measures: 
     for key, box in boxes.items():
         met = [index for index, (own, _) in enumerate(ends) if own == key]
         met.sort(key=lambda index: boxes[ends[index][1]].y)
-        first = box.y + box.height / 2 - measures.port * (len(met) - 1) / 2
+        first = box.y + box.height / 2 - _PORT * (len(met) - 1) / 2
         for place, index in enumerate(met):
-            heights[index] = first + measures.port * place
+            heights[index] = first + _PORT * place
     return heights

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape, quoteattr
 
-from router.observe.route_map import COLUMNS, Box, Curve, Edge, Measures, Node, NodeKind, RouteMap
+from router.observe.route_map import COLUMNS, FONT, HEAD, LETTER, PAD, Box, Curve, Edge, Node, NodeKind, RouteMap
 from router.tools.graph import LEGEND
 
 _STYLE = """
@@ -69,34 +69,33 @@ _CLASSES = {
 
 def svg(drawing: RouteMap, title: str, about: str = "") -> str:
     """The drawing below a title, a line about it, and the legend."""
-    measures = drawing.measures
     kinds = {box.node.key: box.node.kind for box in drawing.boxes}
     names = {box.node.key: box.node.name for box in drawing.boxes}
     width = max(drawing.width, 480.0)
-    line = measures.font * 1.8
-    legend = _placed(_legend(drawing), width, measures)
+    line = FONT * 1.8
+    legend = _placed(_legend(drawing), width)
     top = _MARGIN + line + (line if about else 0)
-    start = top + line * (1 + max(entry.row for entry in legend)) + measures.font
+    start = top + line * (1 + max(entry.row for entry in legend)) + FONT
     size = width + 2 * _MARGIN, start + drawing.height + _MARGIN
     whole = f'viewBox="0 0 {size[0]:g} {size[1]:g}" width="{size[0]:g}" height="{size[1]:g}"'
-    label = f'font-size="{measures.font:g}" role="img" aria-label={quoteattr(f"Route map of {title}")}'
+    label = f'font-size="{FONT:g}" role="img" aria-label={quoteattr(f"Route map of {title}")}'
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" class="route-map" {whole} {label}>',
         f"<title>{escape(title)}</title>",
         f"<style>{_STYLE}</style>",
         '<rect class="ground" width="100%" height="100%"/>',
-        f'<text class="name" x="{_MARGIN}" y="{_MARGIN + measures.font:g}">{escape(title)}</text>',
+        f'<text class="name" x="{_MARGIN}" y="{_MARGIN + FONT:g}">{escape(title)}</text>',
     ]
     if about:
-        lines.append(f'<text class="about" x="{_MARGIN}" y="{_MARGIN + line + measures.font:g}">{escape(about)}</text>')
+        lines.append(f'<text class="about" x="{_MARGIN}" y="{_MARGIN + line + FONT:g}">{escape(about)}</text>')
     lines += [
         f'<g class="legend" transform="translate({_MARGIN},{top:g})">',
-        *(_legend_entry(entry, measures, line) for entry in legend),
+        *(_legend_entry(entry, line) for entry in legend),
         "</g>",
         f'<g transform="translate({_MARGIN + (width - drawing.width) / 2:g},{start:g})">',
         *_heads(drawing),
         *(_link(curve, names, kinds) for curve in drawing.curves),
-        *(_node(box, drawing) for box in drawing.boxes),
+        *(_node(box) for box in drawing.boxes),
         "</g>",
         "</svg>",
     ]
@@ -115,7 +114,7 @@ class _Entry:
 
 def _legend(drawing: RouteMap) -> list[_Entry]:
     """What occurs in the drawing."""
-    row = drawing.measures.font * 1.2
+    row = FONT * 1.2
     present = {box.node.kind for box in drawing.boxes}
     entries = [
         _Entry(f'<g class="{kind.value}">{_shape(kind, 0, 0, _SAMPLE, row)}</g>', text)
@@ -135,10 +134,10 @@ def _legend(drawing: RouteMap) -> list[_Entry]:
     return entries
 
 
-def _placed(entries: Sequence[_Entry], width: float, measures: Measures) -> list[_Entry]:
+def _placed(entries: Sequence[_Entry], width: float) -> list[_Entry]:
     """The entries beside each other in columns, in as many rows as they need."""
     longest = max((len(entry.text) for entry in entries), default=0)
-    column = _SAMPLE + 8 + longest * measures.letter + 12
+    column = _SAMPLE + 8 + longest * LETTER + 12
     columns = max(int(width // column), 1)
     rows = -(-len(entries) // columns)
     return [
@@ -147,16 +146,16 @@ def _placed(entries: Sequence[_Entry], width: float, measures: Measures) -> list
     ] or [_Entry("", "")]
 
 
-def _legend_entry(entry: _Entry, measures: Measures, line: float) -> str:
-    x, y = entry.x, entry.row * line + measures.font * 0.4
-    text = f'<text x="{_SAMPLE + 8}" y="{measures.font:g}">{escape(entry.text)}</text>'
+def _legend_entry(entry: _Entry, line: float) -> str:
+    x, y = entry.x, entry.row * line + FONT * 0.4
+    text = f'<text x="{_SAMPLE + 8}" y="{FONT:g}">{escape(entry.text)}</text>'
     return f'<g transform="translate({x:g},{y:g})">{entry.sample}{text}</g>'
 
 
 def _heads(drawing: RouteMap) -> Iterator[str]:
-    y = drawing.measures.head - drawing.measures.font * 0.8
+    y = HEAD - FONT * 0.8
     for x, text in zip(drawing.columns, COLUMNS, strict=True):
-        yield f'<text class="head" x="{x + drawing.measures.pad:g}" y="{y:g}">{text}</text>'
+        yield f'<text class="head" x="{x + PAD:g}" y="{y:g}">{text}</text>'
 
 
 def _flow(edge: Edge, kinds: Mapping[str, NodeKind]) -> str:
@@ -185,15 +184,15 @@ def _tip(x: float, y: float) -> str:
     return f'<polygon class="tip" points="{x:g},{y:g} {x - _TIP:g},{y - 3:g} {x - _TIP:g},{y + 3:g}"/>'
 
 
-def _node(box: Box, drawing: RouteMap) -> str:
-    node, pad = box.node, drawing.measures.pad
-    baseline = box.y + box.height / 2 + drawing.measures.font * 0.35
+def _node(box: Box) -> str:
+    node = box.node
+    baseline = box.y + box.height / 2 + FONT * 0.35
     said = f"{node.name}\n{node.about}" if node.about else node.name
-    mark = _halt(box.x + box.width - pad - 5, box.y + box.height / 2) if _is_guarded(node) else ""
+    mark = _halt(box.x + box.width - PAD - 5, box.y + box.height / 2) if _is_guarded(node) else ""
     return (
         f'<g class="node {node.kind.value}"><title>{escape(said)}</title>'
         f"{_shape(node.kind, box.x, box.y, box.width, box.height)}"
-        f'<text x="{box.x + pad:g}" y="{baseline:g}">{escape(box.label)}</text>{mark}</g>'
+        f'<text x="{box.x + PAD:g}" y="{baseline:g}">{escape(box.label)}</text>{mark}</g>'
     )
 
 

@@ -44,9 +44,11 @@ def running(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FakeRun
     """All endpoints were heard just now, and the page asks ten times as often."""
     monkeypatch.setattr(responses, "KEPT_SECONDS", 0)
     page = responses.PAGE.read_text(encoding="utf-8")
-    assert "const PERIOD = 1000;" in page
+    for slow in ("const PERIOD = 1000;", "const PERIOD_HIDDEN = 10000;"):
+        assert slow in page
+        page = page.replace(slow, f"{slow.partition('=')[0]}= 100;")
     hasty = tmp_path / "page.html"
-    hasty.write_text(page.replace("const PERIOD = 1000;", "const PERIOD = 100;"), encoding="utf-8")
+    hasty.write_text(page, encoding="utf-8")
     monkeypatch.setattr(responses, "PAGE", hasty)
     opened = FakeRunning(sim_program())
     for endpoint in opened.program.table.endpoints:
@@ -353,6 +355,23 @@ def test_a_topic_without_a_subscriber_is_a_state_of_its_own(running: FakeRunning
     )
 
 
+def test_a_topic_of_a_case_that_falls_silent_keeps_its_state(running: FakeRunning, page: Page) -> None:
+    state = f"subscribed({line('case:imu_info', 'to:imu_data')})"
+    until_compared(page)
+    assert page.evaluate(state) == "unknown"
+    running.count("messages_filtered", "imu_info", "imu_data", to=9)
+    page.until(f"{state} === 'none'")
+    running.count("messages_published", "imu_info", "imu_data", to=9)
+    page.until(f"{state} === 'subscribed'")
+    assert page.evaluate(f"answers = [now()]; {state}") == "subscribed"
+
+
+def test_a_topic_with_a_condition_may_be_held_back_by_it(running: FakeRunning, page: Page) -> None:
+    page.evaluate(f"{line('case:imu_info', 'to:imu_data')}.about = 'when accel_x > 1'")
+    running.count("messages_filtered", "imu_info", "imu_data", to=9)
+    page.until(f"{box('case:imu_info')}.ariaLabel.endsWith('no subscriber, or held back by its condition')")
+
+
 def test_a_minute_of_rates_begins_without_a_peak(running: FakeRunning, browser: Browser, url: str) -> None:
     running.count("messages_received", "imu_info", "sensor_board", to=100_000)
     page = open_page(browser, url)
@@ -484,6 +503,20 @@ def test_pointing_shows_for_a_moment_and_clicking_keeps(page: Page) -> None:
     assert page.text("#name") == "Details"
 
 
+def test_a_reload_without_the_chosen_route_closes_its_details_and_one_with_it_opens_them(page: Page) -> None:
+    choose(page, "case:imu_info")
+    page.evaluate(f"{box('case:imu_info')}.dispatchEvent(new PointerEvent('pointerenter', {{pointerType: 'mouse'}}))")
+    without = """
+      const key = "case:imu_info";
+      const nodes = map.nodes.filter((node) => node.key !== key);
+      const links = map.links.filter(({ start, end }) => start !== key && end !== key);
+      show({ ...now(), map: "other" }, { ...map, map: "other", nodes, links });
+      [chosen, pointedAt, document.querySelector("#name").textContent]"""
+    assert page.evaluate(f"{{{without}}}") == [None, None, "Details"]
+    page.until("document.querySelector('#name').textContent === 'imu_info'")
+    assert page.evaluate(f"{box('case:imu_info')}.getAttribute('aria-expanded')") == "true"
+
+
 def test_the_keyboard_reaches_every_box_and_unfolds_its_topics(page: Page) -> None:
     reached = "[0, 1, 2].flatMap(boxes).every(({element}) => element.tabIndex === 0)"
     assert page.evaluate(reached)
@@ -544,13 +577,31 @@ def test_before_the_first_answer_nothing_is_claimed(browser: Browser, running: F
     page.close()
 
 
-def test_a_page_that_was_hidden_claims_nothing_before_it_has_asked_again(page: Page) -> None:
+def hide(page: Page) -> None:
     page.evaluate("Object.defineProperty(document, 'hidden', {value: true, configurable: true})")
+
+
+def test_a_page_in_the_background_says_in_its_title_how_it_is(running: FakeRunning, page: Page) -> None:
+    page.until("document.title === '✓ rover_router'")
+    hide(page)
+    page.evaluate("answeredAt -= 5000; renderState()")
+    assert page.evaluate("document.title") == "✓ rover_router"
+    running.count("endpoint_last_seen_timestamp_seconds", "arm_board", to=LONG_AGO)
+    page.until("document.title.startsWith('▲ rover_router: arm_board silent')")
+
+
+def test_after_a_pause_between_answers_no_thread_is_stuck(page: Page) -> None:
+    page.until("answers.length > 3")
+    earlier = "answers = [...answers.slice(0, -1).map((answer) => ({ ...answer, at: answer.at - 20 })), now()]"
+    assert page.evaluate(f"{earlier}; causes()") == []
+
+
+def test_a_page_that_was_hidden_claims_nothing_before_it_has_asked_again(page: Page) -> None:
+    hide(page)
     page.until("next !== 0")
-    page.evaluate("answeredAt -= 60000")
-    page.evaluate("delete document.hidden")
-    at_once = "comeBack(); [document.body.classList.contains('lost'), document.querySelector('#what').innerText]"
-    lost, said = page.evaluate(at_once)
+    come_back = "answeredAt -= 60000; delete document.hidden; comeBack();"
+    at_once = "[document.body.classList.contains('lost'), document.querySelector('#what').innerText]"
+    lost, said = page.evaluate(f"{come_back} {at_once}")
     assert lost
     assert said == "Connection to the router lost 60 s ago"
     until_said(page, "All is well", "good")
