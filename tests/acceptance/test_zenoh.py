@@ -201,7 +201,7 @@ def test_rovers_and_operators_find_a_hub_that_comes_back(
         ann = opened.enter_context(fleet.operator("ann"))
         hub.kill()
         hub.wait(PATIENCE)
-        connections = key("gateway_connections", route="fleet")
+        connections = key("gateway_connections", route="fleet", mode="client")
         wait_until(lambda: now.site.samples()[connections] == 0, "the loss")
         opened.enter_context(fleet.hub())
         Heard(ann, f"{MINE}/data/gw/word").await_one(partial(now.peer.say, "/gw/word", {"data": "x"}))
