@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -74,12 +74,34 @@ def test_commands_of_a_page_print_what_it_shows(page: Path, tmp_path: Path) -> N
         pytest.skip(f"needs {', '.join(missing)}")
     clone = tmp_path / "rover-router"
     fresh_clone(clone)
-    with shell(clone, tmp_path) as there:
+    go_through(todo, clone, name(page), tmp_path)
+
+
+def go_through(todo: Iterable[File | Command], clone: Path, page: str, folder: Path) -> None:
+    with shell(clone, folder) as there:
         for step in todo:
             if isinstance(step, File):
                 there.write(step)
             else:
-                there.run(step, f"{name(page)}:{step.line}")
+                there.run(step, f"{page}:{step.line}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (("$ echo a", "b"), "expected:\nb\n\ngot:\na"),
+        (("$ true", "a"), "expected:\na\n\ngot:"),
+        (("$ false",), "exit code 1 instead of 0"),
+        (("$ true", "# exit code 1"), "exit code 0 instead of 1"),
+        (("$ exit 3",), "the shell has ended"),
+        (("$ false &",), "it ended with exit code 1"),
+        (("$ echo a &", "b"), "expected:\nb\n\ngot:\na"),
+    ],
+)
+def test_a_page_that_is_wrong_fails(lines: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    with pytest.raises(pytest.fail.Exception, match=said):
+        go_through(commands(Block("console", 1, lines, True)), ROOT, "page", tmp_path)
 
 
 def fresh_clone(folder: Path) -> None:
