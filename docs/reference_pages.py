@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from router.cli import GROUPS, VERBS, _VerbParser
+from router.cli import GROUPS, VERBS
 
 Schema = Mapping[str, Any]
 
@@ -265,7 +265,7 @@ def commands() -> Iterator[str]:
 
 def _verb(group: str, verb: str) -> Iterator[str]:
     parser = argparse.ArgumentParser(prog="router")
-    subparsers = parser.add_subparsers(parser_class=_VerbParser)
+    subparsers = parser.add_subparsers()
     importlib.import_module(f"router.cli.{verb}").add_parser(subparsers)
     yield from _parser(subparsers.choices[verb], f"## router {verb}")
 

@@ -84,6 +84,16 @@ def steps(page: Path) -> list[File | Command]:
     return found
 
 
+def typed(page: Path) -> list[str]:
+    """The commands of a page, in order."""
+    return [step.text for step in steps(page) if isinstance(step, Command)]
+
+
+def written(page: Path) -> dict[str, str]:
+    """The files that a page has whole, by path."""
+    return {step.path: step.text for step in steps(page) if isinstance(step, File)}
+
+
 def file_name(first_line: str) -> str | None:
     """The file that a block is, which its first line names in a comment."""
     named = _FILE.fullmatch(first_line)

@@ -6,10 +6,10 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import pytest
 
@@ -23,7 +23,7 @@ NEEDS = ("git", "tar", "ip", "unshare")
 PATIENCE = 60.0
 """Seconds that one command may take."""
 
-FIRST_LINE = 3.0
+FIRST_LINE = 10.0
 """Seconds that a background process has for its first line before the next command."""
 
 UNSAID = ("", "sh", "bash", "shell")
@@ -74,12 +74,34 @@ def test_commands_of_a_page_print_what_it_shows(page: Path, tmp_path: Path) -> N
         pytest.skip(f"needs {', '.join(missing)}")
     clone = tmp_path / "rover-router"
     fresh_clone(clone)
-    with shell(clone, tmp_path) as there:
+    go_through(todo, clone, name(page), tmp_path)
+
+
+def go_through(todo: Iterable[File | Command], clone: Path, page: str, folder: Path) -> None:
+    with shell(clone, folder) as there:
         for step in todo:
             if isinstance(step, File):
                 there.write(step)
             else:
-                there.run(step, f"{name(page)}:{step.line}")
+                there.run(step, f"{page}:{step.line}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (("$ echo a", "b"), "expected:\nb\n\ngot:\na"),
+        (("$ true", "a"), "expected:\na\n\ngot:"),
+        (("$ false",), "exit code 1 instead of 0"),
+        (("$ true", "# exit code 1"), "exit code 0 instead of 1"),
+        (("$ exit 3",), "the shell has ended"),
+        (("$ false &",), "it ended with exit code 1"),
+        (("$ echo a &", "b"), "expected:\nb\n\ngot:\na"),
+    ],
+)
+def test_a_page_that_is_wrong_fails(lines: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    with pytest.raises(pytest.fail.Exception, match=said):
+        go_through(commands(Block("console", 1, lines, True)), ROOT, "page", tmp_path)
 
 
 def fresh_clone(folder: Path) -> None:
@@ -99,6 +121,15 @@ def fresh_clone(folder: Path) -> None:
     subprocess.run(["/bin/bash", "-c", copying], cwd=folder, check=True, timeout=PATIENCE)
 
 
+class Job(NamedTuple):
+    """A process in the background. `ended` has its exit code as soon as there is one."""
+
+    place: str
+    command: Command
+    log: Path
+    ended: Path
+
+
 class Shell:
     """A shell that goes through a page. `cd` and `export` last."""
 
@@ -106,7 +137,7 @@ class Shell:
         self._process = process
         self._folder = folder
         self._number = 0
-        self._jobs: dict[str, Path] = {}
+        self._jobs: list[Job] = []
 
     def write(self, file: File) -> None:
         """Where the shell is: an example may go on in a folder that a command has made."""
@@ -117,23 +148,33 @@ class Shell:
         assert code == 0, f"{file.path}: {output}"
 
     def run(self, command: Command, place: str) -> None:
-        code, output = self._enter(command.text, place)
         if command.is_background:
-            log = self._jobs[f"{place}: $ {command.text}"] = self._output(self._number)
-            seconds = PATIENCE if command.printed else FIRST_LINE
-            self._until(lambda: bool(read(log)) and command.is_printed(read(log)), seconds)
-            code, output = command.code, read(log)
+            code, output = command.code, self._start(command, place)
+        else:
+            code, output = self._enter(command.text, place)
         if code != command.code:
             self._fail(place, command.text, f"exit code {code} instead of {command.code}; it printed:\n{output}")
         if not command.is_printed(output):
             self._fail(place, command.text, "\n".join(["expected:", *command.printed, "", "got:", output]))
 
+    def _start(self, command: Command, place: str) -> str:
+        """Return what a process in the background has printed until the next command."""
+        log, ended = self._output(self._number + 1), self._folder / f"{self._number + 1}.ended"
+        self._jobs.append(Job(place, command, log, ended))
+        self._enter(f"{{ {command.text.removesuffix(' &')}\necho $? > {ended}\n}} &", place)
+        seconds = PATIENCE if command.printed else FIRST_LINE
+        self._until(lambda: read(ended) != "" or (read(log) != "" and command.is_printed(read(log))), seconds)
+        return read(log)
+
     def _fail(self, place: str, text: str, what: str) -> NoReturn:
-        beside = [f"\nmeanwhile {job}\n{read(log)[-2000:]}" for job, log in self._jobs.items()]
+        beside = [f"\nmeanwhile {job.place}: $ {job.command.text}\n{read(job.log)[-2000:]}" for job in self._jobs]
         pytest.fail("\n".join([f"{place}: $ {text}", what, *beside]), pytrace=False)
 
     def end_jobs(self) -> None:
-        """As Ctrl-C does."""
+        """As Ctrl-C does. None may have ended with another code than the page's."""
+        for job in self._jobs:
+            if (code := read(job.ended)) and int(code) != job.command.code:
+                self._fail(job.place, job.command.text, f"it ended with exit code {code}")
         if self._jobs and self._process.poll() is None:
             self._enter("kill -INT $(jobs -p | sed 's/^/-/'); wait", patience=10.0)
 

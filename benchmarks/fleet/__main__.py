@@ -25,10 +25,11 @@ from itertools import pairwise
 from pathlib import Path
 
 from benchmarks.fleet.actors import Told
-from benchmarks.fleet.figures import Figures, braked, carried, dropped, first_after, imbalances, spread
+from benchmarks.fleet.figures import Figures, carried, counted, dropped, first_after, imbalances, spread
 from benchmarks.fleet.report import report, wrong
 from benchmarks.fleet.site import PATIENCE, Fleet, cpu_ns, memory
 from benchmarks.versus.results import commit, machine
+from router.observe.snapshot import Snapshot
 
 DOWN = 2.0
 """Seconds for which the hub is away, and an operator is gone."""
@@ -62,9 +63,10 @@ def main() -> int:
         rates = (args.board_rate, args.command_rate)
         fleet = Fleet(Path(folder), args.rovers, args.operators, rates, opened)
         everybody = [*fleet.drivers]
-        fleet.start(everybody[:1])
-        results["one"] = measured(fleet, everybody[:1], args.seconds)
-        fleet.start(everybody[1:])
+        first, others = everybody[:1], everybody[1:]
+        fleet.start(first)
+        results["one"] = measured(fleet, first, args.seconds)
+        fleet.start(others)
         results["all"] = measured(fleet, everybody, args.seconds)
         results["hub"] = without_hub(fleet, everybody)
         results["operator"] = without_operator(fleet, everybody)
@@ -141,7 +143,7 @@ def measured(fleet: Fleet, rovers: Sequence[int], seconds: float) -> Figures:
     time.sleep(seconds)
     used, elapsed = {name: cpu_ns(pid) - cpu[name] for name, pid in pids.items()}, time.monotonic() - began
     boards, operators = drained(fleet)
-    counted = {rover: fleet.scrape(rover) - before[rover] for rover in rovers}
+    counts = {rover: counted(before[rover], fleet.scrape(rover)) for rover in rovers}
     up = carried(boards.sent, operators.received, elapsed)
     down = carried(operators.sent, boards.received, elapsed)
     routers = [used[str(rover)] / elapsed / 1e7 for rover in rovers]
@@ -151,23 +153,23 @@ def measured(fleet: Fleet, rovers: Sequence[int], seconds: float) -> Figures:
         "seconds": round(elapsed, 1),
         "rover_to_operator": up,
         "operator_to_rover": down,
-        "dropped": dict(sum((Counter(dropped(one)) for one in counted.values()), Counter())),
+        "dropped": dict(sum(map(dropped, counts.values()), Counter())),
         "hub_cpu_percent": round(used["hub"] / elapsed / 1e7, 2),
         "hub_cpu_us_per_message": round(used["hub"] / 1e3 / max(1, up["received"] + down["received"]), 1),
         "hub_memory_mb": memory(pids["hub"]),
         "router_cpu_percent": round(statistics.median(routers), 2),
         "router_memory_mb": {kind: round(statistics.median(size[kind] for size in sizes), 1) for kind in sizes[0]},
-        "wrong": books(rovers, counted, boards, operators),
+        "wrong": books(counts, boards, operators),
     }
 
 
-def books(rovers: Sequence[int], counted: dict[int, Counter[str]], boards: Told, operators: Told) -> list[str]:
+def books(counts: dict[int, Snapshot], boards: Told, operators: Told) -> list[str]:
     """Sums that do not come out."""
     ends = [Counter(record[0] for record in records) for records in (*boards[:2], *operators[:2])]
     found = []
-    for rover in rovers:
+    for rover, count in counts.items():
         sent, obeyed, ordered, heard = (end[rover] for end in ends)
-        found += [f"rover {rover}: {what}" for what in imbalances(counted[rover], (sent, heard), (ordered, obeyed))]
+        found += [f"rover {rover}: {what}" for what in imbalances(count, (sent, heard), (ordered, obeyed))]
     return found
 
 
@@ -183,7 +185,7 @@ def without_hub(fleet: Fleet, rovers: Sequence[int]) -> Figures:
     fleet.start_hub()
     back = time.monotonic_ns()
     boards, operators = await_flow(fleet, rovers, back)
-    brakes = braked(boards, rovers, killed)
+    brakes = first_after(boards.brakes, killed)
     return {
         "rovers": len(rovers),
         "braked": len(brakes),
@@ -203,16 +205,16 @@ def without_operator(fleet: Fleet, rovers: Sequence[int]) -> Figures:
     time.sleep(DOWN)
     boards, _ = take(fleet)
     flow(fleet, [])
-    his = [rover for rover in rovers if fleet.drivers[rover] == number]
     others = [rover for rover in rovers if fleet.drivers[rover] != number]
-    brakes = braked(boards, his, killed)
+    brakes = first_after(boards.brakes, killed)
+    his = [after for rover, after in brakes.items() if fleet.drivers[rover] == number]
     gaps = [gap for rover in others for gap in waits(boards, rover)]
     return {
-        "his_rovers": len(his),
-        "braked": len(brakes),
-        "brake_after_ms": spread([*brakes.values()]),
+        "his_rovers": len(rovers) - len(others),
+        "braked": len(his),
+        "brake_after_ms": spread(his),
         "other_rovers": len(others),
-        "others_braked": len(braked(boards, others, killed)),
+        "others_braked": len(brakes) - len(his),
         "others_gap_ms": spread(gaps),
     }
 

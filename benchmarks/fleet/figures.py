@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from benchmarks.fleet.actors import Record, Told
+from benchmarks.fleet.actors import Record
+from router.observe.snapshot import Snapshot
 
 Figures = dict[str, Any]
 
@@ -38,68 +39,42 @@ def carried(sent: Iterable[Record], received: Sequence[Record], seconds: float) 
     }
 
 
-def dropped(counted: Mapping[str, int]) -> dict[str, int]:
-    """What a router dropped or rejected, by series."""
-    kinds = ("messages_dropped_total{", "datagrams_rejected_total{", "client_messages_dropped_total{", "kernel_drops")
-    return {name: count for name, count in counted.items() if name.startswith(kinds) and count}
+def counted(before: Snapshot, after: Snapshot) -> Snapshot:
+    """What was counted in between."""
+    values = {
+        metric: {labels: value - before.counts(metric).get(labels, 0) for labels, value in series.items()}
+        for metric, series in after.values.items()
+    }
+    return Snapshot(after.at, values)
 
 
-def imbalances(counted: Mapping[str, int], up: tuple[int, int], down: tuple[int, int]) -> list[str]:
+def dropped(count: Snapshot) -> Counter[str]:
+    """What a router dropped or rejected, by metric and labels."""
+    kinds = ("messages_dropped", "datagrams_rejected", "client_messages_dropped", "kernel_drops")
+    series = {(kind, *labels): value for kind in kinds for labels, value in count.counts(kind).items()}
+    return Counter({" ".join(words): int(value) for words, value in series.items() if value})
+
+
+def imbalances(count: Snapshot, up: tuple[int, int], down: tuple[int, int]) -> list[str]:
     """Sums of one rover that do not come out. `up` and `down` are what was sent and received at the ends."""
-    count = Counter(counted)
-    from_ros, to_hub = (
-        count['messages_received_total{route="fleet",source="ros"}'],
-        _sum(count, "sent", "fleet", "clients"),
-    )
-    from_hub = count['datagrams_received_total{listener="fleet"}']
-    accepted = count['messages_received_total{route="fleet",source="clients"}']
-    to_ros = count['messages_published_total{route="fleet",topic="/drive"}']
-    commands = count['messages_received_total{route="drive",source="drive"}']
+    total = count.total
+    from_ros, to_hub = total("messages_received", "fleet", "ros"), total("messages_sent", "fleet")
+    from_hub, accepted = total("datagrams_received", "fleet"), total("messages_received", "fleet", "clients")
+    to_ros, commands = total("messages_published", "fleet", "/drive"), total("messages_received", "drive", "drive")
+    withheld = total("messages_filtered", "fleet") + total("messages_dropped", "fleet", "clients")
     sums = {
-        "boards -> router": (up[0], count['messages_received_total{route="imu",source="sensor_board"}']),
-        "router -> gateway": (count['messages_published_total{route="imu",topic="imu"}'], from_ros),
-        "gateway -> hub": (
-            from_ros,
-            to_hub + _sum(count, "filtered", "fleet") + _sum(count, "dropped", "fleet", "clients"),
-        ),
-        "hub -> gateway": (from_hub, accepted + _sum(count, "rejected", "fleet")),
-        "gateway -> ROS": (accepted, to_ros + _sum(count, "dropped", "fleet", "/drive")),
+        "boards -> router": (up[0], total("messages_received", "imu", "sensor_board")),
+        "router -> gateway": (total("messages_published", "imu", "imu"), from_ros),
+        "gateway -> hub": (from_ros, to_hub + withheld),
+        "hub -> gateway": (from_hub, accepted + total("datagrams_rejected", "fleet")),
+        "gateway -> ROS": (accepted, to_ros + total("messages_dropped", "fleet", "/drive")),
         "ROS -> router": (to_ros, commands),
-        "router -> board": (commands, down[1] + _sum(count, "dropped", "drive")),
+        "router -> board": (commands, down[1] + total("messages_dropped", "drive")),
     }
     wrong = [f"{name}: {one} and {other}" for name, (one, other) in sums.items() if one != other]
     if up[1] > to_hub or from_hub > down[0]:
         wrong.append(f"hub: {up[1]} of {to_hub} and {from_hub} of {down[0]}")
     return wrong
-
-
-_METRICS = {
-    "sent": "messages_sent_total{",
-    "filtered": "messages_filtered_total{",
-    "dropped": "messages_dropped_total{",
-    "rejected": "datagrams_rejected_total{",
-}
-
-
-def _sum(count: Mapping[str, int], what: str, owner: str, target: str = "") -> int:
-    """Of series whose route or listener is `owner`."""
-    owners = (f'route="{owner}"', f'listener="{owner}"')
-    return sum(
-        value
-        for name, value in count.items()
-        if name.startswith(_METRICS[what])
-        and any(label in name for label in owners)
-        and (not target or f'target="{target}"' in name or "target=" not in name)
-    )
-
-
-def braked(told: Told, rovers: Iterable[int], since: int) -> dict[int, float]:
-    """Milliseconds from `since` to the first brake of each rover that got one."""
-    first: dict[int, float] = {}
-    for rover, _, at in told.brakes:
-        if rover in rovers and at > since:
-            first.setdefault(rover, (at - since) / 1e6)
-    return first
 
 
 def first_after(records: Iterable[Record], since: int) -> dict[int, float]:

@@ -10,8 +10,6 @@ import re
 import subprocess
 import sys
 import time
-import urllib.request
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing import get_context
@@ -20,6 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.fleet.actors import Address, Told, play_boards, play_operator
+from router.errors import TransportError
+from router.observe.snapshot import Snapshot
+from router.tools.running_router import metrics
+from tests.docs_commands import typed, written
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGE = ROOT / "docs" / "guides" / "fleet.md"
@@ -84,23 +86,9 @@ GATEWAY = """\
 """
 
 
-def blocks(language: str, name: str) -> str:
-    """The guide's file of that name."""
-    text = PAGE.read_text(encoding="utf-8")
-    [found] = re.findall(rf"^```{language}\n(# {re.escape(name)}\n.*?)^```", text, re.DOTALL | re.MULTILINE)
-    return str(found)
-
-
-def commands() -> list[str]:
-    """Those of the guide, in order."""
-    text = PAGE.read_text(encoding="utf-8")
-    console = "".join(re.findall(r"^```console\n(.*?)^```", text, re.DOTALL | re.MULTILINE)).replace("\\\n> ", "")
-    return [line[2:] for line in console.splitlines() if line.startswith("$ ")]
-
-
 def table() -> str:
     """One table for all rovers: the guide's gateway below routes of two messages."""
-    gateways = blocks("yaml", "rover.yaml").partition("gateways:\n")[2].partition("    inbound:\n")[0]
+    gateways = written(PAGE)["rover.yaml"].partition("gateways:\n")[2].partition("    inbound:\n")[0]
     return f"{TABLE}gateways:\n{gateways}{GATEWAY}"
 
 
@@ -128,10 +116,10 @@ class Fleet:
         (self.folder / "protos" / "envelope.proto").write_text(PROTO)
         (self.folder / "rover.yaml").write_text(table())
         drivers = {f"rover_{rover}": [f"operator_{operator}"] for rover, operator in self.drivers.items()}
-        program = re.sub(r"^DRIVERS = .*$", f"DRIVERS = {drivers}", blocks("python", "fleet.py"), flags=re.MULTILINE)
+        program = re.sub(r"^DRIVERS = .*$", f"DRIVERS = {drivers}", written(PAGE)["fleet.py"], flags=re.MULTILINE)
         (self.folder / "fleet.py").write_text(program)
         names = " ".join(["hub", *drivers, *(f"operator_{number}" for number in set(self.drivers.values()))])
-        for command in (line for line in commands() if "openssl" in line):
+        for command in (command for command in typed(PAGE) if "openssl" in command):
             made = re.sub(r"in hub .*? ben;", f"in {names};", command)
             subprocess.run(["/bin/sh", "-e", "-c", made], cwd=self.folder, check=True, capture_output=True)
         subprocess.run([sys.executable, "fleet.py"], cwd=self.folder, check=True)
@@ -176,16 +164,12 @@ class Fleet:
         if self.routers[rover].poll() is not None:
             raise SystemExit((self.folder / f"rover_{rover}.log").read_text())
         try:
-            return self.scrape(rover)['gateway_clients{route="fleet"}'] == 1
-        except OSError:
+            return self.scrape(rover).total("gateway_clients", "fleet") == 1
+        except TransportError:
             return False
 
-    def scrape(self, rover: int) -> Counter[str]:
-        """A router's metrics, without the prefix `router_`."""
-        with urllib.request.urlopen(f"http://127.0.1.{rover}:9108/metrics", timeout=PATIENCE) as answer:
-            text = answer.read().decode()
-        lines = (line.rpartition(" ") for line in text.splitlines() if line.startswith("router_"))
-        return Counter({name.removeprefix("router_"): int(float(value)) for name, _, value in lines})
+    def scrape(self, rover: int) -> Snapshot:
+        return metrics(f"http://127.0.1.{rover}:9108")
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

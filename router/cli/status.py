@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 DEGRADED = 3
 
 _DESCRIPTION = f"""Say in one line whether the router of a table runs, and what is wrong with it: a stuck receive
-thread, a reload that failed, boards that are silent, deadmen that send in place of commands.
+thread, a reload that failed, boards that are silent, deadmen that send in place of commands, publishers that are
+stuck.
 
 Exit code: {OK} it runs and is healthy, {NETWORK_FAULT} none runs, {DEGRADED} it runs and something is wrong,
 {BAD_USAGE} wrong usage, {BAD_TABLE} a wrong table. 'router doctor' says what to do about it."""
@@ -56,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _problems(found: Snapshot) -> Iterator[str]:
+    from router.observe.snapshot import MOST_STALLED
+
     if found.counts("config_last_reload_successful").get(()) == 0:
         yield "its last reload failed"
     sources = {source for _, source in found.counts("messages_received")}
@@ -68,3 +71,6 @@ def _problems(found: Snapshot) -> Iterator[str]:
     for (route,), active in found.counts("deadman_active").items():
         if active:
             yield f"the deadman of {route} sends"
+    for (topic,), seconds in found.counts("publish_stalled_seconds").items():
+        if seconds > MOST_STALLED:
+            yield f"publishing on {topic} is stuck in the ROS middleware, for {seconds:.0f} s"

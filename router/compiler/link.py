@@ -239,7 +239,8 @@ def _open_gateway_counters(counters: Counters, plan: GatewayPlan) -> None:
     _open_each(counters, "messages_dropped", name, CLIENTS, last=GATEWAY_DROP_REASONS)
     _open(counters, ("datagrams_sent", "sent_bytes"), name, plan.settings.transport.value.value)
     if plan.settings.zenoh is not None:
-        _open(counters, ("gateway_key_conflicts", "gateway_connections"), name)
+        _open(counters, ("gateway_key_conflicts",), name)
+        _open(counters, ("gateway_connections",), name, plan.settings.zenoh.mode)
     _open_each(counters, "gateway_topics", name, last=TOPIC_STATES)
     _open_each(counters, "client_messages_dropped", name, last=CLIENT_DROP_REASONS)
     for topic, inbound in plan.inbound.items():

@@ -66,7 +66,7 @@ METRICS = (
     Metric("gateway_clients", "number", ("route",), "Clients that a gateway has now."),
     Metric("gateway_client_clock_ahead", "counter", ("route",), "Messages of clients whose clock is ahead of ours."),
     Metric("gateway_key_conflicts", "counter", ("route",), "Times that another gateway had the same Zenoh key."),
-    Metric("gateway_connections", "number", ("route",), "Zenoh routers and peers that a gateway is connected to now."),
+    Metric("gateway_connections", "number", ("route", "mode"), "Zenoh routers and peers that are connected now."),
     Metric("gateway_topics", "number", ("route", "state"), "Topics that a gateway's patterns match now, by state."),
     Metric(
         "gateway_client_lag_seconds", "number", ("route", "client"), "For how long a client has not had everything."

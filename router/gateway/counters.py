@@ -41,8 +41,9 @@ class GatewayCounters:
         self._arrived_bytes = counters.index("received_bytes", name)
         self._clients = counters.index("gateway_clients", name)
         self._topics = [counters.index("gateway_topics", name, state) for state in TOPIC_STATES]
-        self._contended = counters.index("gateway_key_conflicts", name) if settings.zenoh else None
-        self._connections = counters.index("gateway_connections", name) if settings.zenoh else None
+        zenoh = settings.zenoh
+        self._contended = counters.index("gateway_key_conflicts", name) if zenoh else None
+        self._connections = counters.index("gateway_connections", name, zenoh.mode) if zenoh else None
         self._lost = {reason: counters.index("client_messages_dropped", name, reason) for reason in CLIENT_DROP_REASONS}
 
     def received(self, messages: int) -> None:

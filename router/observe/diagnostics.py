@@ -17,7 +17,7 @@ from router.compiler.metrics import INTENDED_REASONS, RECORD_DROP_REASONS
 from router.compiler.program import GatewayPlan, Program
 from router.log import logger
 from router.observe.running import Running
-from router.observe.snapshot import Labels, Snapshot, snapshot
+from router.observe.snapshot import MOST_STALLED, Labels, Snapshot, snapshot
 from router.table.model import Endpoint, Route
 from router.threads import background_threads, join_or_leave
 
@@ -25,9 +25,6 @@ PERIOD = 1.0
 """Seconds."""
 SNAPSHOTS = 6
 """What went wrong is reported for so many periods, less one: a status that comes and goes would be overlooked."""
-
-MOST_STALLED = 1.0
-"""Seconds that calls which publish on a topic may last."""
 
 LAST_SEEN = "endpoint_last_seen_timestamp_seconds"
 STALLED = "publish_stalled_seconds"

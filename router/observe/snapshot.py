@@ -24,6 +24,9 @@ BUCKETS = "_bucket"
 DELIVERED = ("datagrams_sent", "messages_published", "messages_sent")
 """The metrics that count what targets got; their second label is the target."""
 
+MOST_STALLED = 1.0
+"""Seconds that calls which publish on a topic may last."""
+
 Labels = tuple[str, ...]
 Counts = Mapping[Labels, float]
 

@@ -216,6 +216,8 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
         return f"write it without quotes: {value}"
     if hint := _for_collection(error, value):
         return hint
+    if _is_at(error.path[-3:], ("deadman", "send", "*")):
+        return without_case({name: value})
     if (written := _in_flow(value)) is None or (isinstance(value, bool) and error.path != ("reload",)):
         return ""
     if instead := next((text for place, text in _INSTEAD.items() if _is_at(error.path, place)), ""):
@@ -231,6 +233,14 @@ def _written_otherwise(error: SchemaError, name: str, value: object) -> str:
     if error.limit == "string" and not error.schema.keys() & {"errorMessage", "enum"} and not isinstance(value, list):
         return f'quote it: "{written}"'
     return ""
+
+
+def without_case(fields: Mapping[str, object]) -> str:
+    """A hint for fields that stand below `send` of a deadman, without their payload case; empty for anything else."""
+    written = [f"{name}: {shown}" for name, value in fields.items() if (shown := _in_flow(value)) is not None]
+    if len(written) < len(fields):
+        return ""
+    return f"below 'send' stands a payload case, and below that its fields: `send: {{CASE: {{{', '.join(written)}}}}}`"
 
 
 def _is_of(kinds: str | list[str], value: object) -> bool:

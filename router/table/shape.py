@@ -62,12 +62,14 @@ def check_shape(root: MappingNode, findings: list[Diagnostic]) -> MappingNode:
 
 
 def _said_elsewhere(found: list[SchemaError]) -> list[SchemaError]:
-    """Errors that go with another one: lists after a first one in a list, and what stands below `send` beside a case
-    that lacks its fields.
+    """Errors that go with another one: lists after a first one in a list, and what stands below `send` where that has
+    several, or beside a case that lacks its fields.
     """
     empty = [error.path for error in found if error.lacks_mapping and error.path[-2:-1] == ("send",)]
     groups = [path[:-1] for path in empty]
     said = [error for error in found if error.path not in empty and {error.path, error.path[:-1]} & {*groups}]
+    several = [error.path for error in found if error.keyword == "maxProperties" and error.path[-1] == "send"]
+    said += [error for error in found if error.path[:-1] in several and error.path[:-1] not in groups]
     rows: dict[Path, SchemaError] = {}
     lists = [error for error in found if error.is_list_in_list]
     said += [error for error in lists if rows.setdefault(error.path[:-1], error) is not error]
@@ -156,7 +158,8 @@ def finding(error: SchemaError, tree: Node) -> Diagnostic:
         return _repeated(error, tree)
     code = Code.UNKNOWN_QOS_VALUE if keyword == "enum" and path[-2:-1] == ("qos",) else Code.BAD_VALUE
     if keyword == "maxProperties":
-        return Diagnostic(span, code, f"{name} {_expected(error)}, and no other beside it")
+        hint = hints.without_case(error.value) if path[-1] == "send" and isinstance(error.value, dict) else ""
+        return Diagnostic(span, code, f"{name} {_expected(error)}, and no other beside it", hint)
     hint = hints.for_value(error)
     if keyword == "minProperties" and "errorMessage" in error.schema:
         return Diagnostic(span, code, f"{name} {_expected(error)}")

@@ -49,9 +49,12 @@ def keys() -> Iterator[Callable[[float], str]]:
         if not readable.poll(seconds * 1000):
             return ""
         key = os.read(terminal, 1).decode(errors="replace")
-        if key == _ESCAPE and readable.poll(0):  # a terminal sends the whole sequence of a key at once
-            return _SCROLLING.get(os.read(terminal, 8).decode(errors="replace").replace("O", "["), "")
-        return key
+        if key != _ESCAPE or not readable.poll(0):  # a terminal sends the whole sequence of a key at once
+            return key
+        sequence = os.read(terminal, 2).replace(b"O", b"[")
+        while sequence[-1:].isdigit() and readable.poll(0):
+            sequence += os.read(terminal, 1)
+        return _SCROLLING.get(sequence.decode(errors="replace"), "")
 
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal)

@@ -25,9 +25,9 @@ from tests.acceptance.gateway_clients import Scene, repeating, scene
 from tests.acceptance.payloads import generated
 from tests.acceptance.ros_peer import PATIENCE, RosPeer
 from tests.acceptance.site import RouterProcess, key, wait_until
+from tests.docs_commands import typed, written
 from tests.ports import free_port
 from tests.tables import PROTOS
-from tests.test_docs import examples
 
 pytestmark = pytest.mark.slow  # discovery between three programs, with TLS
 
@@ -41,6 +41,7 @@ ZENOH = """\
 """
 
 
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "fleet.md"
 MINE = "rovers/rover_1"
 DRIVE = {"/drive_motor": "comms/msg/DrivingBoardMotorMessage"}
 MOVE = ("/drive_motor", {"distance_to_go": 1.0, "turning_radius": 0.0})
@@ -56,13 +57,12 @@ class Fleet:
     @property
     def gateways(self) -> str:
         """Of the table of all rovers."""
-        [table] = [text for text in examples("guides/fleet.md", "yaml") if text.startswith("# rover.yaml")]
-        return table.partition("gateways:\n")[2].replace("7447", str(self.port))
+        return written(PAGE)["rover.yaml"].partition("gateways:\n")[2].replace("7447", str(self.port))
 
     @contextmanager
     def hub(self) -> Iterator[subprocess.Popen[bytes]]:
         """The hub, by the page's command. Gateways and operators wait for it."""
-        [command] = [line for line in commands() if line.startswith("python -c ")]
+        [command] = [command for command in typed(PAGE) if command.startswith("python -c ")]
         python = command.removeprefix("python").removesuffix(" &")
         running = subprocess.Popen(["/bin/sh", "-c", f"exec {sys.executable}{python}"], cwd=self.folder)
         try:
@@ -86,22 +86,15 @@ class Fleet:
         subprocess.run(words, cwd=self.folder, check=True, timeout=PATIENCE)
 
 
-def commands() -> list[str]:
-    """Those of the page, in order."""
-    joined = "".join(examples("guides/fleet.md", "console")).replace("\\\n> ", "")
-    return [line[2:] for line in joined.splitlines() if line.startswith("$ ")]
-
-
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     """In `others` there are the same certificates of another authority."""
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl")
     made = Fleet(tmp_path_factory.mktemp("fleet"), free_port(kind=socket.SOCK_STREAM))
-    for program in examples("guides/fleet.md", "python"):
-        name = program.partition("\n")[0].removeprefix("# ")
-        (made.folder / name).write_text(program.replace("7447", str(made.port)))
-    certificates = [line for line in commands() if "openssl" in line]
+    for name in ("fleet.py", "drive.py"):
+        (made.folder / name).write_text(written(PAGE)[name].replace("7447", str(made.port)))
+    certificates = [command for command in typed(PAGE) if "openssl" in command]
     for place in (made.folder, made.folder / "others"):
         place.mkdir(exist_ok=True)
         for command in certificates:
@@ -201,7 +194,7 @@ def test_rovers_and_operators_find_a_hub_that_comes_back(
         ann = opened.enter_context(fleet.operator("ann"))
         hub.kill()
         hub.wait(PATIENCE)
-        connections = key("gateway_connections", route="fleet")
+        connections = key("gateway_connections", route="fleet", mode="client")
         wait_until(lambda: now.site.samples()[connections] == 0, "the loss")
         opened.enter_context(fleet.hub())
         Heard(ann, f"{MINE}/data/gw/word").await_one(partial(now.peer.say, "/gw/word", {"data": "x"}))

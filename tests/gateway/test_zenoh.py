@@ -257,6 +257,7 @@ async def test_a_network_that_is_lost_and_found_is_reported(monkeypatch: pytest.
                     "the Zenoh network is lost: Zenoh tries to connect again",
                     "the Zenoh network is there again",
                 ]
+    assert events.connections == [1, 0, 1, 0]
 
 
 @asynchronous

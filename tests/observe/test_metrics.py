@@ -28,6 +28,7 @@ LABELS = {
     "result": "ok",
     "payload_case": "imu_info",
     "route": "imu_info",
+    "mode": "peer",
     "source": "sensor_board",
     "destination": "basestation",
     "topic": "imu_data",

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import pty
+import sys
 from dataclasses import replace
 
 import pytest
@@ -12,11 +15,12 @@ from router.compiler.metrics import HISTOGRAM_BOUNDS_NS
 from router.observe.snapshot import Counts, Snapshot, parse_metrics
 from router.tools.top import WINDOW, Order, RouteRow, TargetRow, View, Window, ordered, quantile, view
 from router.tools.top_table import targets_text
-from router.tools.top_view import Page, Screen
+from router.tools.top_view import Page, Screen, keys
 from router.tools.top_words import age_text, latency_text, reasons_text
 
 BOUNDS = (*(f"{bound / 1e9:g}" for bound in HISTOGRAM_BOUNDS_NS), "+Inf")
 NOW = 1_000_000.0
+PATIENCE = 30.0
 
 
 def buckets(route: str, *counts: int) -> Counts:
@@ -161,6 +165,15 @@ def test_keys_scroll_through_the_routes() -> None:
     assert shown(0, "end") == (40 - page, 40)
     assert shown(100, "up") == (39 - page, 39)
     assert shown(20, "home") == (0, page)
+
+
+def test_keys_that_come_together_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = pty.openpty()
+    with os.fdopen(ours, "wb", 0) as person, os.fdopen(theirs, encoding="utf-8") as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        with keys() as wait:
+            person.write(b"\x1b[B\x1bOBt\x1b[6~\x1b[Z\x1b[Fq")
+            assert [wait(PATIENCE) for _ in range(7)] == ["down", "down", "t", "page down", "", "end", "q"]
 
 
 def test_what_is_lost_now_is_told_from_what_was_lost_before() -> None:

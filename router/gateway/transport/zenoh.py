@@ -115,6 +115,7 @@ class ZenohTransport:
         if self._session is not None:
             closing = self._loop.run_in_executor(self._session_thread, self._session.close)
             await asyncio.wait([closing], timeout=CLOSING_SECONDS)
+            self._events.connected(0)
         for thread in (self._session_thread, self._answering):
             thread.shutdown()
         self._session = None
