@@ -61,13 +61,14 @@ class Browser:
             self.events.append(answer)
 
     def open(self, url: str, width: int = 1366, height: int = 768) -> Page:
-        """A new page with the size of a laptop's, in front of all others."""
+        """A new page with the size of a laptop's, or as on a phone where it is narrow; in front of all others."""
         target = self.call("Target.createTarget", url="about:blank", newWindow=True)["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         page = Page(self, session, target)
         for domain in ("Page", "Runtime", "Log"):
             page.call(f"{domain}.enable")
-        page.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        page.call("Emulation.setDeviceMetricsOverride", **metrics)
         page.call("Emulation.setFocusEmulationEnabled", enabled=True)
         page.go(url)
         return page
