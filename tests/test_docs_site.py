@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.gateway.accessibility import SIZES, THEMES, contrast_problems, show_at, unnamed_controls
 from tests.gateway.browser import Browser, Page, executable
 
 pytestmark = pytest.mark.slow
@@ -96,3 +97,13 @@ def is_wide(browser: Browser, site: Path, name: str, width: int) -> bool:
     wide = page.evaluate(f"document.documentElement.scrollWidth > {width}")
     page.close()
     return bool(wide)
+
+
+@pytest.mark.parametrize("name", ["index", "start/first-table", "reference/keys", "search"])
+def test_texts_stand_out_and_controls_have_names(browser: Browser, site: Path, name: str) -> None:
+    page = browser.open(f"{site.as_uri()}/{name}.html")
+    for size in SIZES:
+        for theme in THEMES:
+            show_at(page, size, theme)
+            assert contrast_problems(page) + unnamed_controls(page) == []
+    page.close()
