@@ -314,8 +314,9 @@ def _write(file: Path, picture: str, said: str) -> None:
 
 
 def _say(file: Path, text: str) -> None:
-    """What was made, and what it shows, in a line."""
-    print(f"{file.name}: {file.stat().st_size / 1000:.0f} kB; {' '.join(text.split())}", flush=True)
+    """What was made, and what it shows, in a line; on a terminal only what fits into one."""
+    line = f"{file.name}: {file.stat().st_size / 1000:.0f} kB; {' '.join(text.split())}"
+    print(line[: shutil.get_terminal_size().columns - 1] if sys.stdout.isatty() else line, flush=True)
 
 
 if __name__ == "__main__":
