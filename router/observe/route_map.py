@@ -49,7 +49,8 @@ class Node:
     """An endpoint, a topic, a payload case, a gateway or its clients, in a column of the map.
 
     `key` is unique in a map. `about` says in a few words what the name does not: an address, a type, a ttl.
-    Endpoints have an `address` and a `role`, as in `kind: board`; clients of a gateway have an `address`.
+    Endpoints have an `address` and a `role`, as in `kind: board`; clients of a gateway have an `address`. A
+    payload case `is_guarded` by a ttl or a deadman.
     """
 
     key: str
@@ -59,6 +60,7 @@ class Node:
     about: str = ""
     address: str = ""
     role: str = ""
+    is_guarded: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +105,8 @@ def _case(route: Route) -> Node:
         words.append(f"deadman after {duration(route.deadman.timeout.value)}")
     if route.collect is not None:
         words.append("collected to frames")
-    return Node(f"case:{case}", 1, NodeKind.CASE, case, ", ".join(words))
+    is_guarded = route.ttl is not None or route.deadman is not None
+    return Node(f"case:{case}", 1, NodeKind.CASE, case, ", ".join(words), is_guarded=is_guarded)
 
 
 def _sources(route: Route, table: RouteTable) -> Iterator[Node]:

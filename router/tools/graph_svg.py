@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape, quoteattr
 
-from router.observe.route_map import COLUMNS, FONT, HEAD, LETTER, PAD, Box, Curve, Edge, Node, NodeKind, RouteMap
+from router.observe.route_map import COLUMNS, FONT, HEAD, LETTER, PAD, Box, Curve, Edge, NodeKind, RouteMap
 from router.tools.graph import LEGEND
 
 _STYLE = """
@@ -121,7 +121,7 @@ def _legend(drawing: RouteMap) -> list[_Entry]:
         for kind, text in LEGEND.items()
         if kind in present
     ]
-    if any(_is_guarded(box.node) for box in drawing.boxes):
+    if any(box.node.is_guarded for box in drawing.boxes):
         entries.append(_Entry(_halt(_SAMPLE / 2, row / 2), _GUARDED))
     kinds = {box.node.key: box.node.kind for box in drawing.boxes}
     flows = {_flow(curve.edge, kinds) for curve in drawing.curves}
@@ -188,17 +188,12 @@ def _node(box: Box) -> str:
     node = box.node
     baseline = box.y + box.height / 2 + FONT * 0.35
     said = f"{node.name}\n{node.about}" if node.about else node.name
-    mark = _halt(box.x + box.width - PAD - 5, box.y + box.height / 2) if _is_guarded(node) else ""
+    mark = _halt(box.x + box.width - PAD - 5, box.y + box.height / 2) if node.is_guarded else ""
     return (
         f'<g class="node {node.kind.value}"><title>{escape(said)}</title>'
         f"{_shape(node.kind, box.x, box.y, box.width, box.height)}"
         f'<text x="{box.x + PAD:g}" y="{baseline:g}">{escape(box.label)}</text>{mark}</g>'
     )
-
-
-def _is_guarded(node: Node) -> bool:
-    """Whether a route has a ttl or a deadman, as `about` says."""
-    return node.kind is NodeKind.CASE and ("deadman" in node.about or "older than" in node.about)
 
 
 def _halt(x: float, y: float) -> str:
