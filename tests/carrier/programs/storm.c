@@ -41,6 +41,8 @@ struct made {
     struct waiting waiting[ROUTES];
     const uint8_t *wanted[1];
     struct feed feed;
+    bool has_been_left;  /* by the threads that take and command, */
+    uint64_t turns;      /* when the receive thread had done so many turns */
 };
 
 static const struct wire_field of_envelope[] = {
@@ -181,6 +183,16 @@ static void change(const struct made *next, const struct made *earlier) {
     carrier_resume(carrier);
 }
 
+/* Whether nobody uses a program any more that another one has replaced. Until its next turn the receive thread may be
+ * dropping a message of it. */
+static bool has_passed(struct made *made) {
+    uint32_t next_one = made->program.generation + 1;
+    if (atomic_load(&reader_at) < next_one || atomic_load(&commander_at) < next_one) return false;
+    if (!made->has_been_left) made->turns = carrier_turns(carrier);
+    made->has_been_left = true;
+    return carrier_turns(carrier) != made->turns;
+}
+
 /* Replace programs, and free those that nobody uses: they may be as many as MOST_LEFT. Return the last one, which has
  * all listeners. */
 static struct made *replace_all(struct made *running, uint32_t count) {
@@ -197,20 +209,21 @@ static struct made *replace_all(struct made *running, uint32_t count) {
         usleep(generation % 7 * 300);
         for (; first < end; first++) {
             struct made *oldest = left[first % MOST_LEFT];
-            uint32_t next_one = oldest->program.generation + 1;
-            while (end - first == MOST_LEFT && (atomic_load(&reader_at) < next_one || atomic_load(&commander_at) < next_one))
-                usleep(100);
-            if (atomic_load(&reader_at) < next_one || atomic_load(&commander_at) < next_one) break;
+            while (end - first == MOST_LEFT && !has_passed(oldest)) usleep(100);
+            if (!has_passed(oldest)) break;
             free_made(oldest);
         }
     }
     atomic_store(&is_quiet, true);
     while (atomic_load(&commander_at) != UINT32_MAX) usleep(100);
     while (atomic_load(&reader_at) < running->program.generation) usleep(100);
-    for (; first < end; first++) free_made(left[first % MOST_LEFT]);
+    for (; first < end; first++) {
+        while (!has_passed(left[first % MOST_LEFT])) usleep(100);
+        free_made(left[first % MOST_LEFT]);
+    }
     struct made *last = make(LISTENERS * count + LISTENERS - 1);
     change(last, running);
-    while (atomic_load(&reader_at) < last->program.generation) usleep(100);
+    while (atomic_load(&reader_at) < last->program.generation || !has_passed(running)) usleep(100);
     free_made(running);
     return last;
 }
@@ -267,6 +280,7 @@ static void *read_messages(void *unused) {
             const struct message_record *record = (const struct message_record *)(const void *)((char *)records + at);
             check(record->part->handler == record->handler, "the part is alive");
             check(record->generation >= atomic_load(&reader_at), "generations come in order");
+            atomic_store(&reader_at, record->generation);
             atomic_fetch_add(&taken, 1);
             at += record->size;
         }
