@@ -6,12 +6,14 @@ import os
 import signal
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 from router.carrier.build import build, is_current
+from tests.gateway.browser import Browser, executable
 from tests.lanes import LANE
 
 # Before anything imports rclpy. Domains above 101 would use ports that the kernel gives to others.
@@ -55,3 +57,14 @@ sys.addaudithook(_leave_to_the_team)
 def _in_the_checkout() -> None:
     """Wherever the tests were started: files below here are told by their path from here."""
     os.chdir(Path(__file__).parent.parent)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Headless Chromium: pages are tested in a real browser only."""
+    program = executable()
+    if program is None:
+        pytest.skip("no Chromium here")
+    running = Browser(program, tmp_path_factory.mktemp("chromium"))
+    yield running
+    running.close()

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.gateway.accessibility import SIZES, THEMES, contrast_problems, show_at, unnamed_controls
-from tests.gateway.browser import Browser, Page, executable
+from tests.gateway.browser import Browser, Page
 
 pytestmark = pytest.mark.slow
 
@@ -49,16 +49,6 @@ def test_each_page_is_in_the_search_index(site: Path) -> None:
     pages = [str(page.relative_to(DOCS).with_suffix("")) for page in DOCS.rglob("*.md")]
     assert [page for page in pages if f'"{page}"' not in index] == []
     assert '"deadman"' in index
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    program = executable()
-    if program is None:
-        pytest.skip("needs Chromium")
-    browser = Browser(program, tmp_path_factory.mktemp("browser"))
-    yield browser
-    browser.close()
 
 
 @pytest.fixture(params=["file", "http"])

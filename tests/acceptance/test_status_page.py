@@ -3,34 +3,20 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.acceptance.payloads import generated
 from tests.acceptance.site import BARE, RouterProcess, Site, key, site, wait_until
-from tests.gateway.browser import Browser, Page, executable
+from tests.gateway.browser import Browser, Page
 
-PROGRAM = executable()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
-]
+pytestmark = pytest.mark.slow
 
 TABLE = BARE + "routes: {{ph_info: {{source: sensor_board, destinations: [basestation]}}}}\n"
 HOSTS = {"sensor_board": "127.0.0.30", "basestation": "127.0.0.10"}
 RECEIVED = "[...document.querySelectorAll('#tiles small')][0].textContent"
 PH = next(generated("ph_info")).datagram
-
-
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    assert PROGRAM is not None
-    (tmp_path / "chromium").mkdir()
-    running = Browser(PROGRAM, tmp_path / "chromium")
-    yield running
-    running.close()
 
 
 def until_lost(page: Page) -> None:

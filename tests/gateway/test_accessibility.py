@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from urllib.parse import quote
 
 import pytest
 
 from tests.gateway import accessibility
-from tests.gateway.browser import Browser, Page, executable
+from tests.gateway.browser import Browser, Page
 
-PROGRAM = executable()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the checks run in a real browser only"),
-]
+pytestmark = pytest.mark.slow
 
 GOOD = """<html lang=en><title>t</title><style>
   body { background: #fff; color: #333; font: 15px sans-serif; } button { min-height: 30px; }
@@ -40,14 +36,6 @@ FAULTS: list[tuple[Callable[[Page], list[str]], str]] = [
     ),
     (accessibility.hidden_focus, "<button style='outline: none'>no ring</button>"),
 ]
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    assert PROGRAM is not None
-    running = Browser(PROGRAM, tmp_path_factory.mktemp("chromium"))
-    yield running
-    running.close()
 
 
 def open_page(browser: Browser, document: str) -> Page:

@@ -24,25 +24,13 @@ from tests.gateway.accessibility import (
     small_texts,
     unnamed_controls,
 )
-from tests.gateway.browser import Browser, Page, executable
+from tests.gateway.browser import Browser, Page
 from tests.gateway.fake_gateway import MIXED, PAGE, FakeGateway, data_document, field, schema
 from tests.gateway.pictures import IMAGE, TIMES, compressed_image, png, shown_pixel
 
-PROGRAM = executable()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
-]
+pytestmark = pytest.mark.slow
 
 HOSTILE = '<img src=x onerror="window.hacked=1">'
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    assert PROGRAM is not None
-    running = Browser(PROGRAM, tmp_path_factory.mktemp("chromium"))
-    yield running
-    running.close()
 
 
 @pytest.fixture(scope="module")

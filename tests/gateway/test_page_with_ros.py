@@ -15,22 +15,17 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CompressedImage
 
 from router.gateway.thread import GatewayThread
-from tests.gateway.browser import Browser, executable
+from tests.gateway.browser import Browser
 from tests.gateway.pictures import IMAGE, TIMES, png, shown_pixel
 from tests.gateway.stage import program
 from tests.ports import free_port
 from tests.ros.opening import open_ros
 from tests.ros.peers import Publisher
 
-PROGRAM = executable()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
-]
+pytestmark = pytest.mark.slow
 
 
-def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path) -> None:
-    assert PROGRAM is not None
+def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path, browser: Browser) -> None:
     port = free_port(kind=socket.SOCK_STREAM)
     gateway = f"camera: {{transport: {{websocket: 127.0.0.1:{port}}}, discovery_period: 50ms}}"
     made = program(tmp_path, gateway)
@@ -39,7 +34,6 @@ def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path)
     with closing(open_ros()) as ros, closing(Publisher("camera/compressed", IMAGE)) as publisher:
         gateways = GatewayThread(ros, made.counters.fresh_counts(), print, print)
         gateways.finish(gateways.prepare(made, lambda *_: lambda _: None))
-        browser = Browser(PROGRAM, tmp_path)
         try:
             page = browser.open(f"http://127.0.0.1:{port}/?topic=/camera/compressed")
             page.until(f"document.title === {json.dumps(f'Gateway camera · 127.0.0.1:{port}')}")
@@ -51,5 +45,4 @@ def test_a_picture_of_ros_is_shown_under_the_name_of_the_gateway(tmp_path: Path)
             assert shown_pixel(page) == [0, 128, 255, 255]
             assert page.complaints() == []
         finally:
-            browser.close()
             gateways.stop()

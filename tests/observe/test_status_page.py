@@ -17,26 +17,14 @@ from router.observe.http import HttpServer
 from router.table.addresses import Address
 from tests.gateway import accessibility
 from tests.gateway.accessibility import DESKTOP, PHONE, SIZES, THEMES
-from tests.gateway.browser import Browser, Page, executable
+from tests.gateway.browser import Browser, Page
 from tests.observe.fake_running import FakeRunning, sim_program
 
-PROGRAM = executable()
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: the page is tested in a real browser only"),
-]
+pytestmark = pytest.mark.slow
 
 BOARD = ("127.0.0.30", 25008)
 LONG_AGO = 1
 """In ns: an endpoint that was heard, and then no more."""
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    assert PROGRAM is not None
-    running = Browser(PROGRAM, tmp_path_factory.mktemp("chromium"))
-    yield running
-    running.close()
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from router.observe.route_map import NodeKind, nodes_and_edges, route_map
 from router.table.model import RouteTable
 from router.tools.graph import LEGEND, dot, mermaid
 from router.tools.graph_svg import svg
-from tests.gateway.browser import Browser, executable
+from tests.gateway.browser import Browser
 from tests.tables import PROTOS, ROUTES
 
 DOT = shutil.which("dot")
@@ -98,15 +98,10 @@ OVERLAPS = """(() => {
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(executable() is None, reason="no Chromium here")
-def test_nothing_in_the_picture_overlaps(table: RouteTable, tmp_path: Path) -> None:
+def test_nothing_in_the_picture_overlaps(table: RouteTable, tmp_path: Path, browser: Browser) -> None:
     file = tmp_path / "routes.html"
     file.write_text(svg(route_map(table), table.path.name, "boat: 2 routes"), encoding="utf-8")
-    browser = Browser(str(executable()), tmp_path)
-    try:
-        assert browser.open(file.as_uri()).evaluate(OVERLAPS) == []
-    finally:
-        browser.close()
+    assert browser.open(file.as_uri()).evaluate(OVERLAPS) == []
 
 
 def test_browsers_that_darken_pages_on_their_own_leave_it_alone(table: RouteTable) -> None:
