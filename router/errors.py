@@ -233,6 +233,11 @@ def nearest_path(path: Path) -> Path | None:
     return path.with_name(near) if near else None
 
 
+def plural(count: int, noun: str) -> str:
+    """`1 error`, `2 errors`."""
+    return f"{count} {noun}" + ("" if count == 1 else "s")
+
+
 def did_you_mean_file(written: str, path: Path) -> str:
     """A hint for `path` that is not there, in the words of who wrote it; empty where none beside it is near."""
     near = nearest_path(path)

@@ -15,7 +15,7 @@ from router.compiler import check_table
 from router.compiler.check import Checked
 from router.compiler.lookup import Definitions
 from router.compiler.program import Program
-from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError
+from router.errors import Code, Diagnostic, Severity, SourceSpan, StartError, plural
 from router.log import logger
 from router.observe.running import ReloadResult
 from router.table.keys import are_same
@@ -136,7 +136,7 @@ class Reloader:
 
 def _refused(findings: Sequence[Diagnostic]) -> ReloadResult:
     errors = sum(finding.severity is Severity.ERROR for finding in findings)
-    return ReloadResult(False, tuple(findings), f"the table has {errors} error{'s' * (errors != 1)}")
+    return ReloadResult(False, tuple(findings), f"the table has {plural(errors, 'error')}")
 
 
 def _unchangeable(now: RouteTable, then: RouteTable) -> list[Diagnostic]:

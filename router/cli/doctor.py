@@ -9,8 +9,9 @@ import sys
 from collections import Counter
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import is_coloured, plural
+from router.cli.findings import is_coloured
 from router.cli.tool_options import add_table, table_path
+from router.errors import plural
 from router.tools.doctor_checks import CheckResult, Grade
 
 SICK = 1

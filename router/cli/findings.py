@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
-from router.errors import Diagnostic, Severity, SourceSpan
+from router.errors import Diagnostic, Severity, SourceSpan, plural
 
 FORMATS = ("text", "json", "github")
 
@@ -45,10 +45,6 @@ def count_line(findings: Sequence[Diagnostic], tables: int, *, strict: bool) -> 
     if len(findings) > errors:
         counts.append(plural(len(findings) - errors, "warning"))
     return f"{', '.join(counts)} in {plural(tables, 'table')}"
-
-
-def plural(count: int, noun: str) -> str:
-    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def as_data(finding: Diagnostic, *, strict: bool) -> dict[str, str | int]:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, OK, Subparsers, add_verb
-from router.cli.findings import plural, print_findings
+from router.cli.findings import print_findings
 from router.cli.tool_options import add_table, say, table_path
-from router.errors import UsageError
+from router.errors import UsageError, plural
 
 if TYPE_CHECKING:
     from router.table.model import RouteTable

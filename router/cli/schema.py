@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 from router.assets import is_installed
 from router.cli import BAD_TABLE, OK, VERBS, Subparsers, add_verb
-from router.cli.findings import plural, print_findings
+from router.cli.findings import print_findings
 from router.cli.tool_options import add_table, table_path
-from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, shown_path
+from router.errors import Located, SourceSpan, TableError, UsageError, did_you_mean, plural, shown_path
 from router.table import load_table
 from router.table.model import EnvelopeSettings
 from router.types.lock_file import ENVELOPE, ONEOF, short_name

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from router.cli import BAD_TABLE, BAD_USAGE, NETWORK_FAULT, OK, Subparsers, add_verb
-from router.cli.findings import plural
 from router.cli.tool_options import add_router_options, running_url
-from router.errors import TransportError
+from router.errors import TransportError, plural
 
 if TYPE_CHECKING:
     from router.observe.snapshot import Snapshot

@@ -12,11 +12,11 @@ from typing import TextIO
 
 from router.cli import BAD_TABLE, BAD_USAGE, OK, Subparsers, add_verb
 from router.cli.findings import as_data as finding_data
-from router.cli.findings import excerpt, github_escaped, is_coloured, plural, print_findings, visible
+from router.cli.findings import excerpt, github_escaped, is_coloured, print_findings, visible
 from router.cli.tool_options import add_styles, add_tables, table_paths
 from router.compiler import check_table
 from router.compiler.lookup import Definitions
-from router.errors import Diagnostic, SourceSpan, TableError, UsageError, shown_path
+from router.errors import Diagnostic, SourceSpan, TableError, UsageError, plural, shown_path
 from router.rehearsal.coverage import Coverage
 from router.rehearsal.reading import ENDINGS, find_test_files, read_test_file
 from router.rehearsal.running import Result, run_tests

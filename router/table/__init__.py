@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from router.errors import Diagnostic, Severity, TableError
+from router.errors import Diagnostic, Severity, TableError, plural
 from router.table.addresses import outside_findings
 from router.table.build import build_table
 from router.table.extends import load_chain
@@ -61,5 +61,5 @@ def summary(table: RouteTable) -> str:
         "endpoint": len(table.endpoints),
         "gateway": len(table.gateways),
     }
-    named = [f"{count} {noun}{'s' * (count != 1)}" for noun, count in counts.items() if count]
+    named = [plural(count, noun) for noun, count in counts.items() if count]
     return ", ".join(named) or "nothing to do"

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import yaml
 
-from router.errors import Code, Diagnostic, SourceSpan
+from router.errors import Code, Diagnostic, SourceSpan, plural
 from router.table.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from router.table.reading import is_text
 from router.table.source import Source
@@ -292,8 +292,7 @@ def _misplaced(source: Source, line: int, neighbours: list[int]) -> Diagnostic:
     own = _indent(source.lines[line])
     if (odd := _odd_line_above(source, line)) is not None:
         line, own, neighbours = odd, _indent(source.lines[odd]), [own]
-    spaces = f"{own} space{'s' * (own != 1)}"
-    what = f"this line is indented by {spaces}, its neighbours by {' or '.join(map(str, neighbours))}"
+    what = f"this line is indented by {plural(own, 'space')}, its neighbours by {' or '.join(map(str, neighbours))}"
     hint = "indent the keys of one mapping alike, and the items of one list"
     return Diagnostic(source.span(line, own, line, own + 1), Code.BAD_YAML, what, hint)
 

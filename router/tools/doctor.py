@@ -13,7 +13,7 @@ from pathlib import Path
 from router.compiler import Checked, check_table
 from router.compiler.metrics import INTENDED_REASONS
 from router.compiler.program import Program
-from router.errors import Severity, TransportError, shown_path
+from router.errors import Severity, TransportError, plural, shown_path
 from router.observe.snapshot import Snapshot
 from router.table import summary
 from router.table.model import RouteTable
@@ -82,8 +82,7 @@ def _table(checked: Checked) -> Iterator[CheckResult]:
         return
     table = checked.program.table
     if warnings:
-        count = f"{warnings} warning{'s' if warnings > 1 else ''}"
-        yield warning("table", count, f"`router validate {shown_path(checked.path)}` shows them")
+        yield warning("table", plural(warnings, "warning"), f"`router validate {shown_path(checked.path)}` shows them")
     yield fine("table", f"{shown_path(checked.path)}: {summary(table)}")
 
 
@@ -169,7 +168,7 @@ class Health:
             if peers:
                 yield problem(
                     "ROS",
-                    f"topic {topic}: no exchange with {peers:.0f} peer{'s' * (peers != 1)} of another {policy}",
+                    f"topic {topic}: no exchange with {plural(int(peers), 'peer')} of another {policy}",
                     f"`ros2 topic info -v {topic}` shows their QoS, `router explain {route}` ours",
                 )
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from router.carrier.library import NATIVE, PYTHON, VARIABLE, LibraryError, load
 from router.compiler.program import Program
-from router.errors import Located, StartError
+from router.errors import Located, StartError, plural
 from router.net.kernel import interface_is_up, port_holder
 from router.recording.writer import recording_sizes
 from router.ros.environment import SHM, obstacles, ros_package_remedy, ros_remedy
@@ -360,9 +360,8 @@ def ros(program: Program) -> Iterator[CheckResult]:
         yield problem("ROS", f"{what}{more}", remedy)
     if not wrong:
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-        types = len({plan.type_name for plan in plans})
-        counted = f"{types} message type{'s' * (types != 1)}"
-        yield fine("ROS", f"{middleware()} in domain {domain}, and {counted} of the table")
+        types = plural(len({plan.type_name for plan in plans}), "message type")
+        yield fine("ROS", f"{middleware()} in domain {domain}, and {types} of the table")
 
 
 def carrier(variables: Mapping[str, str]) -> Iterator[CheckResult]:

@@ -14,7 +14,7 @@ from router.compiler.expressions.operators import constant
 from router.compiler.expressions.scope import MESSAGE, SOURCE, ExpressionError, Scope, Typed
 from router.compiler.expressions.syntax import Parsed, dotted, forbidden
 from router.compiler.source import attribute, call, load
-from router.errors import Code, Located, SourceSpan, did_you_mean, nearest
+from router.errors import Code, Located, SourceSpan, did_you_mean, nearest, plural
 from router.table.model import Choices, Expression
 from router.table.nodes import TextPlace
 from router.types.model import Enum, Int, List, MessageType, String, Type
@@ -405,7 +405,7 @@ def _bounds(function: Function, span: SourceSpan, expected: Type | None) -> list
 def _want_count(function: Function, count: int, span: SourceSpan) -> None:
     takes = len(function.parameters)
     if count < takes or (count > takes and not function.variadic):
-        wanted = f"{takes} argument{'s' * (takes != 1)}" + " or more" * function.variadic
+        wanted = plural(takes, "argument") + " or more" * function.variadic
         message = f"{function.name}() takes {wanted}, not {count}"
         raise ExpressionError(span, Code.WRONG_ARGUMENTS, message, f"write {function.signature}")
 
