@@ -264,6 +264,14 @@ def rate_text(rate: float) -> str:
     return f"{rate:.1f}" if 0 < rate < 9.95 else f"{rate:.0f}"
 
 
+def shortened(name: str, letters: int) -> str:
+    """A name with its middle left out where it is too long: what names differ in is mostly at an end."""
+    if len(name) <= letters:
+        return name
+    kept = letters - 1
+    return f"{name[: kept - kept // 2]}…{name[len(name) - kept // 2 :]}"
+
+
 def protobuf_tree(message: Any, kind: MessageType, digits: int | None = None) -> Mapping[str, Tree]:
     """The fields of a protobuf message that are not their default. Lists are whole, each element a member: `x[0]`."""
     tree: dict[str, Tree] = {}

@@ -18,7 +18,17 @@ from std_msgs.msg import Byte, ByteMultiArray, Empty, Header, String
 from router.engine.wire import wire_of_protos
 from router.errors import UsageError
 from router.types.protobuf import PayloadCase
-from router.values import compact, float_text, protobuf_tree, rate_text, ros_json, ros_tree, set_fields, words
+from router.values import (
+    compact,
+    float_text,
+    protobuf_tree,
+    rate_text,
+    ros_json,
+    ros_tree,
+    set_fields,
+    shortened,
+    words,
+)
 
 PROTOS = Path(__file__).parent / "protos"
 
@@ -204,3 +214,8 @@ def test_json_has_numbers_for_octets_and_words_for_infinities() -> None:
     assert ros_json(ByteMultiArray(data=[b"\x07"]))["data"] == [7]
     assert ros_json(Point(x=math.inf, y=-math.inf)) == {"x": "Infinity", "y": "-Infinity", "z": 0.0}
     assert ros_json(String(data="a b")) == {"data": "a b"}
+
+
+def test_a_long_name_keeps_its_beginning_and_end() -> None:
+    assert shortened("sensor_board_diagnostics", 18) == "sensor_bo…gnostics"
+    assert shortened("imu_data", 18) == "imu_data"

@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drawn(table: RouteTable, suffix: str) -> str:
-    from router.observe.route_map import route_map
     from router.tools.graph import dot, mermaid
+    from router.tools.graph_layout import route_map
     from router.tools.graph_svg import svg
 
     title = table.path.name

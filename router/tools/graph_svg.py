@@ -9,8 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import escape, quoteattr
 
-from router.observe.route_map import COLUMNS, FONT, HEAD, LETTER, PAD, Box, Curve, Edge, NodeKind, RouteMap
+from router.observe.route_map import COLUMNS, Edge, NodeKind
 from router.tools.graph import LEGEND
+from router.tools.graph_layout import FONT, HEAD, LETTER, PAD, Box, Curve, RouteMap
 
 _STYLE = """
 .route-map { --ground: #fff; --box: #f3f4f6; --text: #000; --faint: #505050; --line: #5d6470;

@@ -9,10 +9,9 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from router.observe.route_map import shortened
 from router.tools.top import Order, RouteRow, TargetRow, View, ordered
 from router.tools.top_words import reasons_text
-from router.values import rate_text
+from router.values import rate_text, shortened
 
 Cell = Callable[[RouteRow], Text]
 

@@ -16,11 +16,10 @@ from dataclasses import dataclass
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from router.observe.route_map import shortened
 from router.tools.top import Order, View, unwanted
 from router.tools.top_table import Column, RouteTable
 from router.tools.top_words import age_text, latency_text, reasons_text
-from router.values import rate_text
+from router.values import rate_text, shortened
 
 _ENDPOINT_LINES = 4
 """At most, on a screen; what is silent is also said above them."""

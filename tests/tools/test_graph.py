@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from router.compiler import check_table
-from router.observe.route_map import NodeKind, nodes_and_edges, route_map
+from router.observe.route_map import NodeKind, nodes_and_edges
 from router.table.model import RouteTable
 from router.tools.graph import LEGEND, dot, mermaid
+from router.tools.graph_layout import route_map
 from router.tools.graph_svg import svg
 from tests.gateway.browser import Browser
 from tests.tables import PROTOS, ROUTES
