@@ -1,9 +1,12 @@
-"""What the demo needs free on this machine: the table's addresses, and a ROS domain."""
+"""What the demo needs free on this machine: the table's addresses, and a ROS domain; or a network of its own."""
 
 from __future__ import annotations
 
+import os
 import random
+import shutil
 import socket
+import subprocess
 
 from router.errors import UsageError
 from router.table.addresses import Address
@@ -55,3 +58,12 @@ def free_ros_domain() -> int:
                 continue
             return domain
     raise UsageError("all ROS domains of this machine are in use")
+
+
+def alone() -> list[str] | None:
+    """The command that runs another one in a network namespace with loopback only; None where that is not possible."""
+    if any(shutil.which(name) is None for name in ("unshare", "ip")):
+        return None
+    user = ["--map-root-user"] if os.geteuid() else []
+    command = ["unshare", "--net", *user, "sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
+    return command if subprocess.run([*command, "true"], capture_output=True, check=False).returncode == 0 else None

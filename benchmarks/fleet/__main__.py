@@ -14,7 +14,6 @@ import json
 import os
 import signal
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,6 +28,7 @@ from benchmarks.fleet.figures import Figures, carried, counted, dropped, first_a
 from benchmarks.fleet.report import report, wrong
 from benchmarks.fleet.site import PATIENCE, Fleet, cpu_ns, memory
 from benchmarks.versus.results import commit, machine
+from demo.places import alone
 from router.observe.snapshot import Snapshot
 
 DOWN = 2.0
@@ -56,7 +56,6 @@ def main() -> int:
     args = arguments()
     if INSIDE not in os.environ:
         enter_namespace()
-    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)  # noqa: S607 - as found in PATH
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that what was started is ended too
     results: Figures = {"machine": machine(), "commit": commit(), "arguments": {**vars(args), "json": None}}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
@@ -79,9 +78,10 @@ def main() -> int:
 
 def enter_namespace() -> None:
     """Run this program again in a network namespace of its own."""
-    user = ["--map-root-user"] if os.geteuid() else []
+    if (wrapper := alone()) is None:
+        raise SystemExit("a fleet needs `unshare`, `ip` and the right to make a network namespace")
     os.environ[INSIDE] = "1"
-    os.execvp("unshare", ["unshare", "--net", *user, sys.executable, "-m", "benchmarks.fleet", *sys.argv[1:]])  # noqa: S606, S607
+    os.execvp(wrapper[0], [*wrapper, sys.executable, "-m", "benchmarks.fleet", *sys.argv[1:]])  # noqa: S606
 
 
 # -- phases --------------------------------------------------------------------------------------------------------

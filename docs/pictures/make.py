@@ -26,7 +26,7 @@ from rich.console import Console
 
 from demo.children import Child
 from demo.expected import checked_table, page_of
-from demo.places import free_ros_domain, taken_places
+from demo.places import alone, free_ros_domain, taken_places
 from router.errors import RouterError, TransportError
 from router.table.model import RouteTable
 from router.tools.running_router import metrics, url_of
@@ -82,25 +82,15 @@ def main() -> int:
     args = parser.parse_args()
     folder = args.folder.resolve()
     os.chdir(ROOT)
-    if _INSIDE not in os.environ and (wrapper := _namespace()):
+    if _INSIDE not in os.environ and (wrapper := alone()):
         command = [sys.executable, "-m", "docs.pictures.make", str(folder), "--settled", str(args.settled)]
-        inside = [*wrapper, "sh", "-c", 'ip link set lo up && exec "$@"', "sh", *command]
-        return subprocess.run(inside, env=os.environ | {_INSIDE: "1"}, check=False).returncode
+        return subprocess.run([*wrapper, *command], env=os.environ | {_INSIDE: "1"}, check=False).returncode
     try:
         make(folder, args.settled)
     except RouterError as error:
         print(f"pictures: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-def _namespace() -> list[str] | None:
-    """The command that runs another one in a network namespace; None where that is not possible."""
-    options = ("--net",) if os.geteuid() == 0 else ("--net", "--map-root-user")
-    if (program := shutil.which("unshare")) is None or shutil.which("ip") is None:
-        return None
-    tried = subprocess.run([program, *options, "true"], capture_output=True, check=False)
-    return [program, *options] if tried.returncode == 0 else None
 
 
 def make(folder: Path, settled: float) -> None:
