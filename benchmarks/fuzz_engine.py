@@ -21,7 +21,8 @@ from pathlib import Path
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine import MAX_DATAGRAM, InboundEngine, Report
+from router.engine import InboundEngine, Report
+from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import Ledger, Rig
 from tests.tables import ROUTES
 

@@ -17,7 +17,7 @@ import yaml
 from benchmarks.versus.building import PROGRAMS
 from benchmarks.versus.contenders import PAYLOADS, datagrams
 from benchmarks.versus.helpers import ALL_TOPICS
-from router.engine.slow_path import LEN
+from router.types.wire import LEN
 from tests.engine.wire import tag
 from tests.tables import PROTOS
 

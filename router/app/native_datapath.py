@@ -45,7 +45,7 @@ from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
-from router.engine import MAX_DATAGRAM, OutboundEngine, PartEngine
+from router.engine import OutboundEngine, PartEngine
 from router.engine.binding import State
 from router.engine.deadman import feeder
 from router.engine.pacing import RateLimit
@@ -55,6 +55,7 @@ from router.log import logger
 from router.net.udp import Listener, Sender
 from router.recording.mirror import Mirror, Mirrored
 from router.table import model
+from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:
     from router.ros.endpoints import RosChange
@@ -415,7 +416,7 @@ class NativeDatapath:
         program = wiring.program
         routed = {number: handlers[0].case.name for number, handlers in program.inbound.items()}
         try:
-            case, _ = SlowPath(program, program.counters.fresh_counts(), listener, routed).parse(data)
+            case, _, _ = SlowPath(program, program.counters.fresh_counts(), listener, routed).parse(data)
         except Rejected as rejected:
             return str(rejected)
         return case

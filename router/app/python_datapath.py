@@ -20,7 +20,7 @@ from router.app.wiring import (
 )
 from router.clock import monotonic_ns
 from router.compiler.program import DeadmanPlan, Program
-from router.engine import MAX_DATAGRAM, InboundEngine, OutboundEngine
+from router.engine import InboundEngine, OutboundEngine
 from router.engine.binding import State
 from router.engine.deadman import Deadman, commander, feeder
 from router.engine.dispatch import Receive
@@ -28,6 +28,7 @@ from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, ReceiveThread
 from router.net.udp import Listener, Sender
 from router.recording.mirror import Mirror
 from router.table import model
+from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:
     from router.ros.endpoints import RosChange

@@ -22,7 +22,6 @@ from router.carrier.schema import CannotCarry, wire_schema
 from router.clock import monotonic_ns
 from router.compiler.program import Program
 from router.compiler.topics import DIAGNOSTICS
-from router.engine import MAX_DATAGRAM
 from router.log import logger
 from router.net.udp import Listener
 from router.observe.reports import Reporter
@@ -30,6 +29,7 @@ from router.observe.running import ReloadResult, Running
 from router.recording.mirror import Mirror
 from router.table.addresses import Address
 from router.threads import DaemonThread, background_threads
+from router.types.framing import MAX_DATAGRAM
 
 if TYPE_CHECKING:  # prometheus_client would take a tenth of the time until the ports are bound
     from prometheus_client.metrics_core import Metric as Family

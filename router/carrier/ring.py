@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 
 from router.carrier.structures import MessageRecord
-from router.engine import MAX_DATAGRAM
+from router.types.framing import MAX_DATAGRAM
 
 LONGEST_RECORD = ctypes.sizeof(MessageRecord) + MAX_DATAGRAM + 8
 

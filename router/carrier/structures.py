@@ -337,7 +337,7 @@ class CommandSet(ctypes.Structure):
 
 
 class MessageRecord(ctypes.Structure):
-    """`struct message_record` in carrier.h; the datagram follows."""
+    """`struct message_record` in carrier.h; the envelope follows."""
 
     _fields_ = (
         ("size", c_uint32),
@@ -352,8 +352,6 @@ class MessageRecord(ctypes.Structure):
         ("start", c_uint32),
         ("payload_length", c_uint32),
         ("handler", c_uint32),
-        ("whole", c_uint32),
-        ("reserved", c_uint32),
     )
 
 

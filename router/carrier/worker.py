@@ -17,7 +17,7 @@ from router.engine.dispatch import ServePart
 
 _TRIES, _TRY_S = 100, 0.0002
 
-_RECORD = Struct("@IIQqqqIIIIIIII")
+_RECORD = Struct("@IIQqqqIIIIII")
 """`struct message_record`."""
 
 
@@ -151,8 +151,6 @@ class Worker:
                 start,
                 payload_length,
                 number,
-                _,
-                _,
             ) = _RECORD.unpack_from(records, position)
             if stage is None or generation != stage.generation:
                 self._switch(generation)

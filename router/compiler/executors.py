@@ -1,6 +1,6 @@
 """Which executor serves a destination: the carrier, or Python.
 
-The carrier forwards datagrams unchanged. It knows `ttl`, `max_rate`, deadmen and `trim_trailing_zeros`, but evaluates
+The carrier forwards envelopes as they were encoded. It knows `ttl`, `max_rate`, deadmen and `trim_trailing_zeros`, but evaluates
 no expression and holds nothing back. An endpoint gets datagrams in the order of their arrival, whatever routes they
 take, so all its targets from UDP have the same executor: Python, if one of them needs it.
 """

@@ -249,7 +249,7 @@ class HandlerSource:
             return write_message(self.out, target.plan, name)
         else:
             data = write_envelope(self.out, target.plan, self.case, name)
-        return f"{data}.rstrip(ZERO)" if target.endpoint is not None and target.endpoint.trim_trailing_zeros else data
+        return f"trimmed({data})" if target.endpoint is not None and target.endpoint.trim_trailing_zeros else data
 
     def _send(self, name: str, target: CheckedTarget) -> None:
         arguments = self._data(name, target)

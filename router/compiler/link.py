@@ -42,6 +42,7 @@ from router.compiler.program import (
 )
 from router.compiler.topics import qos_of
 from router.table.model import ANY, ROS, RouteTable, Topic
+from router.types.framing import trimmed
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
 
@@ -219,7 +220,7 @@ def _route_deadman(route: str, checked: CheckedDeadman, table: RouteTable) -> De
     datagrams = []
     for to in checked.settings.to:
         trims = table.endpoints[to.value].trim_trailing_zeros
-        datagrams.append((to.value, checked.datagram.rstrip(b"\0") if trims else checked.datagram))
+        datagrams.append((to.value, trimmed(checked.datagram) if trims else checked.datagram))
     return deadman_plan(route, checked.settings, datagrams)
 
 

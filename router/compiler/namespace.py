@@ -27,6 +27,7 @@ from router.compiler.cdr.primitives import (
 from router.compiler.expressions.functions import FUNCTIONS
 from router.compiler.source import Source
 from router.errors import MappingError, SourceSpan
+from router.types.framing import trimmed
 
 Values = TypeVar("Values", bound=Sized)
 
@@ -99,7 +100,7 @@ NAMESPACE: Mapping[str, object] = {
     **{function.__name__: function for function in _CALLED},
     "HEADER": HEADER,
     "CDR_LE": CDR_LE,
-    "ZERO": b"\0",
+    "trimmed": trimmed,
 }
 
 

@@ -2,6 +2,5 @@
 
 from router.engine.delivery import Report
 from router.engine.dispatch import InboundEngine, OutboundEngine, PartEngine
-from router.engine.slow_path import MAX_DATAGRAM
 
-__all__ = ["MAX_DATAGRAM", "InboundEngine", "OutboundEngine", "PartEngine", "Report"]
+__all__ = ["InboundEngine", "OutboundEngine", "PartEngine", "Report"]

@@ -17,14 +17,16 @@ from router.compiler.program import Handler, Program, TargetPlan
 from router.engine.binding import EngineContext, Handle, bind, unbind
 from router.engine.delivery import Outcome, Report
 from router.engine.freshness import Freshness
-from router.engine.slow_path import LEN, MAX_DATAGRAM, Rejected, SlowPath, restored
+from router.engine.slow_path import Rejected, SlowPath
+from router.types.framing import MAX_DATAGRAM
+from router.types.wire import LEN
 
 Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]
 Take = Callable[[bytes, int], None]
 
 ServePart = Callable[[bytes | None, bytes, int, int, str, int], None]
-"""Called with the payload, or None where it is not the envelope's only field; the datagram as it was received; the
+"""Called with the payload, or None where it is not the envelope's only field; the restored envelope; the
 wall clock and the monotonic clock at its receipt; the sender's name in expressions; and the monotonic time of its
 arrival in the kernel. Times in ns."""
 
@@ -120,7 +122,7 @@ class InboundEngine:
                 message = case.parse(data[start:])
             except (LookupError, ProtobufError):  # not the usual datagram
                 try:
-                    case, message = parse_slowly(data)
+                    case, message, data = parse_slowly(data)
                 except Rejected as rejected:
                     reject(rejected.reason, peer, str(rejected))
                     return
@@ -226,10 +228,7 @@ class PartEngine:
 
         def serve(payload: bytes | None, data: bytes, received_at: int, now: int, source: str, born: int) -> None:
             try:
-                if payload is not None:
-                    message = parse(payload)
-                else:
-                    message = getattr(parse_envelope(restored(data, MAX_DATAGRAM)), name)
+                message = parse(payload) if payload is not None else getattr(parse_envelope(data), name)
             except ProtobufError as error:
                 for outcome in outcomes:
                     outcome.dropped("mapping_error", error)

@@ -1,8 +1,4 @@
-"""Datagrams that the fast path does not take: repaired where the listener allows it, then parsed by protobuf.
-
-The protocol lets a sender leave out the zeros at the end of an envelope, and boards may send frames of a fixed size,
-padded with zeros. Both can be undone, because a tag is never zero and the last field states its length.
-"""
+"""Datagrams that the fast path does not take: restored where the listener allows it, then parsed by protobuf."""
 
 from __future__ import annotations
 
@@ -16,17 +12,9 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 from router.compiler.metrics import UNKNOWN_CASE
 from router.compiler.program import Program
 from router.table.model import Framing
+from router.types.framing import MAX_DATAGRAM, restored
 
 Case = TypeVar("Case")
-
-MAX_DATAGRAM = 16 * 1024
-"""The longest accepted datagram, in bytes; a longer one is rejected as `truncated`."""
-
-VARINT, I64, LEN, I32 = 0, 1, 2, 5
-"""Wire types of protobuf."""
-
-_FIXED = {I64: 8, I32: 4}
-_LONGEST_VARINT = 10
 
 
 class Rejected(Exception):
@@ -51,20 +39,20 @@ class SlowPath(Generic[Case]):
         self._counts = counts
         self._cases = cases
 
-    def parse(self, data: bytes) -> tuple[Case, Message]:
-        """Return the payload case and the payload of any datagram. Raises Rejected."""
+    def parse(self, data: bytes) -> tuple[Case, Message, bytes]:
+        """Return the payload case, the payload and the restored envelope of any datagram. Raises Rejected."""
         if len(data) > MAX_DATAGRAM:
             raise Rejected("truncated", f"{len(data)} bytes")
         if not data:
             raise Rejected("empty")
-        whole = restored(data, MAX_DATAGRAM) if self._repairs else data
+        whole = restored(data) if self._repairs else data
         try:
             envelope = self._envelope.message_class.FromString(whole)
         except ProtobufError as error:
             raise Rejected("malformed", str(error)) from error
         if len(whole) != len(data):
             self._counts[self._padded] += 1
-        return self._routed(envelope)
+        return *self._routed(envelope), whole
 
     def _routed(self, envelope: Message) -> tuple[Case, Message]:
         name = envelope.WhichOneof(self._envelope.oneof)
@@ -98,45 +86,3 @@ def why_no_payload(envelope: Message, cases: Container[int]) -> tuple[str, str]:
     if known := [number for number in numbers if number in cases]:
         return "malformed", f"field {known[0]} is no message here"
     return "unknown_case", f"field {numbers[0]}"
-
-
-def restored(data: bytes, limit: int) -> bytes:
-    """Return the envelope with the trailing zeros that it had when it was encoded.
-
-    Returns `data` itself where that is complete, or cannot be such an envelope: a cut tag or length, groups, or a field
-    that would make it longer than `limit` bytes. A datagram that was cut inside its last field looks like one whose
-    zeros were removed; its payload then most often has a zero for a tag, which the parser refuses.
-    """
-    position, size = 0, len(data)
-    try:
-        while position < size:
-            if data[position] == 0:
-                return data if data[position:].strip(b"\0") else data[:position]
-            tag, position = _varint(data, position)
-            wire_type = tag & 7
-            if wire_type in _FIXED:
-                position += _FIXED[wire_type]
-            elif wire_type not in (VARINT, LEN):
-                return data
-            elif position == size:
-                position += 1  # the value or the length was zero
-            else:
-                value, position = _varint(data, position)
-                position += value if wire_type == LEN else 0
-    except IndexError:
-        return data
-    return data if position > limit else data.ljust(position, b"\0")
-
-
-def _varint(data: bytes, position: int) -> tuple[int, int]:
-    """Return a varint and the position behind it. Raises IndexError for one that is cut or too long.
-
-    The last byte of a varint is not zero unless it is the only one; so one that is cut lacks more than zeros.
-    """
-    value = 0
-    for index in range(_LONGEST_VARINT):
-        byte = data[position + index]
-        value |= (byte & 0x7F) << (7 * index)
-        if byte < 0x80:
-            return value, position + index + 1
-    raise IndexError

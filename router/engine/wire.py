@@ -8,10 +8,10 @@ from pathlib import Path
 from google.protobuf.message import DecodeError as ProtobufError
 from google.protobuf.message import Message
 
-from router.engine import MAX_DATAGRAM
-from router.engine.slow_path import restored, why_no_payload
+from router.engine.slow_path import why_no_payload
 from router.errors import DecodeError, Located, SourceSpan, UsageError, did_you_mean, shown_path
 from router.table.model import RouteTable
+from router.types.framing import MAX_DATAGRAM, restored
 from router.types.lock_file import ENVELOPE, ONEOF
 from router.types.protobuf import Envelope, PayloadCase, find_envelope, load_protos
 
@@ -55,7 +55,7 @@ class Wire:
             raise DecodeError("empty")
         if len(datagram) > MAX_DATAGRAM:
             raise DecodeError(f"truncated: {len(datagram)} bytes, the router takes {MAX_DATAGRAM}")
-        whole = restored(datagram, MAX_DATAGRAM)
+        whole = restored(datagram)
         try:
             outer = self.envelope.message_class.FromString(whole)
         except ProtobufError as error:

@@ -21,12 +21,11 @@ from google.protobuf.message import Message
 from mcap.opcode import Opcode
 from mcap.records import Chunk as ChunkRecord
 
-from router.engine import MAX_DATAGRAM
-from router.engine.slow_path import LEN
 from router.recording.channels import Channels, Datagram
 from router.recording.mirror import Classifier, Mirrored, Peer
+from router.types.framing import MAX_DATAGRAM
 from router.types.protobuf import PayloadCase
-from router.types.wire import varint
+from router.types.wire import LEN, varint
 
 LONGEST_CHUNK = 4 << 20
 """Bytes, not compressed."""

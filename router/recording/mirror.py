@@ -15,11 +15,10 @@ from google.protobuf.message import Message
 
 from router.clock import wall_ns
 from router.compiler.network import recognisers
-from router.engine import MAX_DATAGRAM
-from router.engine.slow_path import LEN, restored
 from router.table.model import Framing, RouteTable
+from router.types.framing import MAX_DATAGRAM, restored
 from router.types.protobuf import Envelope, PayloadCase
-from router.types.wire import varint
+from router.types.wire import LEN, varint
 
 Peer = tuple[str, int]
 Receive = Callable[[bytes, Peer], None]
@@ -167,7 +166,7 @@ class Classifier:
         if len(data) > MAX_DATAGRAM or not self.envelope.cases:
             return None
         if listener in self._trimming:
-            data = restored(data, MAX_DATAGRAM)
+            data = restored(data)
         try:
             envelope = self.envelope.message_class.FromString(data)
         except ProtobufError:

@@ -16,12 +16,11 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Footer, Header, McapRecord, Message, Metadata
 from mcap.stream_reader import StreamReader
 
-from router.engine.slow_path import LEN
 from router.errors import UsageError
 from router.recording.channels import Datagram, Holds
 from router.recording.mirror import Peer
 from router.recording.writer import LIBRARY, METADATA
-from router.types.wire import varint
+from router.types.wire import LEN, varint
 
 _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupError, ValueError, RuntimeError)
 """What reading raises for what no recorder wrote; lz4, which `mcap recover` may have used, a RuntimeError."""

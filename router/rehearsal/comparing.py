@@ -16,6 +16,7 @@ from router.rehearsal import cdr
 from router.rehearsal.fields import Difference, Path, offset, path_text, shown
 from router.rehearsal.rehearsal import START, Dropped, Event, Filtered, Published, Received, Rejected, Sent
 from router.rehearsal.steps import Counts, Deliveries, Delivery, Expected, Step
+from router.types.framing import restored, trimmed
 from router.types.model import MessageType
 
 _LISTED = 3
@@ -201,7 +202,8 @@ class Comparison:
                     yield self._different_field(difference, event)
         elif expected.is_unchanged:
             trims = self._table.endpoints[event.target].trim_trailing_zeros
-            if event.data not in {data.rstrip(b"\0") if trims else data for _, data in outcome.given}:
+            wholes = [restored(data) for _, data in outcome.given]
+            if event.data not in [trimmed(whole) if trims else whole for whole in wholes]:
                 message = f"{self._described(event)}, not what was given"
                 yield Failure(expected.span, message, self._related(event))
         elif expected.data is not None:

@@ -92,7 +92,6 @@ REJECTED = {
     "the largest datagram": ("truncated", b"\xaa" * 65_507),
 }
 ACCEPTED = {
-    "16 KiB": PH.ljust(16 * 1024, b"\0"),
     "a long tag": b"\x8a\x80\x00" + PH[1:],
     "a long length": b"\x0a\x91\x80\x00" + PH[2:],
     "an unknown field in the payload": bytes.fromhex("0a08 0d713dda40 c83e07".replace(" ", "")),
@@ -102,6 +101,10 @@ ACCEPTED = {
     "the payload in two parts": bytes.fromhex("0a050d713dda40 0a022001".replace(" ", "")),
 }
 """All of them a ph_info to any protobuf parser, and forwarded as they are."""
+REPAIRED = {
+    "padded to 16 KiB": (PH.ljust(16 * 1024, b"\0"), PH),
+    "a length that lacks its last zero": (b"\x0a\x80", b"\x0a\x80\0"),
+}
 
 
 def test_every_series_exists_at_zero_before_the_first_datagram(rover: Rover) -> None:
@@ -187,6 +190,17 @@ def test_whatever_protobuf_can_read_is_forwarded_as_it_is(rover: Rover, datagram
     counted = rover.site.settle(before, 1)
     assert counted[key("sent_bytes", route="ph_info", destination="basestation")] == len(datagram)
     assert rover.site.waiting() == {}
+
+
+@pytest.mark.parametrize(("datagram", "whole"), REPAIRED.values(), ids=REPAIRED)
+def test_what_is_repaired_is_forwarded_as_it_was_encoded(rover: Rover, datagram: bytes, whole: bytes) -> None:
+    before = rover.site.scrape()
+    rover.site.send("sensor_board", datagram)
+    assert rover.site.receive("basestation") == whole
+    counted = rover.site.settle(before, 1)
+    assert counted[key("datagrams_padded", listener="rover")] == 1
+    assert counted[key("received_bytes", listener="rover")] == len(datagram)
+    assert counted[key("sent_bytes", route="ph_info", destination="basestation")] == len(whole)
 
 
 @pytest.mark.parametrize("case", FLOWS)
@@ -381,17 +395,18 @@ def play(site: Site, peer: RosPeer, samples: list[Sample]) -> None:
             earliest = time()
             site.send(flow.source, datagram)
             for destination in flow.destinations:
-                assert site.receive(destination) == datagram
+                assert site.receive(destination) == sent.datagram
             arrived = dict(peer.receive() for _ in expected)
             stamps = [without_stamp(message) for message in arrived.values()]
             assert all(earliest - CLOCK_STEP <= stamp <= time() for stamp in stamps if stamp is not None)
             assert spelled(arrived) == spelled(expected)
-            count(counted, sent.case, len(datagram), repaired=repaired)
+            count(counted, sent, len(datagram), repaired=repaired)
     assert site.settle(before, counted[key("datagrams_received", listener="rover")]) == counted
     assert site.waiting() == {}
 
 
-def count(counted: Counter[str], case: str, size: int, *, repaired: bool) -> None:
+def count(counted: Counter[str], sent: Sample, size: int, *, repaired: bool) -> None:
+    case = sent.case
     flow = FLOWS[case]
     counted[key("datagrams_received", listener="rover")] += 1
     counted[key("received_bytes", listener="rover")] += size
@@ -400,7 +415,7 @@ def count(counted: Counter[str], case: str, size: int, *, repaired: bool) -> Non
     counted[key("messages_received", route=case, source=flow.source)] += 1
     for destination in flow.destinations:
         counted[key("datagrams_sent", route=case, destination=destination)] += 1
-        counted[key("sent_bytes", route=case, destination=destination)] += size
+        counted[key("sent_bytes", route=case, destination=destination)] += len(sent.datagram)
     for topic in topics_of(case):
         counted[key("messages_published", route=case, topic=topic)] += 1
 

@@ -31,7 +31,7 @@ bool seam_compose(struct publishing *publishing, const struct publish_route *rou
     if (!record) return false;
     record->received_at = received_at;
     record->is_single = is_single;
-    record->length = record->payload_length = record->whole = size;
+    record->length = record->payload_length = size;
     if (size) memcpy(record + 1, data, size);
     struct served served = {.record = record, .route = route, .expires = NEVER};
     bool is_made = is_composed(publishing, &served, &route->targets[target]);

@@ -12,7 +12,7 @@ from router.carrier.library import load
 from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import Program
-from router.engine import MAX_DATAGRAM
+from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import Rig, program
 from tests.tables import PROTOS
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from router.carrier.schema import CannotCarry, wire_schema
 from router.compiler.program import Program
-from router.engine import MAX_DATAGRAM
+from router.types.framing import MAX_DATAGRAM
 from tests.carrier.datagrams import GROUP, GROUP_END, Maker
 from tests.carrier.decisions import HEAD, SCHEMAS, CarrierSide, Decision, PythonSide, table
 from tests.engine.rig import program

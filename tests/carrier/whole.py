@@ -23,9 +23,10 @@ from router.carrier.publishing import PublishRoutes
 from router.carrier.ring import Ring
 from router.carrier.sender import NativeSender
 from router.compiler.program import Handler, Program, TargetPlan
-from router.engine import MAX_DATAGRAM, PartEngine
+from router.engine import PartEngine
 from router.engine.binding import State
 from router.engine.pacing import RateLimit
+from router.types.framing import MAX_DATAGRAM
 from tests.carrier.building import sanitizing
 from tests.carrier.commanding import Serialized
 from tests.carrier.datagrams import Maker

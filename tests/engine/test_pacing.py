@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine import MAX_DATAGRAM
 from router.engine.pacing import BURST, LEAST_OVERDRAFT, LEAST_QUEUE, NS, OVERDRAFT, Pacer
 from router.table.model import Priority
+from router.types.framing import MAX_DATAGRAM
 from tests.engine.rig import Destination, play, serve
 
 COMMAND, TELEMETRY, BULK = Priority

@@ -9,10 +9,10 @@ from prometheus_client.metrics_core import Metric as Family
 
 from router.compiler import check_table
 from router.compiler.program import Program
-from router.engine import MAX_DATAGRAM
 from router.observe.metrics import CountersCollector
 from router.observe.running import ReloadResult
 from router.recording.mirror import Mirror
+from router.types.framing import MAX_DATAGRAM
 from tests.tables import ROUTES
 
 RELOADED = ReloadResult(True, (), "nothing has changed")

@@ -5,11 +5,10 @@ from __future__ import annotations
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
-from router.engine import MAX_DATAGRAM
 from router.engine.binding import bind
 from router.engine.freshness import Freshness
-from router.engine.slow_path import restored
 from router.table.model import Framing
+from router.types.framing import MAX_DATAGRAM, restored
 from tests.engine.rig import Rig
 
 
@@ -45,14 +44,14 @@ class Naive:
         if not data:
             return "empty"
         [plan] = [plan for plan in self.program.listeners if plan.name == listener]
-        whole = restored(data, MAX_DATAGRAM) if plan.framing is Framing.ZERO_TRIMMED else data
+        whole = restored(data) if plan.framing is Framing.ZERO_TRIMMED else data
         try:
             message = self.program.envelope.message_class.FromString(whole)
         except DecodeError:
             return "malformed"
         if whole != data:
             self._add(1, "datagrams_padded", listener)
-        return self._route(message, data, peer, listener)
+        return self._route(message, whole, peer, listener)
 
     def _route(self, message: Message, data: bytes, peer: tuple[str, int], listener: str) -> str | None:
         name = message.WhichOneof("payload")

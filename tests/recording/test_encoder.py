@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from router.engine import MAX_DATAGRAM
 from router.recording.channels import MOST_CHANNELS, Channels
 from router.recording.encoder import Encoder
 from router.recording.mirror import MirroredDatagram
+from router.types.framing import MAX_DATAGRAM
 from router.types.wire import varint
 from tests.recording.recorder_rig import (
     MILLISECOND,

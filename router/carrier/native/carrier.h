@@ -117,7 +117,7 @@ struct change {
     uint32_t reserved;
 };
 
-/* A message for a part, as it stands in the ring. The bytes of the datagram follow, with the zeros that were put back. */
+/* A message for a part, as it stands in the ring. The bytes of the envelope follow, as they are forwarded. */
 struct message_record {
     uint32_t size, generation;
     const struct part *part;
@@ -128,8 +128,6 @@ struct message_record {
     uint32_t length;      /* of the datagram */
     uint32_t start, payload_length; /* of the payload, where it is the only field */
     uint32_t handler;
-    uint32_t whole; /* of the envelope, as in struct envelope */
-    uint32_t reserved;
 };
 
 /* A received datagram in the mirror; up to MAX_DATAGRAM + 1 bytes of it follow. */

@@ -189,33 +189,31 @@ static bool is_zeros(const struct bytes *bytes) {
     return true;
 }
 
-/* The size that the envelope had when it was encoded. The protocol lets a sender leave out the zeros at the end, and
- * boards may send frames of a fixed size, padded with zeros. Both can be undone, because a tag is never zero and the
- * last field states its length.
- *
- * It is the size of the datagram if that is complete, or cannot be such an envelope: a cut tag or length, groups, or a
- * field that would make it longer than MAX_DATAGRAM. */
-static size_t restored_size(const uint8_t *data, size_t size) {
+size_t envelope_restored_size(const uint8_t *data, size_t size) {
     struct bytes rest = {data, data + size};
     while (rest.at < rest.end) {
-        uint64_t tag, value;
+        uint64_t tag, length = 0;
+        size_t missing = 0; /* zeros of a length or value */
         if (*rest.at == 0) return is_zeros(&rest) ? (size_t)(rest.at - data) : size;
         if (!read_varint(&rest, LONGEST_VARINT, &tag)) return size;
         switch (tag & 7) {
-        case I64: value = 8; break;
-        case I32: value = 4; break;
+        case I64: length = 8; break;
+        case I32: length = 4; break;
         case VARINT:
+            missing = rest.at == rest.end;
+            if (!missing && !read_varint(&rest, LONGEST_VARINT, &length)) return size;
+            length = 0;
+            break;
         case LEN:
-            if (rest.at == rest.end) return size < MAX_DATAGRAM ? size + 1 : size; /* the value or length was zero */
-            if (!read_varint(&rest, LONGEST_VARINT, &value)) return size;
-            if ((tag & 7) == VARINT) value = 0;
+            missing = !read_varint(&rest, LONGEST_SIZE, &length); /* `c2 01 80` was `c2 01 80 00` */
+            if (missing && rest.at < rest.end) return size;
             break;
         default: return size;
         }
-        if (!skip(&rest, value)) {
-            uint64_t missing = value - left(&rest);
-            return missing <= MAX_DATAGRAM - size ? size + (size_t)missing : size;
-        }
+        if (length > MAX_DATAGRAM) return size;
+        size_t end = (size_t)(rest.at - data) + missing + (size_t)length;
+        if (end > size) return end <= MAX_DATAGRAM ? end : size;
+        rest.at = data + end;
     }
     return size;
 }
@@ -226,7 +224,7 @@ int envelope_read(const struct wire_schema *schema, uint8_t *data, size_t size, 
     if (size > MAX_DATAGRAM) return TRUNCATED;
     if (size == 0) return EMPTY;
     if (is_usual(schema, data, envelope)) return -1;
-    size_t whole = repairs ? restored_size(data, size) : size;
+    size_t whole = repairs ? envelope_restored_size(data, size) : size;
     if (whole > size) memset(data + size, 0, whole - size);
     if (!is_well_formed(schema, &schema->types[0], (struct bytes){data, data + whole})) return MALFORMED;
     envelope->size = (uint32_t)whole;

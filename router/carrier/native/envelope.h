@@ -47,6 +47,14 @@ struct envelope {
     bool is_repaired;       /* `size` is not that of the datagram; counted as padded, also if there is no payload */
 };
 
+/* The size that the envelope had when it was encoded. The protocol lets a sender leave out the zeros at the end, and
+ * boards may send frames of a fixed size, padded with zeros. Both can be undone, because a tag is never zero and the
+ * last field states its length.
+ *
+ * It is the size of the datagram if that is complete, or cannot be such an envelope: a cut tag, groups, or a field that
+ * would make it longer than MAX_DATAGRAM. */
+size_t envelope_restored_size(const uint8_t *data, size_t size);
+
 /* Find the payload case of a datagram of `size` bytes. `data` has room for MAX_DATAGRAM bytes; zeros that were left
  * out are written behind the datagram. `repairs`: the listener restores trimmed and padded frames.
  *

@@ -100,7 +100,7 @@ static bool read_fields(struct fields *fields, const struct served *served) {
     memcpy(fields->slots, route->defaults, route->slot_count * sizeof *fields->slots);
     fields->slots[SLOT_RECEIVED_AT].integer = record->received_at;
     fields->slots[SLOT_SOURCE] = route->sources[record->column];
-    if (!record->is_single) return fields_read(fields, NODE_ENVELOPE, datagram, record->whole);
+    if (!record->is_single) return fields_read(fields, NODE_ENVELOPE, datagram, record->length);
     return fields_read(fields, NODE_PAYLOAD, datagram + record->start, record->payload_length);
 }
 

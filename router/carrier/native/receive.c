@@ -72,7 +72,7 @@ static void forward(struct carrier *carrier, const struct route *route, const st
     for (uint32_t index = 0; index < route->destination_count; index++) {
         const struct destination *to = &route->destinations[index];
         if (!destination_may_send(carrier->counters, to, received->now, expires)) continue;
-        int error = destination_send(carrier->deadmen, carrier->counters, to, carrier->datagram, received->length, expires);
+        int error = destination_send(carrier->deadmen, carrier->counters, to, carrier->datagram, received->envelope.size, expires);
         if (error && error != COMMAND_STALE) report_send_error(&carrier->reporter, received->now, route->id, to, error);
     }
 }
@@ -102,8 +102,7 @@ static void hand_over(struct carrier *carrier, const struct part *part, const st
         return;
     }
     struct message_record *record = (struct message_record *)carrier->record;
-    size_t whole = received->envelope.size > received->length ? received->envelope.size : received->length;
-    *record = (struct message_record){.size = padded_to_word(sizeof *record + whole),
+    *record = (struct message_record){.size = padded_to_word(sizeof *record + received->envelope.size),
                                       .generation = carrier->program->generation,
                                       .part = part,
                                       .received_at = received->received_at,
@@ -111,12 +110,11 @@ static void hand_over(struct carrier *carrier, const struct part *part, const st
                                       .born = received->born,
                                       .column = received->column,
                                       .is_single = received->envelope.is_single,
-                                      .length = (uint32_t)received->length,
+                                      .length = received->envelope.size,
                                       .start = received->envelope.start,
                                       .payload_length = received->envelope.length,
-                                      .handler = part->handler,
-                                      .whole = received->envelope.size};
-    memcpy(record + 1, carrier->datagram, whole);
+                                      .handler = part->handler};
+    memcpy(record + 1, carrier->datagram, received->envelope.size);
     for (uint32_t index = 0; index < part->target_count; index++)
         counter_add(carrier->counters, part->targets[index].waiting, 1);
     while (!ring_put(part->ring, record, record->size)) drop_oldest(carrier, part->ring, received->now);

@@ -99,9 +99,11 @@ bool destination_may_send(counter *counters, const struct destination *to, int64
     return true;
 }
 
-static size_t without_trailing_zeros(const uint8_t *data, size_t size) {
-    while (size && !data[size - 1]) size--;
-    return size;
+/* The size of an envelope without its trailing zeros, if it can be told from the rest how many there were. */
+static size_t trimmed_size(const uint8_t *data, size_t size) {
+    size_t trimmed = size;
+    while (trimmed && !data[trimmed - 1]) trimmed--;
+    return envelope_restored_size(data, trimmed) == size ? trimmed : size;
 }
 
 static enum loss loss_of(int error) {
@@ -115,7 +117,7 @@ static uint32_t counter_of(const struct destination *to, enum loss reason) {
 
 int destination_send(struct deadmen *deadmen, counter *counters, const struct destination *to, const uint8_t *data,
                      size_t size, int64_t expires) {
-    if (to->trims) size = without_trailing_zeros(data, size);
+    if (to->trims) size = trimmed_size(data, size);
     int error = command_send(deadmen, to->sender, data, size, expires, to->feeds, to->feed_count);
     if (!error) {
         counter_add(counters, to->sent, 1);

@@ -28,7 +28,8 @@ struct bytes {
 
 static inline size_t left(const struct bytes *bytes) { return (size_t)(bytes->end - bytes->at); }
 
-/* Read a varint of at most `longest` bytes. It may be longer than it needs to be; bits beyond 64 are dropped. */
+/* Read a varint of at most `longest` bytes. It may be longer than it needs to be; bits beyond 64 are dropped. Of one that
+ * is cut or too long, `value` is what was read. */
 static inline bool read_varint(struct bytes *bytes, unsigned longest, uint64_t *value) {
     uint64_t read = 0;
     for (unsigned index = 0; index < longest && bytes->at < bytes->end; index++) {
@@ -39,6 +40,7 @@ static inline bool read_varint(struct bytes *bytes, unsigned longest, uint64_t *
             return true;
         }
     }
+    *value = read;
     return false;
 }
 
