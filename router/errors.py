@@ -108,7 +108,7 @@ class Code(enum.Enum):
         "qos-conflict",
         "QoS settings that contradict each other, or that keep publisher and subscriber apart.",
     )
-    BOARD_PAYLOAD = ("board-payload", "A board's firmware cannot decode this payload: no fixed size, or too large.")
+    BOARD_PAYLOAD = ("board-payload", "A board's firmware cannot decode this: no fixed size, too large, or not finite.")
     NO_TARGET = ("no-target", "A route that goes nowhere.")
     SOURCE_CLASH = ("source-clash", "Two routes of one payload case take it from the same source.")
     NO_DEADMAN = ("no-deadman", "Commands to a board that nothing stops when they stop coming.")

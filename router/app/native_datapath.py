@@ -34,6 +34,7 @@ from router.app.wiring import (
     open_pacers,
 )
 from router.carrier import structures as c
+from router.carrier.boards import NativeBoards
 from router.carrier.carrier import Carrier
 from router.carrier.commands import native_commands
 from router.carrier.deadmen import Deadmen, NativeDeadman
@@ -210,6 +211,7 @@ class NativeDatapath:
             names=self._names,
         )
         try:
+            outlets = replace(outlets, boards=NativeBoards(program.boards))
             native = native_program(program, generation, outlets)
         except CannotCarry as error:
             what = f"the carrier, which runs, cannot take these messages: {error}"

@@ -17,6 +17,7 @@ from router.app.runtime import Change, Runtime
 from router.app.timers import Timers
 from router.app.watching import InterfaceWatcher, Watcher, watched_files
 from router.app.wiring import Datapath, RouterContext, ThreadCounts
+from router.carrier.boards import NativeBoards
 from router.carrier.library import chosen_library
 from router.carrier.schema import CannotCarry, wire_schema
 from router.clock import monotonic_ns
@@ -229,6 +230,7 @@ def _datapath(program: Program, context: RouterContext, mirror: Mirror, subscrib
     if library is not None:
         try:
             wire_schema(program.envelope, ())
+            NativeBoards(program.boards)
         except CannotCarry as error:
             logger.warning("the carrier cannot take these messages, and Python serves them", why=str(error))
         else:

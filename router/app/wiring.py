@@ -285,6 +285,7 @@ def engine_context(
         command=command,
         publish_errors=publish_errors,
         pacers=pacers,
+        boards=program.boards,
     )
 
 

@@ -27,6 +27,7 @@ _LOSSES = (
     "send_buffer_full",
     "send_error",
     "publish_error",
+    "too_large",
 )
 """`enum loss`."""
 

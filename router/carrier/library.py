@@ -22,6 +22,7 @@ NATIVE, PYTHON = "native", "python"
 """The values of that environment variable. Without it the library is used if it can be."""
 
 FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
+    "board_takes": (c_bool, (c_void_p, c_void_p, c_size_t, c_void_p)),
     "carrier_change": (None, (c_void_p, c_void_p)),
     "carrier_close": (None, (c_void_p,)),
     "carrier_counters": (c_bool, (c_void_p, c_void_p, c_uint32)),
@@ -83,6 +84,9 @@ FUNCTIONS: Mapping[str, tuple[type | None, tuple[type, ...]]] = {
 """What each function of the headers returns and takes. Any pointer is a c_void_p, which also takes bytes and arrays."""
 
 STRUCTURES: Mapping[str, type[ctypes.Structure]] = {
+    "board": structures.Board,
+    "board_field": structures.BoardField,
+    "board_message": structures.BoardMessage,
     "change": structures.Change,
     "command_route": structures.CommandRoute,
     "command_set": structures.CommandSet,

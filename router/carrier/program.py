@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from router.carrier import structures as c
+from router.carrier.boards import NativeBoards
 from router.carrier.schema import wire_schema
 from router.compiler.metrics import REJECT_REASONS, UNKNOWN_CASE, Counters
 from router.compiler.network import recognisers
@@ -56,7 +57,8 @@ class Outlets:
 
     `senders` are by endpoint, `wanted` by topic. `feeds(route, names)` returns the deadmen that a command feeds
     (False) or disarms (True), `limit(handler, target)` the limit of a target with `max_rate`. `carried(handler)` are
-    the targets that the carrier serves, `parts(handler)` all others.
+    the targets that the carrier serves, `parts(handler)` all others. Without
+    `boards`, endpoints that are boards get everything.
     """
 
     listeners: Mapping[str, Listener]
@@ -67,6 +69,7 @@ class Outlets:
     carried: Callable[[Handler], Sequence[TargetPlan]]
     parts: Callable[[Handler], Sequence[PartTargets]]
     names: Names
+    boards: NativeBoards | None = None
 
 
 @dataclass(slots=True)
@@ -245,7 +248,12 @@ def native_destination(
         rate_limited=counters.index("messages_dropped", *place, "rate_limited"),
         send_buffer_full=counters.index("messages_dropped", *place, "send_buffer_full"),
         send_error=counters.index("messages_dropped", *place, "send_error"),
+        too_large=counters.index("messages_dropped", *place, "too_large"),
+        non_finite=counters.index("messages_dropped", *place, "non_finite"),
     )
+    if outlets.boards is not None:
+        made.board = outlets.boards.pointer(target.label)
+        arrays.append(outlets.boards)
     if target.deadmen:
         feeds = [
             c.Feed(deadman=deadman, disarms=disarms)

@@ -54,7 +54,7 @@ class WireSchema:
         return ctypes.addressof(self.schema)
 
 
-_KINDS: Mapping[int, WireKind] = {
+KINDS: Mapping[int, WireKind] = {
     FieldDescriptor.TYPE_BOOL: WireKind.VARINT,
     FieldDescriptor.TYPE_ENUM: WireKind.VARINT,
     FieldDescriptor.TYPE_INT32: WireKind.VARINT,
@@ -157,4 +157,4 @@ def _lowered_field(field: FieldDescriptor, indexes: Mapping[Descriptor, int], fl
 def _kind(field: FieldDescriptor) -> WireKind:
     if field.type == FieldDescriptor.TYPE_STRING and not validates_text(field):
         return WireKind.BYTES  # what is no UTF-8 is accepted; that depends on syntax and features
-    return _KINDS[field.type]
+    return KINDS[field.type]

@@ -52,6 +52,40 @@ class DeadmanDestination(ctypes.Structure):
     )
 
 
+class BoardField(ctypes.Structure):
+    """`struct board_field` in board.h."""
+
+    _fields_ = (
+        ("number", c_uint32),
+        ("kind", c_uint8),
+        ("flags", c_uint8),
+        ("message", c_uint16),
+        ("longest", c_uint32),
+        ("most", c_uint32),
+        ("counter", c_uint32),
+        ("reserved", c_uint32),
+        ("path", ctypes.c_char_p),
+    )
+
+
+class BoardMessage(ctypes.Structure):
+    """`struct board_message` in board.h."""
+
+    _fields_ = (
+        ("fields", POINTER(BoardField)),
+        ("count", c_uint32),
+        ("first_counter", c_uint32),
+        ("counter_count", c_uint32),
+        ("reserved", c_uint32),
+    )
+
+
+class Board(ctypes.Structure):
+    """`struct board` in board.h."""
+
+    _fields_ = (("messages", POINTER(BoardMessage)), ("longest", c_uint32), ("allows_non_finite", c_uint32))
+
+
 class Destination(ctypes.Structure):
     """`struct destination` in carrier.h."""
 
@@ -59,6 +93,7 @@ class Destination(ctypes.Structure):
         ("sender", c_void_p),
         ("limit", POINTER(Limit)),
         ("feeds", POINTER(Feed)),
+        ("board", POINTER(Board)),
         ("feed_count", c_uint32),
         ("trims", c_uint32),
         ("id", c_uint32),
@@ -68,6 +103,8 @@ class Destination(ctypes.Structure):
         ("rate_limited", c_uint32),
         ("send_buffer_full", c_uint32),
         ("send_error", c_uint32),
+        ("too_large", c_uint32),
+        ("non_finite", c_uint32),
         ("reserved", c_uint32),
     )
 

@@ -6,7 +6,7 @@ The same check serves `validate`, `explain` and `run`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -20,7 +20,8 @@ from router.compiler.routes import check_routes, clash_findings
 from router.compiler.topics import diagnostics_topic, topic_findings, with_types
 from router.errors import Diagnostic, Severity, TableError
 from router.table import in_order, load_table
-from router.table.model import RouteTable, Topic
+from router.table.model import EndpointKind, RouteTable, Topic
+from router.types.board_limits import BoardLimits, board_fields
 from router.types.lock import LockComparison
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema, find_envelope, without_protos
@@ -37,6 +38,7 @@ class Checked:
     envelope: Envelope | None = None
     routes: Sequence[CheckedRoute] = ()
     gateways: Sequence[GatewayPlan] = ()
+    boards: Mapping[str, BoardLimits] = field(default_factory=dict)
     own_topics: Sequence[tuple[Topic, MessageType]] = ()
 
     @property
@@ -54,7 +56,16 @@ class Checked:
 
         if self.has_errors or self.table is None or self.schema is None or self.envelope is None:
             return None
-        return link(self.table, self.schema, self.envelope, self.routes, self.gateways, self.own_topics, counters)
+        return link(
+            self.table,
+            self.schema,
+            self.envelope,
+            self.routes,
+            self.gateways,
+            self.boards,
+            self.own_topics,
+            counters,
+        )
 
 
 def check_table(
@@ -76,7 +87,8 @@ def check_table(
     table = with_types(table, envelope.cases, findings)
     lock = LockComparison(schema, envelope) if table.envelope else None
     board_limit = lock.max_size if lock and lock.max_size else envelope.max_size
-    lookup = Lookup(table, schema, envelope, definitions, board_limit)
+    boards = _boards(table, schema, envelope, board_limit)
+    lookup = Lookup(table, schema, envelope, definitions, board_limit, boards)
     routes = check_routes(lookup)
     gateways = check_gateways(lookup)
     own = diagnostics_topic(table.node)
@@ -91,7 +103,14 @@ def check_table(
         *topic_findings(table, [checked.route for checked in routes]),
     ]
     own_topics = [(own, own_type)] if own and own_type else []
-    return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, own_topics)
+    return Checked(path, in_order(findings), table, schema, envelope, routes, gateways, boards, own_topics)
+
+
+def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: int) -> Mapping[str, BoardLimits]:
+    """What each endpoint that is a board can take; `limit` is the largest envelope in bytes."""
+    boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
+    fields = board_fields(schema.descriptor(envelope.name), schema.board_options) if boards else {}
+    return {each.name: BoardLimits(envelope, fields, limit, each.allow_non_finite) for each in boards}
 
 
 def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:

@@ -18,6 +18,7 @@ from router.compiler.plan import Record
 from router.compiler.program import DeadmanPlan
 from router.errors import Code, Diagnostic, MappingError, SourceSpan, did_you_mean
 from router.table.model import Deadman, Destination, EndpointKind, FieldMap, InboundDeadman, OnLimit, Route, RouteTable
+from router.types.board_limits import NON_FINITE
 from router.types.model import MessageType
 from router.types.protobuf import PayloadCase
 
@@ -38,11 +39,13 @@ def check_deadman(lookup: Lookup, route: Route) -> CheckedDeadman | None:
     case = lookup.case(deadman.case)
     if case is None:
         return None
+    known = len(lookup.findings)
     for name in deadman.to:
         lookup.recipient(case, name, sources=frozenset())
+    can_reach = len(lookup.findings) == known
     disarmed_by = _successors(lookup, route, deadman)
     datagram = _datagram(lookup, deadman, case)
-    if datagram is None:
+    if datagram is None or (can_reach and _is_refused(lookup, deadman, datagram)):
         return None
     return CheckedDeadman(deadman, datagram, disarmed_by)
 
@@ -133,6 +136,17 @@ def _datagram(lookup: Lookup, deadman: Deadman, case: PayloadCase) -> bytes | No
     except (MappingError, ValueError) as error:
         lookup.report(deadman.case.span, Code.BAD_VALUE, f"this payload cannot be built: {error}")
         return None
+
+
+def _is_refused(lookup: Lookup, deadman: Deadman, datagram: bytes) -> bool:
+    """Report the first board that cannot take what the deadman sends."""
+    for to in deadman.to:
+        board = lookup.boards.get(to.value)
+        if refusal := board.refusal(datagram) if board else None:
+            hint = f"'{to.value}' gets it with `allow_non_finite: true`" if refusal.reason == NON_FINITE else ""
+            lookup.report(deadman.case.span, Code.BOARD_PAYLOAD, f"a board cannot take this: {refusal.text}", hint)
+            return True
+    return False
 
 
 def deadman_plan(name: str, settings: Deadman | InboundDeadman, datagrams: Iterable[tuple[str, bytes]]) -> DeadmanPlan:

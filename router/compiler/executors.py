@@ -1,8 +1,8 @@
 """Which executor serves a destination: the carrier, or Python.
 
-The carrier forwards envelopes as they were encoded. It knows `ttl`, `max_rate`, deadmen and `trim_trailing_zeros`, but evaluates
-no expression and holds nothing back. An endpoint gets datagrams in the order of their arrival, whatever routes they
-take, so all its targets from UDP have the same executor: Python, if one of them needs it.
+The carrier forwards envelopes as they were encoded. It knows `ttl`, `max_rate`, deadmen, `trim_trailing_zeros` and what
+a board can take, but evaluates no expression and holds nothing back. An endpoint gets datagrams in the order of their
+arrival, whatever routes they take, so all its targets from UDP have the same executor: Python, if one of them needs it.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ Expects a table without errors: nothing here is checked.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from router.compiler.checked import CheckedDeadman, CheckedRoute
@@ -42,6 +42,7 @@ from router.compiler.program import (
 )
 from router.compiler.topics import qos_of
 from router.table.model import ANY, ROS, RouteTable, Topic
+from router.types.board_limits import BoardLimits
 from router.types.framing import trimmed
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, ProtoSchema
@@ -53,6 +54,7 @@ def link(
     envelope: Envelope,
     routes: Sequence[CheckedRoute],
     gateways: Sequence[GatewayPlan],
+    boards: Mapping[str, BoardLimits],
     own_topics: Sequence[tuple[Topic, MessageType]],
     counters: Counters | None,
 ) -> Program:
@@ -97,6 +99,7 @@ def link(
         executors={**executors(served), **commands.executors, **topics.executors},
         commands=commands.commands,
         lowered=topics.routes,
+        boards=boards,
         gateways=tuple(gateways),
     )
 

@@ -14,6 +14,7 @@ from router.compiler.expressions.kinds import BoolKind, Kind
 from router.compiler.network import loop_finding
 from router.errors import Code, Diagnostic, Located, SourceSpan, TableError, did_you_mean, nearest
 from router.table.model import ANY, ROS, Endpoint, EndpointKind, EnvelopeSettings, Expression, Route, RouteTable, Topic
+from router.types.board_limits import BoardLimits
 from router.types.boards import board_findings
 from router.types.model import List, MessageType, Type
 from router.types.proto_files import read_folder
@@ -60,13 +61,17 @@ NO_NAMES: Mapping[str, Typed] = {}
 
 @dataclass(slots=True)
 class Lookup:
-    """Looks up the names of one table and collects findings. `board_limit`: see `board_findings`."""
+    """Looks up the names of one table and collects findings.
+
+    `board_limit` is as in `board_findings`; `boards` says by endpoint what boards can take.
+    """
 
     table: RouteTable
     schema: ProtoSchema
     envelope: Envelope
     definitions: Definitions
     board_limit: int
+    boards: Mapping[str, BoardLimits]
     findings: list[Diagnostic] = field(default_factory=list)
 
     def report(self, span: SourceSpan, code: Code, message: str, hint: str = "") -> None:

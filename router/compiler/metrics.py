@@ -100,7 +100,8 @@ REJECT_REASONS: Mapping[str, str] = {
 
 DROP_REASONS: Mapping[str, str] = {
     "mapping_error": "a mapping failed on these values, as in a division by zero",
-    "non_finite": "NaN or infinity where an integer or a time is wanted",
+    "non_finite": "NaN or infinity where an integer or a time is wanted, or for a board",
+    "too_large": "the envelope, a text or a list is larger than the board takes",
     "stale": "older than `ttl`",
     "rate_limited": "more often than `max_rate`",
     "queue_full": "the endpoint's `bandwidth` was short, or a thread was behind, for longer than the queue lasts",

@@ -9,7 +9,7 @@ from itertools import combinations
 
 from router.errors import Code, Diagnostic, Located, SourceSpan, did_you_mean
 from router.table.addresses import Address
-from router.table.model import ANY, Endpoint, Gateway, RouteTable, Transport
+from router.table.model import ANY, Endpoint, EndpointKind, Gateway, RouteTable, Transport
 
 WILDCARD = "0.0.0.0"
 LOOPBACK = "127."
@@ -35,6 +35,10 @@ def network_findings(table: RouteTable) -> Iterator[Diagnostic]:
                 hint += f", or give {second.owner if first.interface else first.owner} an 'interface' too"
             yield Diagnostic(second.address.span, Code.ADDRESS_CLASH, message, hint)
     yield from _listener_findings(table)
+    for endpoint in table.endpoints.values():
+        if endpoint.allow_non_finite and endpoint.kind is not EndpointKind.BOARD:
+            message = f"'{endpoint.name}' is no board, and gets NaN and infinities anyway"
+            yield Diagnostic(endpoint.span, Code.BAD_VALUE, message, "leave `allow_non_finite` out")
     yield from _gateway_findings(table)
     sources = {source.value for route in table.routes for source in route.sources}
     blamed: set[str] = set()

@@ -15,6 +15,7 @@ from router.compiler.executors import Executors
 from router.compiler.lowering import LoweredRoute
 from router.compiler.metrics import Counters
 from router.table.model import Endpoint, Gateway, Inbound, Listener, OnLimit, Priority, RouteTable
+from router.types.board_limits import BoardLimits
 from router.types.model import MessageType
 from router.types.protobuf import Envelope, PayloadCase, ProtoSchema
 
@@ -153,7 +154,8 @@ class Program:
 
     `inbound` has the handlers by envelope field number: several where a case has several routes, which differ
     in their sources. `outbound` has them by topic, and `commands` the topics that the carrier can take. `lowered` has
-    the routes with topics that it can publish on, by name. `ignored` are the numbers of cases that the table ignores.
+    the routes with topics that it can publish on, by name. `ignored` are the numbers of cases that the table ignores,
+    `boards` what each endpoint that is a board can take, by name.
     """
 
     table: RouteTable
@@ -170,6 +172,7 @@ class Program:
     executors: Executors
     commands: Commands
     lowered: Mapping[str, LoweredRoute]
+    boards: Mapping[str, BoardLimits]
     gateways: tuple[GatewayPlan, ...] = ()
 
     @property

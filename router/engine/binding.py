@@ -11,11 +11,12 @@ from router.compiler.metrics import Counters
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
 from router.engine.deadman import CommandMaker
-from router.engine.delivery import MAPPING_FAILURES, Deliver, FrameOutcome, Outcome, Report, Stale, immediately
+from router.engine.delivery import MAPPING_FAILURES, Deliver, FrameOutcome, Outcome, Report, Stale, checked, immediately
 from router.engine.freshness import Freshness
 from router.engine.pacing import Latest, Pacer, RateLimit
 from router.engine.timers import Locked
 from router.table.model import OnLimit
+from router.types.board_limits import BoardLimits
 
 T = TypeVar("T")
 
@@ -75,7 +76,7 @@ class EngineContext:
     `publish_errors`. `wanted`, by topic, is a flag that its owner keeps up to date: whether anybody subscribes.
     `report` is called for losses only. `counts` belong to the thread that calls the handlers. `pacers` are those of
     endpoints with a bandwidth, in the group `pacing` like messages that wait for endpoints; `holding` has those that
-    wait for topics. Frames are collected in the group `collecting`.
+    wait for topics. `boards` says by endpoint what boards can take. Frames are collected in the group `collecting`.
     """
 
     counts: list[int]
@@ -91,6 +92,7 @@ class EngineContext:
     command: CommandMaker
     publish_errors: tuple[type[Exception], ...] = ()
     pacers: Mapping[str, Pacer] = field(default_factory=dict)
+    boards: Mapping[str, BoardLimits] = field(default_factory=dict)
     state: State = field(default_factory=State)
 
 
@@ -131,9 +133,8 @@ def _target_names(target: TargetPlan, handler: Handler, counters: Counters, cont
         names[f"publish_{name}"] = context.publish[target.label]
     else:
         is_command = handler.ttl is not None or target.deadmen
-        names[f"send_{name}"] = (
-            context.command(target.label, route, target.deadmen) if is_command else context.send[target.label]
-        )
+        send = context.command(target.label, route, target.deadmen) if is_command else context.send[target.label]
+        names[f"send_{name}"] = checked(send, context.boards.get(target.label))
     if target.max_rate is not None and target.on_limit is OnLimit.FIRST:
         rate = target.max_rate
         names[f"limit_{name}"] = context.state.keep(("limit", *place), lambda: RateLimit(rate)).may_pass
@@ -165,14 +166,15 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
     destination: object
     pacer = None if target.is_topic else context.pacers.get(target.label)
     if pacer is not None:
-        command = context.command(target.label, route, target.deadmen)
+        command = checked(context.command(target.label, route, target.deadmen), context.boards.get(target.label))
         destination, deliver = pacer, pacer.queue(target.priority, outcome, command)
     elif target.is_topic:
         destination = publish = context.publish[target.label]
         deliver = immediately(lambda data, _: publish(data), outcome, context.publish_errors)
     else:
         destination = context.send[target.label]
-        deliver = immediately(context.command(target.label, route, target.deadmen), outcome)
+        command = checked(context.command(target.label, route, target.deadmen), context.boards.get(target.label))
+        deliver = immediately(command, outcome)
     if target.on_limit is OnLimit.LATEST and target.max_rate is not None:
         rate = target.max_rate
         latest = context.state.keep(("latest", *place, destination), lambda: Latest(rate, deliver, outcome))

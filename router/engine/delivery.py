@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from router.compiler.metrics import DROP_REASONS, Counters
 from router.compiler.program import TargetPlan
 from router.errors import MappingError, NonFiniteError
+from router.types.board_limits import BoardLimits, Refusal
+from router.types.framing import restored
 
 MAPPING_FAILURES = (ArithmeticError, ValueError, LookupError, struct.error, MappingError)
 """What a value in a message can make a mapping raise. Any other exception is a bug of the router and propagates."""
@@ -39,6 +41,14 @@ behind the datagram of a deadman that replaces it. Raises Stale or OSError.
 
 class Stale(Exception):
     """A message is older than `ttl`, and was not sent."""
+
+
+class BoardRefuses(OSError):
+    """A board cannot take a datagram, which was not sent."""
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(refusal.text)
+        self.reason = refusal.reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +106,8 @@ class Outcome:
         """Count a message as lost because mapping it or handing it over raised `error`."""
         if isinstance(error, Stale):
             self.dropped("stale")
+        elif isinstance(error, BoardRefuses):
+            self.dropped(error.reason, detail=str(error))
         else:
             self.dropped(_reason(error, self._is_topic), error)
 
@@ -143,6 +155,22 @@ def immediately(
             outcome.delivered(len(data))
 
     return deliver
+
+
+def checked(send: Callable[..., int], board: BoardLimits | None) -> Callable[..., int]:
+    """Return a function that sends only what the board can take, and else raises BoardRefuses.
+
+    `send` takes a datagram, and may take more.
+    """
+    if board is None:
+        return send
+
+    def send_checked(data: bytes, *more: int | None) -> int:
+        if refusal := board.refusal(restored(data)):
+            raise BoardRefuses(refusal)
+        return send(data, *more)
+
+    return send_checked
 
 
 def is_stale(now: int, expires: int | None) -> bool:

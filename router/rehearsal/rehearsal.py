@@ -190,6 +190,7 @@ class Rehearsal:
             collecting=group,
             command=commander(send, deadmen, self._locked, lambda: self.now),
             pacers=pacers,
+            boards=program.boards,
         )
 
     def _locked(self, timer: Timer, call: Callable[P, R]) -> Callable[P, R]:

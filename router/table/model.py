@@ -125,7 +125,7 @@ class Endpoint:
     """`span` is the endpoint's name in the table. `bandwidth` is in bytes per second, None for no limit.
 
     Silent for longer than `stale_after` (ns) it is stale; None means that it never is. With a `listener`, only what
-    that one receives can be from it.
+    that one receives can be from it. `allow_non_finite`: a board gets NaN and infinities as well.
     """
 
     name: str
@@ -134,6 +134,7 @@ class Endpoint:
     kind: EndpointKind
     source_port: Located[int] | None = None
     trim_trailing_zeros: bool = False
+    allow_non_finite: bool = False
     bandwidth: Annotated[int | None, DATA_RATE] = None
     stale_after: Annotated[int | None, PATIENCE] = 5_000_000_000
     listener: Located[str] | None = None

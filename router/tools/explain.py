@@ -117,7 +117,8 @@ def _source(name: str, table: RouteTable) -> str:
 def _destination(served: CheckedTarget, route: Route, table: RouteTable, how: str) -> Iterator[str]:
     endpoint = table.endpoints[served.label]
     trimmed = ", trailing zeros trimmed" if endpoint.trim_trailing_zeros else ""
-    yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}  ({served.span})"
+    allowed = ", NaN and infinity allowed" if endpoint.allow_non_finite else ""
+    yield f"  destination {served.label} ({endpoint.address.value}): {how}{trimmed}{allowed}  ({served.span})"
     if endpoint.bandwidth is not None:
         yield f"    {served.priority.value} within a bandwidth of {endpoint.bandwidth} bytes/s"
     if others := [other for other in served.deadmen if other != route.name]:

@@ -187,7 +187,7 @@ def unbounded_fields(
     inside = {step.containing_type for step in path}
     for field in message.fields:
         here = (*path, field)
-        if why := _why_unbounded(field, options_of(field)):
+        if why := why_unbounded(field, options_of(field)):
             yield Unbounded(here, why)
         elif field.message_type is None:
             continue
@@ -197,7 +197,8 @@ def unbounded_fields(
             yield from unbounded_fields(field.message_type, options_of, here)
 
 
-def _why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
+def why_unbounded(field: FieldDescriptor, options: BoardOptions) -> str | None:
+    """Why a field has no largest encoding, None if it has one: what it contains does not count."""
     if field.type == FieldDescriptor.TYPE_GROUP:
         return "is a group, which nanopb does not know"
     if field.is_repeated and options.max_count is None:

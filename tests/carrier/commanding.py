@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from router.carrier import structures as c
+from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c
 from router.carrier.commands import CommandThread, native_commands
 from router.carrier.deadmen import Deadmen, NativeDeadman
@@ -146,6 +147,7 @@ class Commanding:
             carried=lambda _: (),
             parts=lambda _: (),
             names=self.names,
+            boards=NativeBoards(program.boards),
         )
         self.commands = native_commands(program, outlets)
         self.subscriptions = {topic: Subscription(functions) for topic in self.commands.topics}

@@ -15,6 +15,7 @@ from typing import Any, cast
 from benchmarks.fuzz_engine import MUTATIONS
 from router.app.parts import OF_PYTHON, Part, divided
 from router.carrier import structures as c
+from router.carrier.boards import NativeBoards
 from router.carrier.build import NATIVE, compile_c, sources
 from router.carrier.deadmen import Deadmen, NativeDeadman
 from router.carrier.library import load
@@ -208,6 +209,7 @@ class Whole:
                 carried=lambda handler: self._divided[Part.SENT].get(handler.route, ()),
                 parts=self._parts_of,
                 names=self._names,
+                boards=NativeBoards(made.boards),
             ),
         )
         self._carrier = loaded.carrier_open(self._deadmen.address, self._counts, self._events.address)

@@ -106,6 +106,10 @@ def outcome(make: Callable[[], Any]) -> Any:
         return MAPPING_FAILURES
 
 
+DATAGRAM = b"\x18\x01"
+"""What stands for the datagram of any message: an envelope with a field that nobody knows."""
+
+
 class Published:
     """A handler of a program, whose targets are those of a rig: `reports` has its losses, `sent` what it sends."""
 
@@ -120,5 +124,5 @@ class Published:
         """Serve one message, and return what is published by topic. Topics whose mapping failed are left out."""
         for made in (self.reports, self.sent, self._published):
             made.clear()
-        self._handle(message, b"datagram", RECEIVED_AT, 1, SOURCE, *((1,) if self._is_aged else ()))
+        self._handle(message, DATAGRAM, RECEIVED_AT, 1, SOURCE, *((1,) if self._is_aged else ()))
         return dict(self._published)

@@ -15,7 +15,7 @@ from router.compiler.program import Program
 from router.engine.delivery import MAPPING_FAILURES
 from router.rehearsal.cdr import serialize as cdr
 from router.types.model import Bool, Bytes, Enum, Field, Float, Int, List, MessageType, String, Type
-from tests.compiler.compiling import Published, context_of
+from tests.compiler.compiling import DATAGRAM, Published, context_of
 from tests.compiler.generated_types import EACH_TYPE
 from tests.oracles.reference import fill
 
@@ -53,7 +53,7 @@ def assert_agreement(checked: Checked, route: CheckedRoute, serve: Published, me
     assert published == expected(checked, route, message)
     assert {report.reason for report in serve.reports} <= {"mapping_error", "non_finite"}
     assert {report.target for report in serve.reports} == serve.topics - published.keys()
-    assert {data for _, data in serve.sent} <= {b"datagram"}
+    assert {data for _, data in serve.sent} <= {DATAGRAM}
     return published
 
 

@@ -165,6 +165,7 @@ class Rig:
             command=commander(send, deadmen, self._locked, lambda: self.now),
             publish_errors=(PublishError,),
             pacers=pacers,
+            boards=made.boards,
         )
         self.arrived_before = 0
         arrived_at = {plan.name: lambda: self.WALL + self.now - self.arrived_before for plan in made.listeners}

@@ -277,7 +277,8 @@ def test_what_is_forwarded_is_the_restored_envelope(rig: Rig) -> None:
     forwarded = list(whole.values())
     assert [data for endpoint, data in rig.sent if endpoint == "basestation"] == forwarded
     assert [data for endpoint, data in rig.sent if endpoint == "recorder"] == [
-        data if data == long_tag else data.rstrip(b"\0") for data in forwarded  # a cut tag could not be restored
+        data if data == long_tag else data.rstrip(b"\0")
+        for data in forwarded  # a cut tag could not be restored
     ]
     assert rig.count("sent_bytes", "imu_info", "basestation") == sum(map(len, forwarded))
 

@@ -11,17 +11,19 @@ from tests.engine.rig import BASESTATION, HEAD, SENSOR_BOARD, Rig, program
 from tests.engine.test_both_directions import BRAKE, MS, SECOND, enveloped
 from tests.engine.wire import LEN, framed, tag, varint
 
-HEAD_MORE = HEAD.replace("routes:", "  far_board: {address: 192.168.0.70:8, kind: board, bandwidth: 10kB/s}\nroutes:")
+HEAD_MORE = HEAD.replace("routes:", "  far_board: {address: 192.168.0.70:8, kind: tool, bandwidth: 10kB/s}\nroutes:")
 TURN = enveloped(manual_drive={"turn": 5})
 DEADMAN = "deadman: {timeout: 500ms, send: {manual_brake: {brake: true}}, to: [far_board]"
 PACED = f"""\
   manual_drive:
     - source: basestation
       destinations: [far_board]
+      priority: command
       ttl: 200ms
       {DEADMAN}, disarmed_by: [pump_info]}}
   ph_info: {{source: sensor_board, destinations: [far_board], priority: bulk, deadman: {{none: no command at all}}}}
-  pump_info: {{source: sensor_board, destinations: [far_board], ttl: 200ms, deadman: {{none: large commands}}}}
+  pump_info: {{source: sensor_board, destinations: [far_board], priority: command, ttl: 200ms,
+    deadman: {{none: large commands}}}}
 """
 HELD = f"""\
   manual_drive:

@@ -34,10 +34,11 @@ def test_listeners_endpoints_and_settings_are_typed(table: RouteTable) -> None:
     }  # fmt: skip
     assert flat(table.endpoints["sensor_board"]) == {
         "name": "sensor_board", "address": "192.168.0.30:8", "kind": "board", "source_port": "9",
-        "trim_trailing_zeros": "false", "stale_after": "5 s",
+        "trim_trailing_zeros": "false", "allow_non_finite": "false", "stale_after": "5 s",
     }  # fmt: skip
     assert flat(table.endpoints["basestation"]) == {
         "name": "basestation", "address": "192.168.0.10:9000", "kind": "tool", "trim_trailing_zeros": "true",
+        "allow_non_finite": "false",
         "bandwidth": "500 kB/s", "stale_after": "5 s",
     }  # fmt: skip
 

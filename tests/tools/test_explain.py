@@ -104,6 +104,7 @@ def told(folder: Path, more: str, old: str = OLD) -> list[str]:
                 "endpoint x: +address: 10.0.0.9:99",
                 "endpoint x: +kind: tool",
                 "endpoint x: +trim_trailing_zeros: false",
+                "endpoint x: +allow_non_finite: false",
                 "endpoint x: +stale_after: 5 s",
             ],
         ),

@@ -11,6 +11,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "board.h"
 #include "counters.h"
 #include "deadman.h"
 #include "envelope.h"
@@ -24,11 +25,12 @@ struct destination {
     struct sender *sender;
     struct limit *limit; /* `max_rate`, or NULL */
     const struct feed *feeds;
+    const struct board *board; /* what it can take, or NULL if it is no board */
     uint32_t feed_count;
     uint32_t trims; /* it gets datagrams without their trailing zeros */
     uint32_t id;    /* of the target, in events */
     /* Counters: */
-    uint32_t sent, sent_bytes, stale, rate_limited, send_buffer_full, send_error;
+    uint32_t sent, sent_bytes, stale, rate_limited, send_buffer_full, send_error, too_large, non_finite;
     uint32_t reserved;
 };
 

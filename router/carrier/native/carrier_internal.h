@@ -74,6 +74,10 @@ void count_duration(counter *counters, uint32_t histogram, int64_t elapsed);
  * pass; else count it, and return false. */
 bool destination_may_send(counter *counters, const struct destination *to, int64_t now, int64_t expires);
 
+/* Check that the destination, if it is a board, can take an envelope; else count and report it, and return false. */
+bool destination_takes(counter *counters, struct reporter *reporter, int64_t now, uint32_t route,
+                       const struct destination *to, const uint8_t *data, size_t size);
+
 /* Send and count a datagram. Return what `command_send` does. */
 int destination_send(struct deadmen *deadmen, counter *counters, const struct destination *to, const uint8_t *data,
                      size_t size, int64_t expires);

@@ -66,6 +66,7 @@ static void serve_target(struct commands *commands, const struct command_route *
         return;
     }
     const uint8_t *datagram = commands->datagram + MOST_CONVERTED - size;
+    if (!destination_takes(commands->counters, &commands->reporter, command->now, route->id, to, datagram, size)) return;
     int error = destination_send(commands->deadmen, commands->counters, to, datagram, size, expires);
     if (error && error != COMMAND_STALE) report_send_error(&commands->reporter, command->now, route->id, to, error);
 }

@@ -26,7 +26,7 @@ const struct structure_size *carrier_structure_sizes(void) {
         SIZE(payload_case),   SIZE(peer),      SIZE(listener),    SIZE(program), SIZE(change),
         SIZE(message_record), SIZE(mirror_record), SIZE(read_op), SIZE(write_op), SIZE(command_target), SIZE(command_route),
         SIZE(command_topic), SIZE(command_set), SIZE(deadman_destination),
-        SIZE(value), SIZE(node_field), SIZE(node), SIZE(operation), SIZE(publish_topic), SIZE(publish_target), SIZE(publish_route), {NULL, 0},
+        SIZE(value), SIZE(node_field), SIZE(node), SIZE(operation), SIZE(board_field), SIZE(board_message), SIZE(board), SIZE(publish_topic), SIZE(publish_target), SIZE(publish_route), {NULL, 0},
     };
     return sizes;
 }

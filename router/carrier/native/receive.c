@@ -72,7 +72,11 @@ static void forward(struct carrier *carrier, const struct route *route, const st
     for (uint32_t index = 0; index < route->destination_count; index++) {
         const struct destination *to = &route->destinations[index];
         if (!destination_may_send(carrier->counters, to, received->now, expires)) continue;
-        int error = destination_send(carrier->deadmen, carrier->counters, to, carrier->datagram, received->envelope.size, expires);
+        if (!destination_takes(carrier->counters, &carrier->reporter, received->now, route->id, to, carrier->datagram,
+                               received->envelope.size))
+            continue;
+        int error = destination_send(carrier->deadmen, carrier->counters, to, carrier->datagram, received->envelope.size,
+                                     expires);
         if (error && error != COMMAND_STALE) report_send_error(&carrier->reporter, received->now, route->id, to, error);
     }
 }

@@ -99,6 +99,17 @@ bool destination_may_send(counter *counters, const struct destination *to, int64
     return true;
 }
 
+bool destination_takes(counter *counters, struct reporter *reporter, int64_t now, uint32_t route,
+                       const struct destination *to, const uint8_t *data, size_t size) {
+    struct board_refusal refusal;
+    if (!to->board || board_takes(to->board, data, size, &refusal)) return true;
+    uint32_t counted = refusal.reason == LOSS_TOO_LARGE ? to->too_large : to->non_finite;
+    counter_add(counters, counted, 1);
+    struct lost_event lost = {.route = route, .target = to->id, .reason = refusal.reason, .counter = counted};
+    report_loss_because(reporter, now, &lost, refusal.text);
+    return false;
+}
+
 /* The size of an envelope without its trailing zeros, if it can be told from the rest how many there were. */
 static size_t trimmed_size(const uint8_t *data, size_t size) {
     size_t trimmed = size;

@@ -1,0 +1,94 @@
+"""What boards can take, as the arrays that `board_takes` checks by."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from enum import IntFlag
+
+from router.carrier import structures as c
+from router.carrier.schema import KINDS, CannotCarry, WireKind
+from router.types.board_limits import BoardField, BoardLimits, BoardMessage
+
+_MOST_COUNTERS = 4096
+"""MOST_BOARD_COUNTERS in board.h."""
+
+_MOST_MESSAGES = 65536
+
+
+class _Flag(IntFlag):
+    """`enum board_flag` in board.h."""
+
+    IS_FLOAT = 1
+    IS_REPEATED = 2
+    HAS_FIXED_LENGTH = 4
+    HAS_FIXED_COUNT = 8
+
+
+class NativeBoards:
+    """A `struct board` for each endpoint that is a board. C may use them as long as this object lives.
+
+    Raises CannotCarry.
+    """
+
+    def __init__(self, boards: Mapping[str, BoardLimits]) -> None:
+        trees: dict[int, _Tree] = {}  # boards with the same firmware share one
+        self._boards: dict[str, c.Board] = {}
+        for name, limits in boards.items():
+            tree = trees.setdefault(id(limits.fields), _Tree(limits.fields))
+            self._boards[name] = c.Board(tree.messages, limits.longest, limits.allows_non_finite)
+        self._trees = trees
+
+    def pointer(self, endpoint: str) -> ctypes._Pointer[c.Board] | None:
+        """The board that an endpoint is; None for another kind of endpoint."""
+        board = self._boards.get(endpoint)
+        return ctypes.pointer(board) if board is not None else None
+
+
+class _Tree:
+    """The tree of messages that an envelope is, flattened: each place has an index, and a run of counters."""
+
+    def __init__(self, envelope: BoardMessage) -> None:
+        self._messages: list[c.BoardMessage] = []
+        self._arrays: list[object] = []
+        self._counters = 0
+        self._add(envelope)
+        if len(self._messages) > _MOST_MESSAGES or self._counters > _MOST_COUNTERS:
+            raise CannotCarry("the messages for boards have too many repeated fields")
+        self.messages = (c.BoardMessage * len(self._messages))(*self._messages)
+
+    def _add(self, message: BoardMessage) -> int:
+        index, first = len(self._messages), self._counters
+        self._messages.append(c.BoardMessage())
+        ordered = sorted(message.items())
+        counters = {number: self._counter() for number, field in ordered if field.most is not None}
+        fields = [self._field(number, field, counters.get(number, 0)) for number, field in ordered]
+        array = (c.BoardField * len(fields))(*fields)
+        self._arrays.append(array)
+        self._messages[index] = c.BoardMessage(array, len(fields), first, self._counters - first)
+        return index
+
+    def _counter(self) -> int:
+        self._counters += 1
+        return self._counters - 1
+
+    def _field(self, number: int, field: BoardField, counter: int) -> c.BoardField:
+        flags = _Flag(0)
+        if field.is_float:
+            flags |= _Flag.IS_FLOAT
+        if field.most is not None:
+            flags |= _Flag.IS_REPEATED
+        if field.has_fixed_length:
+            flags |= _Flag.HAS_FIXED_LENGTH
+        if field.has_fixed_count:
+            flags |= _Flag.HAS_FIXED_COUNT
+        return c.BoardField(
+            number=number,
+            kind=WireKind.BYTES if field.longest is not None else KINDS[field.descriptor.type],
+            flags=flags,
+            message=self._add(field.message) if field.message is not None else 0,
+            longest=field.longest or 0,
+            most=field.most or 0,
+            counter=counter,
+            path=field.path.encode(),
+        )

@@ -1,0 +1,160 @@
+#include "board.h"
+
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+
+#include "numbers.h"
+#include "wire.h"
+
+enum { MOST_LEVELS = 100 /* as many as a well-formed message has */ };
+
+struct level {
+    const uint8_t *end;
+    const struct board_message *message;
+};
+
+struct check {
+    const struct board *board;
+    struct board_refusal *refusal;
+    struct bytes rest; /* of the innermost message */
+    unsigned depth;
+    struct level levels[MOST_LEVELS + 1];
+    uint32_t counts[MOST_BOARD_COUNTERS];
+};
+
+/* ---- bounds: each function returns whether the board takes the value ---- */
+
+static bool fits(uint64_t size, uint32_t bound, bool is_fixed) {
+    return is_fixed ? size == 0 || size == bound : size <= bound;
+}
+
+static bool too_large(struct check *check, const char *path, uint64_t found, const char *unit, uint32_t bound) {
+    check->refusal->reason = LOSS_TOO_LARGE;
+    snprintf(check->refusal->text, sizeof check->refusal->text, "%s has %llu %s%s; the board takes %u", path,
+             (unsigned long long)found, unit, found == 1 ? "" : "s", bound);
+    return false;
+}
+
+static bool takes_length(struct check *check, const struct board_field *field, size_t length) {
+    if (fits(length, field->longest, field->flags & BOARD_HAS_FIXED_LENGTH)) return true;
+    return too_large(check, field->path, length, "byte", field->longest);
+}
+
+static bool takes_number(struct check *check, const struct board_field *field, const uint8_t *at) {
+    if (!(field->flags & BOARD_IS_FLOAT) || check->board->allows_non_finite) return true;
+    double number = field->kind == WIRE_I64 ? of_float64(load_little_endian(at, 8)) : of_float32(load_little_endian(at, 4));
+    if (isfinite(number)) return true;
+    check->refusal->reason = LOSS_NON_FINITE;
+    snprintf(check->refusal->text, sizeof check->refusal->text, "%s is %s", field->path,
+             isnan(number) ? "nan" : number > 0 ? "inf" : "-inf");
+    return false;
+}
+
+/* Count elements of a repeated field. */
+static bool takes_more(struct check *check, const struct board_field *field, uint64_t elements) {
+    if (!(field->flags & BOARD_IS_REPEATED)) return true;
+    uint64_t total = check->counts[field->counter] + elements;
+    if (total > field->most) return too_large(check, field->path, total, "element", field->most);
+    check->counts[field->counter] = (uint32_t)total;
+    return true;
+}
+
+/* Whether the lists of a message that has been read are complete. */
+static bool has_all_elements(struct check *check, const struct board_message *message) {
+    for (uint32_t index = 0; index < message->count; index++) {
+        const struct board_field *field = &message->fields[index];
+        if (!(field->flags & BOARD_HAS_FIXED_COUNT)) continue;
+        uint32_t count = check->counts[field->counter];
+        if (!fits(count, field->most, true)) return too_large(check, field->path, count, "element", field->most);
+    }
+    return true;
+}
+
+/* ---- values ---- */
+
+static const struct board_field *find_field(const struct board_message *message, uint32_t number) {
+    uint32_t low = 0, high = message->count;
+    while (low < high) {
+        uint32_t middle = low + (high - low) / 2;
+        if (message->fields[middle].number == number) return &message->fields[middle];
+        if (message->fields[middle].number < number) low = middle + 1;
+        else high = middle;
+    }
+    return NULL;
+}
+
+static bool takes_packed(struct check *check, const struct board_field *field, struct bytes values) {
+    uint64_t count = 0, value;
+    if (field->kind == WIRE_VARINT) {
+        while (values.at < values.end && read_varint(&values, LONGEST_VARINT, &value)) count++;
+        return takes_more(check, field, count);
+    }
+    size_t size = field->kind == WIRE_I64 ? 8 : 4;
+    if (!takes_more(check, field, left(&values) / size)) return false;
+    for (; left(&values) >= size; values.at += size)
+        if (!takes_number(check, field, values.at)) return false;
+    return true;
+}
+
+/* Enter a message. An element of a list begins with empty lists; what comes twice without being in one is merged. */
+static bool enter(struct check *check, const struct board_field *field, const uint8_t *end) {
+    const struct board_message *message = &check->board->messages[field->message];
+    if (check->depth == MOST_LEVELS) return too_large(check, field->path, MOST_LEVELS + 1, "level", MOST_LEVELS);
+    if (field->flags & BOARD_IS_REPEATED)
+        memset(&check->counts[message->first_counter], 0, message->counter_count * sizeof *check->counts);
+    check->levels[++check->depth] = (struct level){end, message};
+    check->rest.end = end;
+    return true;
+}
+
+static bool takes_len(struct check *check, const struct board_field *field, struct bytes value) {
+    switch (field->kind) {
+    case WIRE_MESSAGE:
+        check->rest.at = value.at;
+        return takes_more(check, field, 1) && enter(check, field, value.end);
+    case WIRE_BYTES: return takes_more(check, field, 1) && takes_length(check, field, left(&value));
+    default: return !(field->flags & BOARD_IS_REPEATED) || takes_packed(check, field, value);
+    }
+}
+
+static bool takes_field(struct check *check) {
+    uint32_t tag;
+    struct bytes value;
+    if (!read_tag(&check->rest, &tag) || !read_value(&check->rest, tag & 7, &value)) return true; /* it is well formed */
+    const struct board_field *field = find_field(check->levels[check->depth].message, tag >> 3);
+    if (!field) return true;
+    switch (tag & 7) {
+    case LEN: return takes_len(check, field, value);
+    case VARINT: return field->kind != WIRE_VARINT || takes_more(check, field, 1);
+    case I64:
+        return field->kind != WIRE_I64 || (takes_more(check, field, 1) && takes_number(check, field, value.at));
+    case I32:
+        return field->kind != WIRE_I32 || (takes_more(check, field, 1) && takes_number(check, field, value.at));
+    default: return true;
+    }
+}
+
+static bool takes_fields(struct check *check) {
+    for (;;) {
+        if (check->rest.at < check->rest.end) {
+            if (!takes_field(check)) return false;
+        } else {
+            if (!has_all_elements(check, check->levels[check->depth].message)) return false;
+            if (check->depth == 0) return true;
+            check->rest.end = check->levels[--check->depth].end;
+        }
+    }
+}
+
+bool board_takes(const struct board *board, const uint8_t *data, size_t size, struct board_refusal *refusal) {
+    struct check check; /* not initialized as a whole: only what is counted and entered is read */
+    check.board = board;
+    check.refusal = refusal;
+    if (size > board->longest) return too_large(&check, "the envelope", size, "byte", board->longest);
+    memset(check.counts, 0, board->messages->counter_count * sizeof *check.counts);
+    check.rest = (struct bytes){data, data + size};
+    check.depth = 0;
+    check.levels[0] = (struct level){data + size, board->messages};
+    return takes_fields(&check);
+}

@@ -1,0 +1,61 @@
+/* What a datagram for a board may hold: its firmware decodes with nanopb, into structures of a fixed size.
+ *
+ * Checked are the sizes of the envelope, of strings and bytes, the number of elements, and that numbers are finite. Not
+ * checked, though nanopb refuses it: a field of another wire type than its own, an integer of more bits than its field, a
+ * negative number in an enum that declares none, an unknown group. `BoardLimits` in types/board_limits.py has to give the
+ * same answers. */
+#ifndef BOARD_H
+#define BOARD_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "envelope.h"
+#include "events.h"
+
+enum { MOST_BOARD_COUNTERS = 4096 };
+
+enum board_flag {
+    BOARD_IS_FLOAT = 1,
+    BOARD_IS_REPEATED = 2,      /* at most `most` elements */
+    BOARD_HAS_FIXED_LENGTH = 4, /* `longest` bytes, or none */
+    BOARD_HAS_FIXED_COUNT = 8   /* `most` elements, or none */
+};
+
+struct board_field {
+    uint32_t number;
+    uint8_t kind;     /* enum wire_kind; WIRE_BYTES also for strings */
+    uint8_t flags;    /* of enum board_flag */
+    uint16_t message; /* of a message: its index */
+    uint32_t longest; /* of a string or bytes */
+    uint32_t most;
+    uint32_t counter; /* of elements */
+    uint32_t reserved;
+    const char *path; /* from the payload case on: "arm_ctrl.name" */
+};
+
+/* A message at one place of the tree that the envelope is: no two places share one, as each counts for itself. The
+ * counters of all that is inside follow each other. */
+struct board_message {
+    const struct board_field *fields; /* those that are checked, by ascending number */
+    uint32_t count;
+    uint32_t first_counter, counter_count;
+    uint32_t reserved;
+};
+
+struct board {
+    const struct board_message *messages; /* the first one is the envelope */
+    uint32_t longest;                     /* of an envelope */
+    uint32_t allows_non_finite;
+};
+
+struct board_refusal {
+    enum loss reason; /* LOSS_TOO_LARGE or LOSS_NON_FINITE */
+    char text[256];
+};
+
+/* Whether a board can take an envelope that is well formed. */
+bool board_takes(const struct board *board, const uint8_t *data, size_t size, struct board_refusal *refusal);
+
+#endif

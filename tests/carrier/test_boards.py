@@ -1,0 +1,212 @@
+"""What boards can take: by hand, and the carrier against Python for any message."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from router.carrier.boards import NativeBoards
+from router.errors import Located, SourceSpan
+from router.types.board_limits import NON_FINITE, TOO_LARGE, BoardLimits, Refusal, board_fields
+from router.types.protobuf import find_envelope, load_protos
+from tests.engine.wire import I32, I64, VARINT, framed, tag, varint
+
+PROTOS = Path(__file__).parent / "protos_of_boards"
+TEXTS, NUMBERS, TREE = 1, 2, 3
+LONGEST = 120
+REASONS = {1: NON_FINITE, 8: TOO_LARGE}
+"""Those of `enum loss`."""
+
+ONE = b"\0\0\x80\x3f"
+NAN, INF = b"\0\0\xc0\x7f", b"\0\0\x80\x7f"
+WIDE_INF = bytes(6) + b"\xf0\xff"
+
+
+class _Refusal(ctypes.Structure):
+    """`struct board_refusal` in board.h."""
+
+    _fields_ = (("reason", ctypes.c_int), ("text", ctypes.c_char * 256))
+
+
+class Boards:
+    """A board that refuses numbers that are not finite, and one that takes them; as Python and as C know them."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        span = SourceSpan("a test")
+        schema = load_protos(Located(PROTOS, span), Located("PBEnvelope", span))
+        self.envelope = find_envelope(schema, Located("payload", span))
+        fields = board_fields(schema.descriptor("PBEnvelope"), schema.board_options)
+        self.limits = {
+            name: BoardLimits(self.envelope, fields, LONGEST, allows)
+            for name, allows in {"strict": False, "lenient": True}.items()
+        }
+        self._native = NativeBoards(self.limits)
+        self._takes = library.board_takes
+
+    def carrier(self, data: bytes, board: str = "strict") -> Refusal | None:
+        found = _Refusal()
+        if self._takes(self._native.pointer(board), data, len(data), ctypes.byref(found)):
+            return None
+        return Refusal(REASONS[found.reason], found.text.decode())
+
+    def refusal(self, data: bytes, board: str = "strict") -> Refusal | None:
+        """What both say, which has to be the same."""
+        refusal = self.limits[board].refusal(data)
+        assert self.carrier(data, board) == refusal
+        return refusal
+
+
+@pytest.fixture(scope="module")
+def boards(library: ctypes.CDLL) -> Boards:
+    return Boards(library)
+
+
+TAKEN = {
+    "nothing": b"",
+    "an empty payload": framed(TEXTS, b""),
+    "texts at their bounds": framed(TEXTS, framed(1, b"1234567") + framed(2, b"1234") + framed(3, b"1234")),
+    "as many texts as fit": framed(TEXTS, framed(4, b"ab") * 2),
+    "an empty key": framed(TEXTS, framed(3, b"")),
+    "numbers": framed(NUMBERS, tag(1, I32) + ONE + tag(2, I64) + bytes(8)),
+    "the largest float": framed(NUMBERS, tag(1, I32) + b"\xff\xff\x7f\x7f"),
+    "packed numbers": framed(NUMBERS, framed(3, ONE * 3) + framed(5, varint(300) * 3)),
+    "numbers one by one": framed(NUMBERS, (tag(3, I32) + ONE) * 3 + (tag(5, VARINT) + varint(1)) * 3),
+    "packed and one by one": framed(NUMBERS, framed(3, ONE * 2) + tag(3, I32) + ONE),
+    "both of a pair": framed(NUMBERS, framed(6, b"\1\2")),
+    "lists in each of several": framed(TREE, framed(2, framed(3, ONE * 3)) * 2),
+    "a list here and there": framed(TREE, framed(1, framed(3, ONE * 3)) + framed(2, framed(3, ONE * 3))),
+    "a map": framed(TREE, framed(3, framed(1, b"abc") + framed(2, framed(3, ONE * 3)))),
+    "an unknown field": framed(TEXTS, framed(99, bytes(50))),
+    "a list of another wire type": framed(NUMBERS, (tag(5, I32) + ONE) * 5),
+    "a number of another wire type": framed(NUMBERS, framed(1, NAN)),
+}
+REFUSED = {
+    "an envelope that is too long": (framed(9, bytes(119)), "the envelope has 121 bytes; the board takes 120"),
+    "a text": (framed(TEXTS, framed(1, b"12345678")), "texts.name has 8 bytes; the board takes 7"),
+    "bytes": (framed(TEXTS, framed(2, bytes(5))), "texts.blob has 5 bytes; the board takes 4"),
+    "a key that is too short": (framed(TEXTS, framed(3, b"123")), "texts.key has 3 bytes; the board takes 4"),
+    "too many texts": (framed(TEXTS, framed(4, b"") * 3), "texts.names has 3 elements; the board takes 2"),
+    "a long one among texts": (framed(TEXTS, framed(4, b"abc")), "texts.names has 3 bytes; the board takes 2"),
+    "too many numbers": (framed(NUMBERS, framed(3, ONE * 4)), "numbers.floats has 4 elements; the board takes 3"),
+    "too many varints": (framed(NUMBERS, framed(5, b"\1" * 4)), "numbers.integers has 4 elements; the board takes 3"),
+    "half of a pair": (framed(NUMBERS, framed(6, b"\1")), "numbers.pair has 1 element; the board takes 2"),
+    "too many messages": (framed(TREE, framed(2, b"") * 3), "tree.many has 3 elements; the board takes 2"),
+    "too many entries": (
+        framed(TREE, b"".join(framed(3, framed(1, key)) for key in (b"a", b"b", b"c"))),
+        "tree.named has 3 elements; the board takes 2",
+    ),
+    "the key of an entry": (
+        framed(TREE, framed(3, framed(1, b"abcd"))),
+        "tree.named.key has 4 bytes; the board takes 3",
+    ),
+    "deep inside": (
+        framed(TREE, framed(2, b"") + framed(2, framed(3, ONE * 4))),
+        "tree.many.floats has 4 elements; the board takes 3",
+    ),
+    "parts that are merged": (
+        framed(TREE, framed(1, framed(3, ONE * 2)) * 2),
+        "tree.one.floats has 4 elements; the board takes 3",
+    ),
+}
+NOT_FINITE = {
+    "nan": (framed(NUMBERS, tag(1, I32) + NAN), "numbers.small is nan"),
+    "infinity": (framed(NUMBERS, tag(1, I32) + INF), "numbers.small is inf"),
+    "a double": (framed(NUMBERS, tag(2, I64) + WIDE_INF), "numbers.large is -inf"),
+    "packed": (framed(NUMBERS, framed(3, ONE + NAN)), "numbers.floats is nan"),
+    "one by one": (framed(NUMBERS, tag(4, I64) + bytes(8) + tag(4, I64) + WIDE_INF), "numbers.doubles is -inf"),
+    "in an entry": (framed(TREE, framed(3, framed(2, tag(1, I32) + NAN))), "tree.named.value.small is nan"),
+    "beside the payload": (framed(TREE, b"") + tag(20, I32) + INF, "beside is inf"),
+}
+
+
+@pytest.mark.parametrize("data", TAKEN.values(), ids=TAKEN)
+def test_what_fits_is_taken(boards: Boards, data: bytes) -> None:
+    assert boards.refusal(data) is None
+
+
+@pytest.mark.parametrize(("data", "text"), REFUSED.values(), ids=REFUSED)
+def test_what_does_not_fit_is_refused_with_field_and_bound(boards: Boards, data: bytes, text: str) -> None:
+    assert boards.refusal(data) == boards.refusal(data, "lenient") == Refusal(TOO_LARGE, text)
+
+
+@pytest.mark.parametrize(("data", "text"), NOT_FINITE.values(), ids=NOT_FINITE)
+def test_a_number_that_is_not_finite_is_refused_unless_it_is_allowed(boards: Boards, data: bytes, text: str) -> None:
+    assert boards.refusal(data) == Refusal(NON_FINITE, text)
+    assert boards.refusal(data, "lenient") is None
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        pytest.param(framed(TEXTS, framed(1, bytes(8)) + framed(1, b"")), "texts.name", id="an earlier value"),
+        pytest.param(framed(TEXTS, framed(1, bytes(8))) + framed(TREE, b""), "texts.name", id="an earlier payload"),
+        pytest.param(framed(NUMBERS, tag(1, I32) + NAN + tag(1, I32) + ONE), "numbers.small", id="an earlier number"),
+    ],
+)
+def test_nanopb_also_decodes_what_a_later_field_replaces(boards: Boards, data: bytes, text: str) -> None:
+    """Python, which reads what protobuf has made of it, does not know."""
+    assert boards.limits["strict"].refusal(data) is None
+    refusal = boards.carrier(data)
+    assert refusal is not None
+    assert refusal.text.startswith(text)
+
+
+# -- any message ------------------------------------------------------------------------------------------------------
+
+FLOATS = st.sampled_from([0.0, 1.5, -2.0, math.nan, math.inf, -math.inf, 3.4028234663852886e38])
+
+
+def maybe(**fields: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+    return st.fixed_dictionaries({}, optional=fields)
+
+
+TEXT, DATA = st.text("ab", max_size=9), st.binary(max_size=6)
+NUMBER = maybe(
+    small=FLOATS,
+    large=FLOATS,
+    floats=st.lists(FLOATS, max_size=4),
+    doubles=st.lists(FLOATS, max_size=3),
+    integers=st.lists(st.integers(-9, 900), max_size=4),
+    pair=st.lists(st.integers(-9, 900), max_size=3),
+    plain=st.integers(-9, 9),
+)
+ENVELOPES = st.one_of(
+    st.fixed_dictionaries(
+        {
+            "texts": maybe(
+                name=TEXT,
+                blob=DATA,
+                key=DATA,
+                names=st.lists(st.text("a", max_size=3), max_size=3),
+                keys=st.lists(DATA, max_size=3),
+            )
+        }
+    ),
+    st.fixed_dictionaries({"numbers": NUMBER, "beside": FLOATS}),
+    st.fixed_dictionaries(
+        {
+            "tree": maybe(
+                one=NUMBER, many=st.lists(NUMBER, max_size=3), named=st.dictionaries(st.text("k", max_size=4), NUMBER)
+            )
+        }
+    ),
+)
+
+
+@given(values=ENVELOPES, board=st.sampled_from(["strict", "lenient"]))
+def test_the_carrier_takes_what_python_takes(boards: Boards, values: dict[str, Any], board: str) -> None:
+    data = boards.envelope.message_class(**values).SerializeToString()
+    ours, theirs = boards.limits[board].refusal(data), boards.carrier(data, board)
+    assert (ours is None) == (theirs is None)
+
+
+@given(data=st.binary(max_size=LONGEST))
+def test_any_bytes_are_survived(boards: Boards, data: bytes) -> None:
+    boards.carrier(data)
+    boards.carrier(framed(TREE, data))
