@@ -340,7 +340,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._respond(plain(HTTPStatus.BAD_REQUEST, f"at most {MAX_IN_QUERY} values can be asked for"))
             return
         if path == "/tap":
-            self._for_own_computer(lambda: self._tap(query.get("case", []), query.get("from", [])))
+            asked_for = [query.get(key, []) for key in ("case", "from", "only")]
+            self._for_own_computer(lambda: self._tap(*asked_for))
         elif path == "/metrics":
             self._respond(self._responder.metrics(self.headers.get("Accept", "")))
         elif path == "/healthz":
@@ -383,10 +384,10 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(response.body)
 
-    def _tap(self, cases: list[str], sources: list[str]) -> None:
+    def _tap(self, cases: list[str], sources: list[str], decisions: list[str]) -> None:
         running = self._responder.running
         try:
-            is_wanted = wanted(running.program, cases, sources)
+            is_wanted = wanted(running.program, cases, sources, decisions)
         except TapRequestError as error:
             self._respond(plain(HTTPStatus.BAD_REQUEST, str(error)))
             return
