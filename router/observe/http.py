@@ -4,7 +4,7 @@
     GET  /metrics      for Prometheus
     GET  /healthz      200 while datagrams are received or could be, 503 where the receive thread is stuck
     GET  /ready        200 while everything is open
-    GET  /tap          what is received, before routing (see tap): ?case=NAME&from=ENDPOINT, each several times
+    GET  /tap          what is received (see tap): ?case=NAME&from=ENDPOINT&only=accepted, or rejected
     POST /-/reload     {"ok", "text", "findings"}: 200, or 422 where nothing was changed
     POST /record/save  {"ok", "file"}: 200; {"ok", "text"}: 409 where it failed, 404 where nothing is kept; the status
                        page may order this from any computer, gets the file's name only, and 429 within 10 s
