@@ -45,6 +45,7 @@ from router.carrier.ring import Ring
 from router.carrier.schema import CannotCarry
 from router.carrier.sender import NativeSender
 from router.carrier.worker import Stage, Worker
+from router.compiler.metrics import REJECT_REASONS
 from router.compiler.program import DeadmanPlan, Handler, Program, TargetPlan
 from router.engine import OutboundEngine, PartEngine
 from router.engine.binding import State
@@ -73,8 +74,11 @@ _PATIENCE_S = 1.0
 
 _TURN_S = 0.002
 
-_MIRROR = Struct("@IIqIIII")
+_MIRROR = Struct("@IIqIIIiiI")
 """`struct mirror_record`."""
+
+_REASONS = (*REJECT_REASONS, "")
+"""By `enum reason`; the last one is also ROUTED, -1."""
 
 _ROS, _ENDPOINTS, _GATEWAYS = "ros", "endpoints", "gateways"
 
@@ -455,9 +459,10 @@ class MirrorRing:
         while records := self.ring.take():
             position = 0
             while position < len(records):
-                size, listener, at, address, port, length, _ = _MIRROR.unpack_from(records, position)
+                size, listener, at, address, port, length, why, who, _ = _MIRROR.unpack_from(records, position)
                 data = bytes(records[position + head : position + head + length])
-                taken.append((at, self._name(listener), (_host(address), port), data))
+                sender = self._name(who) if who >= 0 else ""
+                taken.append((at, self._name(listener), (_host(address), port), sender, _REASONS[why], data))
                 position += size
         return taken
 

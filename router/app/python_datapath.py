@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from router.app.sockets import SocketChange
@@ -26,7 +27,7 @@ from router.engine.deadman import Deadman, commander, feeder
 from router.engine.dispatch import Receive
 from router.net.receiver import FOR_SOCKETS, FOR_SUBSCRIBERS, ReceiveThread
 from router.net.udp import Listener, Sender
-from router.recording.mirror import Mirror
+from router.recording.mirror import Classifier, Mirror
 from router.table import model
 from router.types.framing import MAX_DATAGRAM
 
@@ -158,5 +159,11 @@ class PythonDatapath:
         self._receiving.replace_receivers(self._observed())
 
     def _observed(self) -> dict[str, Receive]:
-        receive = self._wiring.receive if self._wiring else {}
-        return {name: self._mirror.tee(name, each) for name, each in receive.items()}
+        if self._wiring is None:
+            return {}
+        program = self._wiring.program
+        known = Classifier(program.envelope, program.table)
+        return {
+            name: self._mirror.tee(name, each, partial(known.sender, name))
+            for name, each in self._wiring.receive.items()
+        }

@@ -41,11 +41,11 @@ class Reloader:
         self._replaced = replaced
         self._is_open = False
         self._one_at_a_time = threading.Lock()
+        self._remember(is_good=True)  # the first table, before anybody can scrape
 
     def open(self) -> None:
-        """Allow reloads, once the router runs, and count the start as a successful load."""
+        """Allow reloads, once the router runs."""
         self._is_open = True
-        self._remember(is_good=True)
 
     def close(self) -> None:
         """Wait for a reload that is running; refuse any other."""

@@ -167,7 +167,8 @@ class _Writer:
         known += [(host, 0, name) for host, name in by_host.items()]
         for address, _, port, name in sorted((_number(host), not port, port, name) for host, port, name in known):
             last_seen = self.counters.index("endpoint_last_seen_timestamp_seconds", name)
-            yield c.Peer(address=address, port=port, column=self.columns[name], last_seen=last_seen)
+            number = self.outlets.names.number(name)
+            yield c.Peer(address=address, port=port, column=self.columns[name], last_seen=last_seen, id=number)
 
     def _entries(self) -> Iterator[c.Entry]:
         """Row by row, as in `cases`: a column for each endpoint, and the last one for strangers."""

@@ -247,7 +247,13 @@ class Case(ctypes.Structure):
 class Peer(ctypes.Structure):
     """`struct peer` in carrier.h."""
 
-    _fields_ = (("address", c_uint32), ("port", c_uint32), ("column", c_uint32), ("last_seen", c_uint32))
+    _fields_ = (
+        ("address", c_uint32),
+        ("port", c_uint32),
+        ("column", c_uint32),
+        ("last_seen", c_uint32),
+        ("id", c_uint32),
+    )
 
 
 class Listener(ctypes.Structure):
@@ -402,6 +408,8 @@ class MirrorRecord(ctypes.Structure):
         ("address", c_uint32),
         ("port", c_uint32),
         ("length", c_uint32),
+        ("reason", c_int32),
+        ("endpoint", c_int32),
         ("reserved", c_uint32),
     )
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 FAILED = 1
 
 
-_DESCRIPTION = """Write every datagram that a running router receives to an MCAP file, until Ctrl-C: before it is
-routed, also what no route takes, with sender and time. Foxglove opens the file as it is, 'router replay' sends it
+_DESCRIPTION = """Write every datagram that a running router receives to an MCAP file, until Ctrl-C, with sender and
+time; also what no route takes, with the reason. Foxglove opens the file as it is, 'router replay' sends it
 again. To record always, without this command, give the table a 'record'."""
 
 

@@ -17,12 +17,14 @@ from router.cli.tool_options import (
     until_interrupted,
 )
 
-_DESCRIPTION = """Print what a running router receives, before it routes it: the fields that are not default. The
-router is asked where the table's 'http.address' says, on this computer; it does not wait for this terminal, and
-says how many datagrams were too many for it. To listen at a port or a ROS topic without a router: 'router listen'."""
+_DESCRIPTION = """Print what a running router receives: the fields that are not default, and why it rejected what no
+route took. The router is asked where the table's 'http.address' says, on this computer; it does not wait for this
+terminal, and says how many datagrams were too many for it. To listen at a port or a ROS topic without a router: 'router
+listen'."""
 _EXAMPLES = (
     "router tap imu_info gps_info -t routes/sim.yaml",
     "router tap --from arm_board --for 10s",
+    "router tap --only rejected",
     "router tap imu_info --where 'accel_z < 0 or not is_calibrated'",
     "router tap --count 100 --json > hundred.jsonl",
 )
@@ -33,6 +35,8 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("cases", nargs="*", metavar="CASE", help="only these payload cases (default: everything)")
     about = "only from this endpoint or IP address; several are possible"
     parser.add_argument("--from", dest="sources", action="append", default=[], metavar="ENDPOINT", help=about)
+    about = "only what a route took, or only what none took"
+    parser.add_argument("--only", choices=("accepted", "rejected"), help=about)
     about = "only what this expression of the table's language holds for: 'satellites < 4'"
     parser.add_argument("--where", metavar="EXPR", help=about)
     add_count(parser)
@@ -47,16 +51,15 @@ def run(args: argparse.Namespace) -> int:
     from router.threads import background_threads
     from router.tools.running_router import tap
     from router.tools.tap import Condition, RunningTap
-    from router.tools.udp import peer_names
 
     url = running_url(args)
-    wire, table = load_wire(args)
+    wire, _ = load_wire(args)
     cases = [wire.case(name) for name in args.cases]
     condition = Condition(args.where, cases or list(wire.envelope.cases.values())) if args.where else None
-    taken = RunningTap(wire, peer_names(table), args.cases, condition)
+    taken = RunningTap(wire, args.cases, condition)
     wanted = args.cases or (sorted(condition.cases) if condition else [])
     # The router goes before whatever runs on its computer to watch it.
-    with background_threads(), tap(url, wanted, args.sources) as batches:
+    with background_threads(), tap(url, wanted, args.sources, args.only) as batches:
         say(f"tapping the router at {url}; Ctrl-C ends it")
         try:
             with until_interrupted():

@@ -22,7 +22,9 @@ from router.types.framing import MAX_DATAGRAM
 from router.types.wire import LEN
 
 Peer = tuple[str, int]
-Receive = Callable[[bytes, Peer], None]
+Receive = Callable[[bytes, Peer], str]
+"""Takes a datagram, and returns why no route took it: one of REJECT_REASONS, "" if one did."""
+
 Take = Callable[[bytes, int], None]
 
 ServePart = Callable[[bytes | None, bytes, int, int, str, int], None]
@@ -100,7 +102,7 @@ class InboundEngine:
         seen = self._seen_indexes(addresses)
         parse_slowly, reject = SlowPath(self._program, counts, listener, cases).parse, self._rejecter(listener)
 
-        def receive(data: bytes, peer: Peer) -> None:
+        def receive(data: bytes, peer: Peer) -> str:
             now = clock_ns()
             received_at = wall_ns()
             size = len(data)
@@ -125,17 +127,18 @@ class InboundEngine:
                     case, message, data = parse_slowly(data)
                 except Rejected as rejected:
                     reject(rejected.reason, peer, str(rejected))
-                    return
+                    return rejected.reason
             route = case.routes.get(sender_key, case.stranger)
             if route is None:
                 reject("source_mismatch", peer, case.name)
-                return
+                return "source_mismatch"
             counts[route.received] += 1
             route.handle(message, data, received_at, now, route.name)
             counts[route.last_message] = received_at
             elapsed = clock_ns() - now
             counts[route.seconds + bisect_left(bounds, elapsed)] += 1
             counts[route.seconds + _SUM] += elapsed
+            return ""
 
         return receive
 

@@ -20,8 +20,11 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from time import monotonic_ns
 
-from router.engine.dispatch import Receive
+from router.engine.dispatch import Peer
 from router.net.udp import Listener
+
+Receive = Callable[[bytes, Peer], object]
+"""Takes a datagram. What it returns is of no use here."""
 
 SAMPLE = 32
 """Number of datagrams by which their density is measured."""

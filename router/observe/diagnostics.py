@@ -202,7 +202,11 @@ class Report:
         ]
         if not self.now.total("config_last_reload_successful"):
             problems.append(_warning("the last reload failed, and the table from before it goes on"))
-        values = [("table", table.path), ("table sha256", table.sha256), ("protos sha256", self.program.protos_sha256)]
+        values = [
+            ("table", table.path.name),
+            ("table sha256", table.sha256),
+            ("protos sha256", self.program.protos_sha256),
+        ]
         return _status("router", self.host, problems, "routing", values)
 
     def _listener(self, name: str) -> Status:

@@ -1,6 +1,7 @@
 """The live view in Foxglove: a WebSocket server with a channel for each payload case, named as in recordings.
 
-Foxglove decodes payloads by the descriptors that the channels carry. The mirror is attached while a client subscribes.
+Only what a route took is shown. Foxglove decodes payloads by the descriptors that the channels carry. The mirror is
+attached while a client subscribes.
 """
 
 from __future__ import annotations
@@ -135,11 +136,13 @@ class FoxgloveServer(ServerListener):
         return _View(program, Classifier(program.envelope, program.table), channels)
 
     def _send(self, batch: Sequence[Mirrored]) -> None:
-        """Log the payloads of subscribed channels. Called by the mirror's thread."""
+        """Log the accepted payloads of subscribed channels. Called by the mirror's thread."""
         program, classifier, channels = self._view
         wanted = {case.number for name, case in program.envelope.cases.items() if channels[name].has_sinks()}
-        for at, listener, _, data in batch:
-            if first_field(data) in wanted and (found := classifier.encoded_payload(listener, data)) is not None:
+        for at, listener, _, _, reason, data in batch:
+            if reason or first_field(data) not in wanted:
+                continue
+            if (found := classifier.encoded_payload(listener, data)) is not None:
                 case, payload = found
                 channels[case.name].log(payload, log_time=at)
 

@@ -4,7 +4,7 @@
     GET  /metrics      for Prometheus
     GET  /healthz      200 while datagrams are received or could be, 503 where the receive thread is stuck
     GET  /ready        200 while everything is open
-    GET  /tap          what is received, before routing (see tap): ?case=NAME&from=ENDPOINT, each several times
+    GET  /tap          what is received (see tap): ?case=NAME&from=ENDPOINT&only=accepted, or rejected
     POST /-/reload     {"ok", "text", "findings"}: 200, or 422 where nothing was changed
     POST /record/save  {"ok", "file"}: 200; {"ok", "text"}: 409 where it failed, 404 where nothing is kept; the status
                        page may order this from any computer, gets the file's name only, and 429 within 10 s
@@ -340,7 +340,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._respond(plain(HTTPStatus.BAD_REQUEST, f"at most {MAX_IN_QUERY} values can be asked for"))
             return
         if path == "/tap":
-            self._for_own_computer(lambda: self._tap(query.get("case", []), query.get("from", [])))
+            asked_for = [query.get(key, []) for key in ("case", "from", "only")]
+            self._for_own_computer(lambda: self._tap(*asked_for))
         elif path == "/metrics":
             self._respond(self._responder.metrics(self.headers.get("Accept", "")))
         elif path == "/healthz":
@@ -383,10 +384,10 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(response.body)
 
-    def _tap(self, cases: list[str], sources: list[str]) -> None:
+    def _tap(self, cases: list[str], sources: list[str], decisions: list[str]) -> None:
         running = self._responder.running
         try:
-            is_wanted = wanted(running.program, cases, sources)
+            is_wanted = wanted(running.program, cases, sources, decisions)
         except TapRequestError as error:
             self._respond(plain(HTTPStatus.BAD_REQUEST, str(error)))
             return

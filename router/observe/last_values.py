@@ -1,4 +1,4 @@
-"""The newest value of each payload case, for the status page.
+"""The newest value of each payload case that a route took, for the status page.
 
 The mirror is attached while a page asks, and datagrams are decoded when it does.
 """
@@ -26,7 +26,7 @@ Value = dict[str, Any]
 
 
 class LastValues:
-    """The newest datagram of each payload case since the first of requests that follow one another."""
+    """The newest accepted datagram of each payload case since the first of requests that follow one another."""
 
     def __init__(self, running: Running) -> None:
         self._running = running
@@ -62,18 +62,19 @@ class LastValues:
         """Called by the mirror's thread."""
         with self._newest_lock:
             for datagram in batch:
-                _, _, _, data = datagram
-                self._newest[first_field(data)] = datagram
+                *_, reason, data = datagram
+                if not reason:
+                    self._newest[first_field(data)] = datagram
 
     def _decode(self, datagram: Mirrored, classifier: Classifier) -> None:
-        at, listener, peer, data = datagram
+        at, listener, peer, endpoint, _, data = datagram
         if (found := classifier.payload(listener, data)) is None:
-            return  # the page shows it among what was rejected
+            return  # a reload has changed the messages meanwhile
         case, payload = found
         fields = MessageToDict(payload, preserving_proto_field_name=True, always_print_fields_with_no_presence=True)
         self._values[case.name] = {
             "at": at / 1e9,
-            "source": classifier.sender(listener, peer) or f"{peer[0]}:{peer[1]}",
+            "source": endpoint or f"{peer[0]}:{peer[1]}",
             "bytes": len(data),
             "fields": shortened(fields),
         }

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Any
 
 from router.clock import wall_ns
-from router.errors import shown_path
 from router.observe.last_values import LastValues
 from router.observe.route_map import nodes_and_edges
 from router.observe.running import Running
@@ -85,7 +84,7 @@ class Status:
             "at": wall_ns() / 1e9,
             "started": self._started,
             "map": table.sha256,
-            "table": shown_path(table.path),
+            "table": table.path.name,
             "ready": running.is_ready,
             "progress": running.progress(),
             **found,

@@ -1,12 +1,13 @@
-"""A tap on a running router: what it receives, before routing, as a stream of bytes over HTTP.
+"""A tap on a running router: what it receives, and what it decides about it, as a stream of bytes over HTTP.
 
 The stream is MAGIC and then records, each behind its length: `<uint32 length> <uint8 kind> ...`, all little-endian.
 
-    SEEN   <uint64 wall clock, ns> <4 bytes IPv4 address> <uint16 port> <uint8 length> <listener> <datagram>
+    SEEN   <uint64 wall clock, ns> <4 bytes IPv4 address> <uint16 port> <listener> <endpoint> <reason> <datagram>
     LOST   <uint64 count>    so many were not sent, because the reader of the stream is too slow
     ALIVE                    nothing was seen: once a second where there is nothing to send
 
-A datagram longer than the router takes is cut to one byte more than that.
+Listener, endpoint and reason, as in MirroredDatagram, are texts behind their lengths (uint16). A datagram longer than
+the router takes is cut to one byte more than that.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from typing import NamedTuple
 
 from router.compiler.program import Program
 from router.errors import RouterError, TransportError, did_you_mean
-from router.recording.mirror import Classifier, Mirror, Mirrored, MirroredDatagram, first_field
+from router.recording.mirror import Mirror, Mirrored, MirroredDatagram, first_field
 
-MAGIC = b"router tap 1\n"
+MAGIC = b"router tap 2\n"
 CONTENT_TYPE = "application/x-router-tap"
 
 SEEN, LOST, ALIVE = 1, 2, 3
@@ -36,27 +37,48 @@ ALIVE_SECONDS = 1.0
 _LENGTH = struct.Struct("<I")
 _SEEN = struct.Struct("<IBQ")
 _LOST = struct.Struct("<IBQ")
-_SENDER = struct.Struct("<4sHB")
+_PEER = struct.Struct("<4sH")
+_TEXT = struct.Struct("<H")
 _LONGEST = 1 << 20
 
 Wanted = Callable[[Mirrored], bool]
 
 
+ACCEPTED, REJECTED = "accepted", "rejected"
+DECISIONS = (ACCEPTED, REJECTED)
+"""What a tap may be limited to."""
+
+
 class TapRequestError(RouterError):
-    """A payload case or an endpoint was asked for that there is not."""
+    """A payload case, an endpoint or a decision was asked for that there is not."""
 
 
-def wanted(program: Program, cases: Sequence[str], sources: Sequence[str]) -> Wanted | None:
-    """Return what tells whether a datagram is of these payload cases and from these endpoints; None: all are wanted.
+def wanted(
+    program: Program, cases: Sequence[str], sources: Sequence[str], decisions: Sequence[str] = ()
+) -> Wanted | None:
+    """Return what tells whether a datagram is of these payload cases, from these endpoints, and was decided about in
+    this way; None: all are wanted.
 
     What does not begin with the field of a payload case is wanted in any case: only a decoder can say what it is.
     A source may be an IPv4 address as well. Raises TapRequestError.
     """
-    of_case = _of_case(program, cases) if cases else None
-    from_source = _from_source(program, sources) if sources else None
-    if of_case is None or from_source is None:
-        return of_case or from_source
-    return lambda datagram: from_source(datagram) and of_case(datagram)
+    asked = [
+        *([_of_decision(decisions)] if decisions else []),
+        *([_from_source(program, sources)] if sources else []),
+        *([_of_case(program, cases)] if cases else []),
+    ]
+    return (lambda datagram: all(is_wanted(datagram) for is_wanted in asked)) if asked else None
+
+
+def _of_decision(decisions: Sequence[str]) -> Wanted:
+    if unknown := [name for name in decisions if name not in DECISIONS]:
+        raise TapRequestError(f"datagrams are {' or '.join(DECISIONS)}, not '{unknown[0]}'")
+
+    def is_wanted(datagram: Mirrored) -> bool:
+        *_, reason, _ = datagram
+        return (REJECTED if reason else ACCEPTED) in decisions
+
+    return is_wanted
 
 
 def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
@@ -66,7 +88,7 @@ def _of_case(program: Program, cases: Sequence[str]) -> Wanted:
     unwanted = frozenset(case.number for name, case in known.items() if name not in cases)
 
     def is_wanted(datagram: Mirrored) -> bool:
-        _, _, _, data = datagram
+        *_, data = datagram
         return first_field(data) not in unwanted
 
     return is_wanted
@@ -76,11 +98,11 @@ def _from_source(program: Program, sources: Sequence[str]) -> Wanted:
     endpoints = program.table.endpoints
     if unknown := [name for name in sources if name not in endpoints and not name[:1].isdigit()]:
         raise TapRequestError(f"the router has no endpoint '{unknown[0]}'; {did_you_mean(unknown[0], endpoints)}")
-    sender, names = Classifier(program.envelope, program.table).sender, frozenset(sources)
+    names = frozenset(sources)
 
     def is_wanted(datagram: Mirrored) -> bool:
-        _, listener, peer, _ = datagram
-        return peer[0] in names or sender(listener, peer) in names
+        _, _, peer, endpoint, *_ = datagram
+        return peer[0] in names or endpoint in names
 
     return is_wanted
 
@@ -135,9 +157,9 @@ class Tap:
 def encode(batch: Iterable[Mirrored]) -> bytes:
     """One record for each."""
     pieces: list[bytes] = []
-    for at, listener, peer, data in batch:
-        sender = _sender(listener, peer)
-        pieces += (_SEEN.pack(9 + len(sender) + len(data), SEEN, at), sender, data)
+    for at, listener, peer, endpoint, reason, data in batch:
+        head = _head(listener, peer, endpoint, reason)
+        pieces += (_SEEN.pack(9 + len(head) + len(data), SEEN, at), head, data)
     return b"".join(pieces)
 
 
@@ -150,9 +172,11 @@ def encode_alive() -> bytes:
 
 
 @lru_cache(1024)
-def _sender(listener: str, peer: tuple[str, int]) -> bytes:
-    name = listener.encode()
-    return _SENDER.pack(socket.inet_aton(peer[0]), peer[1], len(name)) + name
+def _head(listener: str, peer: tuple[str, int], *texts: str) -> bytes:
+    pieces = [_PEER.pack(socket.inet_aton(peer[0]), peer[1])]
+    for text in map(str.encode, (listener, *texts)):
+        pieces += (_TEXT.pack(len(text)), text)
+    return b"".join(pieces)
 
 
 class Lost(NamedTuple):
@@ -197,8 +221,12 @@ def _record(record: bytes) -> Iterator[MirroredDatagram | Lost]:
     if record[0] == LOST:
         yield Lost(int.from_bytes(record[1:9], "little"))
     elif record[0] == SEEN:
-        host, port, length = _SENDER.unpack_from(record, 9)
-        data = 9 + _SENDER.size + length
-        listener = record[9 + _SENDER.size : data].decode()
         at = int.from_bytes(record[1:9], "little")
-        yield MirroredDatagram(at, listener, (socket.inet_ntoa(host), port), record[data:])
+        host, port = _PEER.unpack_from(record, 9)
+        start, texts = 9 + _PEER.size, list[str]()
+        for _ in range(3):
+            (length,) = _TEXT.unpack_from(record, start)
+            start += _TEXT.size + length
+            texts.append(record[start - length : start].decode())
+        listener, endpoint, reason = texts
+        yield MirroredDatagram(at, listener, (socket.inet_ntoa(host), port), endpoint, reason, record[start:])

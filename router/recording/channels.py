@@ -1,7 +1,7 @@
 """Schemas and channels of recordings. The files of one router use the same numbers for them.
 
-A channel is what one sender sends of one payload case to one listener. Its metadata says so; together with a message's
-data that is the whole datagram (see `Holds`).
+A channel is what one sender sends of one payload case to one listener, and what routing decided about it. Its metadata
+says so; together with a message's data that is the whole datagram (see `Holds`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
-from router.recording.mirror import Peer
+from router.engine.dispatch import Peer
 from router.types.protobuf import PayloadCase
 
 DATAGRAMS = "raw/datagrams"
 """The topic of datagrams as received. No payload case can have a slash in its name."""
+
+REJECTED = "rejected/{reason}/{topic}"
+"""The topic of what no route took, so that viewers do not mix it with what one did."""
 
 MOST_CHANNELS = 4096
 """Senders beyond that, as of a client that changes its port each time, are recorded as raw datagrams."""
@@ -46,20 +49,21 @@ class Channels:
         self._schema_ids: dict[tuple[str, bytes], int] = {}
         self._channel_ids: dict[tuple[object, ...], int] = {}
 
-    def payload(self, case: PayloadCase, listener: str, peer: Peer, endpoint: str) -> int | None:
-        """`endpoint` is the table's name of the sender, empty for a stranger. None where there are too many."""
-        metadata = _metadata(case, Holds.PAYLOAD, listener=listener, peer=f"{peer[0]}:{peer[1]}", endpoint=endpoint)
-        if len(self.channels) >= MOST_CHANNELS and self._key(case.name, _payload(case), metadata) not in (
-            self._channel_ids
-        ):
+    def payload(self, case: PayloadCase, listener: str, peer: Peer, endpoint: str, reason: str) -> int | None:
+        """`endpoint` and `reason` are those of a MirroredDatagram. None where there are too many channels."""
+        sender = {"listener": listener, "peer": f"{peer[0]}:{peer[1]}", "endpoint": endpoint}
+        topic, metadata = _decided(case.name, {**_metadata(case, Holds.PAYLOAD), **sender}, reason)
+        if len(self.channels) >= MOST_CHANNELS and self._key(topic, _payload(case), metadata) not in self._channel_ids:
             return None
-        return self._channel(case.name, _payload(case), metadata)
+        return self._channel(topic, _payload(case), metadata)
 
-    def view(self, case: PayloadCase) -> int:
-        return self._channel(case.name, _payload(case), _metadata(case, Holds.VIEW))
+    def view(self, case: PayloadCase, reason: str) -> int:
+        topic, metadata = _decided(case.name, _metadata(case, Holds.VIEW), reason)
+        return self._channel(topic, _payload(case), metadata)
 
-    def datagrams(self) -> int:
-        return self._channel(DATAGRAMS, DATAGRAM, {"holds": Holds.DATAGRAM.value})
+    def datagrams(self, reason: str) -> int:
+        topic, metadata = _decided(DATAGRAMS, {"holds": Holds.DATAGRAM.value}, reason)
+        return self._channel(topic, DATAGRAM, metadata)
 
     def _channel(self, topic: str, message: Descriptor, metadata: dict[str, str]) -> int:
         key = self._key(topic, message, metadata)
@@ -81,8 +85,15 @@ class Channels:
         return self._schema_ids[key]
 
 
-def _metadata(case: PayloadCase, holds: Holds, **sender: str) -> dict[str, str]:
-    return {"holds": holds.value, "number": str(case.number), **sender}
+def _metadata(case: PayloadCase, holds: Holds) -> dict[str, str]:
+    return {"holds": holds.value, "number": str(case.number)}
+
+
+def _decided(topic: str, metadata: dict[str, str], reason: str) -> tuple[str, dict[str, str]]:
+    """Return topic and metadata of a channel for datagrams that were rejected for `reason`, if there is one."""
+    if not reason:
+        return topic, metadata
+    return REJECTED.format(reason=reason, topic=topic), {**metadata, "reason": reason}
 
 
 def _payload(case: PayloadCase) -> Descriptor:

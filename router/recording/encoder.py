@@ -21,8 +21,9 @@ from google.protobuf.message import Message
 from mcap.opcode import Opcode
 from mcap.records import Chunk as ChunkRecord
 
+from router.engine.dispatch import Peer
 from router.recording.channels import Channels, Datagram
-from router.recording.mirror import Classifier, Mirrored, Peer
+from router.recording.mirror import Classifier, Mirrored
 from router.types.framing import MAX_DATAGRAM
 from router.types.protobuf import PayloadCase
 from router.types.wire import LEN, varint
@@ -65,7 +66,7 @@ class Chunk:
 
 
 class _Shape(NamedTuple):
-    """What datagrams of one sender, length and payload case have in common.
+    """What datagrams of one sender, length, payload case and decision have in common.
 
     `header` is the envelope's tag and length. `length` is that of the message record behind its length field,
     `message_index` the index of its channel.
@@ -109,10 +110,10 @@ class Encoder:
         self._shift = self._steady = 0
         self._classifier: Classifier | None = None
         self._cases: dict[bytes, PayloadCase] = {}  # by tag
-        self._shapes: dict[tuple[str, Peer, int, bytes], _Shape] = {}
-        self._payload_channels: dict[tuple[str, str, Peer], int | None] = {}
-        self._other_channels: dict[str, int] = {}
-        self._raw: dict[tuple[str, Peer], tuple[bytes, bytes]] = {}
+        self._shapes: dict[tuple[str, Peer, str, str, int, bytes], _Shape] = {}
+        self._payload_channels: dict[tuple[str, str, Peer, str, str], int | None] = {}
+        self._other_channels: dict[tuple[str, str], int] = {}
+        self._raw: dict[tuple[str, Peer, str], tuple[bytes, bytes]] = {}
 
     @property
     def size(self) -> int:
@@ -127,13 +128,13 @@ class Encoder:
             self._use(classifier)
         self._datagrams += len(batch)
         self._monotonic = monotonic
-        times, listeners, peers, data = zip(*batch, strict=True)
+        times, listeners, peers, endpoints, reasons, data = zip(*batch, strict=True)
         self._bytes += sum(map(len, data))
         steady = self._steady_times(times, wall, monotonic)
         first = self._sequence + 1
         self._sequence += len(batch)
         sequences = map(_SEQUENCE.__and__, range(first, first + len(batch)))
-        shapes = self._shapes_of(listeners, peers, data)
+        shapes = self._shapes_of(listeners, peers, endpoints, reasons, data)
         found = [shape for shape in shapes if shape is not None]
         if len(found) == len(batch) and _parses(self._parse_envelope, b"".join(data)):
             _, payloads, lengths, channels, indexes, _ = zip(*found, strict=True)
@@ -215,26 +216,33 @@ class Encoder:
         deque(map(list.extend, indexes, zip(log_times, offsets, strict=True)), maxlen=0)
 
     def _shapes_of(
-        self, listeners: Sequence[str], peers: Sequence[Peer], data: Sequence[bytes]
+        self,
+        listeners: Sequence[str],
+        peers: Sequence[Peer],
+        endpoints: Sequence[str],
+        reasons: Sequence[str],
+        data: Sequence[bytes],
     ) -> Sequence[_Shape | None]:
         """Return the shape of each, None for one that has to be recorded raw."""
-        shapes = list(map(self._shapes.get, zip(listeners, peers, map(len, data), map(_TAG, data), strict=True)))
+        keys = zip(listeners, peers, endpoints, reasons, map(len, data), map(_TAG, data), strict=True)
+        shapes = list(map(self._shapes.get, keys))
         if None in shapes:
-            shapes = list(map(self._shape, listeners, peers, data))
+            shapes = list(map(self._shape, listeners, peers, endpoints, reasons, data))
         return [
             shape if shape is not None and each.startswith(shape.header) else None
             for shape, each in zip(shapes, data, strict=True)
         ]
 
-    def _shape(self, listener: str, peer: Peer, data: bytes) -> _Shape | None:
+    def _shape(self, listener: str, peer: Peer, endpoint: str, reason: str, data: bytes) -> _Shape | None:
         """Return None for a datagram that is not one field of a payload case, encoded as protobuf encodes it."""
-        if (known := self._shapes.get((listener, peer, len(data), data[:2]))) is not None:
+        key = listener, peer, endpoint, reason, len(data), data[:2]
+        if (known := self._shapes.get(key)) is not None:
             return known
         tag = data[: 1 if data[:1] < b"\x80" else 2 if data[1:2] < b"\x80" else 3]
         if tag not in self._cases or len(data) > MAX_DATAGRAM or (header := _header(tag, data)) is None:
             return None
         case = self._cases[tag]
-        channel = self._payload_channel(case, listener, peer)
+        channel = self._payload_channel(case, listener, peer, endpoint, reason)
         if channel is None:
             return None
         length = _BEHIND_LENGTH + len(data) - len(header)
@@ -242,26 +250,25 @@ class Encoder:
         shape = _Shape(header, slice(len(header), None), length, channel, self._index(channel), parse)
         if len(self._shapes) >= _MOST_SHAPES:
             self._shapes.clear()
-        self._shapes[listener, peer, len(data), data[:2]] = shape
+        self._shapes[key] = shape
         return shape
 
-    def _payload_channel(self, case: PayloadCase, listener: str, peer: Peer) -> int | None:
-        key = (case.name, listener, peer)
+    def _payload_channel(self, case: PayloadCase, listener: str, peer: Peer, endpoint: str, reason: str) -> int | None:
+        key = case.name, listener, peer, endpoint, reason
         if key not in self._payload_channels:
-            assert self._classifier is not None  # noqa: S101 - `add` has set it
             if len(self._payload_channels) >= _MOST_SHAPES:
                 self._payload_channels.clear()
-            endpoint = self._classifier.sender(listener, peer)
-            self._payload_channels[key] = self._channels.payload(case, listener, peer, endpoint)
+            self._payload_channels[key] = self._channels.payload(case, listener, peer, endpoint, reason)
         return self._payload_channels[key]
 
-    def _other_channel(self, case: PayloadCase | None) -> int:
+    def _other_channel(self, case: PayloadCase | None, reason: str) -> int:
         """Return the channel of a case's views, or that of raw datagrams."""
-        name = case.name if case is not None else ""
-        if name not in self._other_channels:
+        key = case.name if case is not None else "", reason
+        if key not in self._other_channels:
             channels = self._channels
-            self._other_channels[name] = channels.view(case) if case is not None else channels.datagrams()
-        return self._other_channels[name]
+            number = channels.view(case, reason) if case is not None else channels.datagrams(reason)
+            self._other_channels[key] = number
+        return self._other_channels[key]
 
     def _index(self, channel: int) -> list[int]:
         return self._indexes.setdefault(channel, [])
@@ -270,28 +277,28 @@ class Encoder:
         self, classifier: Classifier, datagram: Mirrored, shape: _Shape | None, sequence: int, publish_time: int
     ) -> Iterator[_Row]:
         """Yield the payload where that is the whole datagram; else the datagram, and its payload if there is one."""
-        at, listener, peer, data = datagram
+        at, listener, peer, endpoint, reason, data = datagram
         if shape is not None and _parses(shape.parse, data[shape.payload]):
             row = (sequence, at, publish_time, data[shape.payload], shape.message_index)
             yield _Row(shape.length, shape.channel, *row)
             return
-        messages = [(self._other_channel(None), self._datagram(classifier, listener, peer, data))]
+        messages = [(self._other_channel(None, reason), self._datagram(listener, peer, endpoint, data))]
         if (found := classifier.encoded_payload(listener, data)) is not None:
             case, payload = found
-            messages.append((self._other_channel(case), payload))
+            messages.append((self._other_channel(case, reason), payload))
         for channel, message in messages:
             length = _BEHIND_LENGTH + len(message)
             yield _Row(length, channel, sequence, at, publish_time, message, self._index(channel))
 
-    def _datagram(self, classifier: Classifier, listener: str, peer: Peer, data: bytes) -> bytes:
+    def _datagram(self, listener: str, peer: Peer, endpoint: str, data: bytes) -> bytes:
         """Encode a `Datagram`; fields before and behind `data` are encoded once for a sender."""
-        if (listener, peer) not in self._raw:
+        key = listener, peer, endpoint
+        if key not in self._raw:
             if len(self._raw) >= _MOST_SHAPES:
                 self._raw.clear()
             before = Datagram(listener=listener, peer=f"{peer[0]}:{peer[1]}").SerializeToString()
-            behind = Datagram(endpoint=classifier.sender(listener, peer)).SerializeToString()
-            self._raw[listener, peer] = before, behind
-        before, behind = self._raw[listener, peer]
+            self._raw[key] = before, Datagram(endpoint=endpoint).SerializeToString()
+        before, behind = self._raw[key]
         return b"".join((before, _DATA_TAG, varint(len(data)), data, behind))
 
 

@@ -1,4 +1,4 @@
-"""The mirror: what listeners receive, before routing, for recordings, taps and pages.
+"""The mirror: what listeners receive, and what routing decided about it, for recordings, taps and pages.
 
 While no consumer is attached, the receive path has nothing of it. The carrier has a ring of its own in place of `tee`.
 """
@@ -15,13 +15,11 @@ from google.protobuf.message import Message
 
 from router.clock import wall_ns
 from router.compiler.network import recognisers
+from router.engine.dispatch import Peer, Receive
 from router.table.model import Framing, RouteTable
 from router.types.framing import MAX_DATAGRAM, restored
 from router.types.protobuf import Envelope, PayloadCase
 from router.types.wire import LEN, varint
-
-Peer = tuple[str, int]
-Receive = Callable[[bytes, Peer], None]
 
 PERIOD = 0.05
 """Seconds between two batches: waking a consumer for each datagram would cost more than routing it."""
@@ -31,18 +29,22 @@ MOST_WAITING = 8192
 
 
 class MirroredDatagram(NamedTuple):
-    """A datagram: when the router took it (wall clock, ns), on which listener, from whom, and its bytes.
+    """A datagram: when the router took it (wall clock, ns), on which listener, from whom, and its bytes as received.
 
-    Of one that is longer than the router takes there are the first `limit` + 1 bytes.
+    `endpoint` is what the table calls the sender, "" for a stranger. `reason` is why no route took the datagram, one of
+    REJECT_REASONS, "" for one that a route took. Of one that is longer than the router takes there are the first
+    `limit` + 1 bytes.
     """
 
     at: int
     listener: str
     peer: Peer
+    endpoint: str
+    reason: str
     data: bytes
 
 
-Mirrored = tuple[int, str, Peer, bytes]
+Mirrored = tuple[int, str, Peer, str, str, bytes]
 """The fields of a MirroredDatagram as a plain tuple, which takes a third of the time to build."""
 
 Consumer = Callable[[Sequence[Mirrored]], None]
@@ -99,18 +101,23 @@ class Mirror:
 
         return detach
 
-    def tee(self, listener: str, receive: Receive) -> Receive:
-        """Return what to call in place of `receive` for datagrams of `listener`, until `rewire` is called."""
+    def tee(self, listener: str, receive: Receive, sender: Callable[[Peer], str]) -> Receive:
+        """Return what to call in place of `receive` for datagrams of `listener`, until `rewire` is called.
+
+        `sender` returns the table's name of a peer, as `Classifier.sender` does.
+        """
         if not self._consumers:
             return receive
         waiting, append, most = self._waiting, self._waiting.append, self._limit + 1
 
-        def mirrored(data: bytes, peer: Peer) -> None:
+        def mirrored(data: bytes, peer: Peer) -> str:
+            at = wall_ns()
+            reason = receive(data, peer)
             if len(waiting) < MOST_WAITING:
-                append((wall_ns(), listener, peer, data[:most]))
+                append((at, listener, peer, sender(peer), reason, data[:most]))
             else:
                 self.lost += 1
-            receive(data, peer)
+            return reason
 
         return mirrored
 
@@ -151,7 +158,7 @@ class Mirror:
 
 
 class Classifier:
-    """What a mirrored datagram is to a table: its payload and its sender, as in routing. Any thread may use it."""
+    """What a datagram is to a table: its payload and its sender, as in routing. Any thread may use it."""
 
     def __init__(self, envelope: Envelope, table: RouteTable) -> None:
         self.envelope = envelope

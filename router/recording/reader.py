@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -16,9 +17,9 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Footer, Header, McapRecord, Message, Metadata
 from mcap.stream_reader import StreamReader
 
+from router.engine.dispatch import Peer
 from router.errors import UsageError
 from router.recording.channels import Datagram, Holds
-from router.recording.mirror import Peer
 from router.recording.writer import LIBRARY, METADATA
 from router.types.wire import LEN, varint
 
@@ -29,7 +30,8 @@ _DAMAGED = (McapError, zstandard.ZstdError, ProtobufError, struct.error, LookupE
 class Recorded(NamedTuple):
     """A datagram: when the router took it by the wall clock and by one that nobody set (ns), where, from whom.
 
-    `endpoint` is what the table of that time called the sender, empty for a stranger.
+    `endpoint` is what the table of that time called the sender, empty for a stranger. `reason` is why no route took the
+    datagram, empty if one did.
     """
 
     at: int
@@ -37,6 +39,7 @@ class Recorded(NamedTuple):
     listener: str
     peer: Peer
     endpoint: str
+    reason: str
     data: bytes
 
 
@@ -48,7 +51,7 @@ class Recording:
         self.about: dict[str, str] = {}
         self.is_whole = self.ends_early = False
         """Once all was read: the writer finished the file; it was killed, or the file is damaged."""
-        self._decoders: dict[int, Callable[[bytes], tuple[str, Peer, str, bytes] | None]] = {}
+        self._decoders: dict[int, Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]] = {}
         try:
             self._file: BinaryIO = path.open("rb")
         except OSError as error:
@@ -75,8 +78,7 @@ class Recording:
             for record in self._records:
                 if isinstance(record, Message):
                     if (found := self._decoders[record.channel_id](record.data)) is not None:
-                        listener, peer, endpoint, data = found
-                        yield Recorded(record.log_time, record.publish_time, listener, peer, endpoint, data)
+                        yield Recorded(record.log_time, record.publish_time, *found)
                 else:
                     self._take(record)
         except _DAMAGED:
@@ -100,21 +102,22 @@ class Recording:
             raise UsageError(f"{self.path} was not recorded by a router")
 
 
-def _decoder(metadata: dict[str, str]) -> Callable[[bytes], tuple[str, Peer, str, bytes] | None]:
-    """Return what makes listener, sender, endpoint and datagram of a message of the channel with this metadata."""
-    holds = metadata.get("holds")
+def _decoder(metadata: dict[str, str]) -> Callable[[bytes], tuple[str, Peer, str, str, bytes] | None]:
+    """Return what makes a datagram of a message of the channel with this metadata: the fields of Recorded from
+    `listener` on."""
+    holds, reason = metadata.get("holds"), metadata.get("reason", "")
     if holds == Holds.DATAGRAM.value:
-        return _raw
+        return partial(_raw, reason)
     if holds != Holds.PAYLOAD.value:
         return lambda _: None  # the datagram is elsewhere in the recording
     tag, peer = varint(int(metadata["number"]) << 3 | LEN), _peer(metadata["peer"])
     listener, endpoint = metadata["listener"], metadata["endpoint"]
-    return lambda payload: (listener, peer, endpoint, b"".join((tag, varint(len(payload)), payload)))
+    return lambda payload: (listener, peer, endpoint, reason, b"".join((tag, varint(len(payload)), payload)))
 
 
-def _raw(message: bytes) -> tuple[str, Peer, str, bytes]:
+def _raw(reason: str, message: bytes) -> tuple[str, Peer, str, str, bytes]:
     datagram: Any = Datagram.FromString(message)
-    return datagram.listener, _peer(datagram.peer), datagram.endpoint, datagram.data
+    return datagram.listener, _peer(datagram.peer), datagram.endpoint, reason, datagram.data
 
 
 def _peer(text: str) -> Peer:

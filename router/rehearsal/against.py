@@ -10,9 +10,10 @@ from typing import NamedTuple, Union
 
 from router.compiler import Checked
 from router.compiler.program import Program
+from router.engine.dispatch import Peer
 from router.engine.wire import Wire
 from router.errors import DecodeError, MappingError
-from router.recording.mirror import Classifier, Peer
+from router.recording.mirror import Classifier
 from router.recording.reader import Recorded
 from router.rehearsal import cdr
 from router.rehearsal.comparing import TableIndex

@@ -78,15 +78,17 @@ def is_receiving(url: str) -> bool:
 
 @contextmanager
 def tap(
-    url: str, cases: Sequence[str] = (), sources: Sequence[str] = ()
+    url: str, cases: Sequence[str] = (), sources: Sequence[str] = (), only: str | None = None
 ) -> Iterator[Iterator[list[MirroredDatagram | Lost]]]:
     """Yield what a running router receives from now on: of these payload cases, from these endpoints; none means all.
+    `only` is one of DECISIONS.
 
     It comes in batches, of which there is an empty one each second while nothing comes. What is of no known payload
     case comes in any case. Raises UsageError for what the router refuses, TransportError where none answers, and
     later when it has ended.
     """
-    words = urlencode([*(("case", case) for case in cases), *(("from", source) for source in sources)])
+    asked = [("case", case) for case in cases] + [("from", source) for source in sources]
+    words = urlencode(asked + ([("only", only)] if only else []))
     with closing(_connection(url, PATIENCE)) as connection:
         response = _asked(connection, url, "GET", f"/tap?{words}" if words else "/tap")
         if response.status != http.client.OK:

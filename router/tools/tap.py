@@ -112,17 +112,21 @@ PATIENCE = 0.2
 
 @dataclass(frozen=True, slots=True)
 class TappedDatagram:
-    """One datagram: when (local time), from whom, its bytes, and what it means or why it means nothing."""
+    """One datagram: when (local time), from whom, its bytes, and what it means or why it means nothing.
+
+    `rejected` is the reason why no route of the router took it, if none did.
+    """
 
     at: dt.datetime
     peer: str
     data: bytes
     decoded: Decoded | None
     problem: str = ""
+    rejected: str = ""
 
     def line(self, with_hex: bool) -> str:
         """`12:00:00.123 sensor_board imu_info accel_x=1.5`."""
-        start = f"{_clock(self.at)} {self.peer}"
+        start = f"{_clock(self.at)} {self.peer}" + (f" rejected ({self.rejected})" if self.rejected else "")
         if self.decoded is None:
             return f"{start} undecodable ({self.problem}): {self.data.hex() or 'no bytes'}"
         line = f"{start} {self.decoded.case.name} {compact(self.decoded.message, self.decoded.case.type)}"
@@ -136,6 +140,8 @@ class TappedDatagram:
     def json(self, with_hex: bool) -> str:
         """One JSON object; the fields in protobuf's JSON mapping with the names of the `.proto` files."""
         document: dict[str, object] = {"time": self.at.isoformat(), "peer": self.peer, "bytes": len(self.data)}
+        if self.rejected:
+            document["rejected"] = self.rejected
         if self.decoded is None:
             document["problem"] = self.problem
         else:
@@ -190,13 +196,11 @@ class RunningTap:
     def __init__(
         self,
         wire: Wire,
-        name_of: Callable[..., str],
         cases: Collection[str] = (),
         condition: Condition | None = None,
     ) -> None:
         self.missed = 0
         self._wire = wire
-        self._name_of = name_of
         self._cases = cases
         self._condition = condition
 
@@ -208,8 +212,8 @@ class RunningTap:
                 if isinstance(each, Lost):
                     self.missed += each.number
                     continue
-                peer = self._name_of(each.peer, each.listener)
-                tapped = tapped_datagram(each.at, peer, each.data, self._wire)
+                peer = each.endpoint or f"{each.peer[0]}:{each.peer[1]}"
+                tapped = tapped_datagram(each.at, peer, each.data, self._wire, each.reason)
                 if self._is_wanted(tapped, each.at):
                     shown.append(tapped)
             yield shown
@@ -232,7 +236,9 @@ def listen_to_topic(listener: TopicListener) -> Iterator[list[TappedMessage]]:
         ]
 
 
-def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> Iterator[list[TappedDatagram]]:
+def listen(
+    receiver: socket.socket, wire: Wire, name_of: Callable[[tuple[str, int]], str]
+) -> Iterator[list[TappedDatagram]]:
     """Wait for one datagram after the other, for ever; after PATIENCE without one, yield an empty list."""
     receiver.settimeout(PATIENCE)
     while True:
@@ -244,9 +250,9 @@ def listen(receiver: socket.socket, wire: Wire, name_of: Callable[..., str]) -> 
             yield [tapped_datagram(wall_ns(), name_of(peer), data, wire)]
 
 
-def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire) -> TappedDatagram:
+def tapped_datagram(at: int, peer: str, data: bytes, wire: Wire, rejected: str = "") -> TappedDatagram:
     """A datagram that was received at `at`, ns since 1970."""
     try:
-        return TappedDatagram(_local_time(at), peer, data, wire.decode(data))
+        return TappedDatagram(_local_time(at), peer, data, wire.decode(data), rejected=rejected)
     except DecodeError as error:
-        return TappedDatagram(_local_time(at), peer, data, None, str(error))
+        return TappedDatagram(_local_time(at), peer, data, None, str(error), rejected)

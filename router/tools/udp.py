@@ -9,7 +9,6 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
 
 from router.compiler.network import recognisers
 from router.errors import TransportError, UsageError, did_you_mean
@@ -74,17 +73,11 @@ def listener_address(listener: Listener) -> Address:
     return reachable(listener.address.value, listener.interface)
 
 
-def peer_names(table: RouteTable | None) -> Callable[..., str]:
-    """A function from a peer's address, and the listener if it is one of the table, to its endpoint's name, else to the
-    address as text.
-    """
+def peer_names(table: RouteTable | None) -> Callable[[tuple[str, int]], str]:
+    """A function from a peer's address to its endpoint's name, else to the address as text."""
+    by_host, by_address = recognisers(table.endpoints if table is not None else {}, None)
 
-    @cache
-    def recognised(listener: str | None) -> tuple[dict[str, str], dict[tuple[str, int], str]]:
-        return recognisers(table.endpoints if table is not None else {}, listener)
-
-    def name_of(peer: tuple[str, int], listener: str | None = None) -> str:
-        by_host, by_address = recognised(listener)
+    def name_of(peer: tuple[str, int]) -> str:
         return by_address.get(peer) or by_host.get(peer[0]) or f"{peer[0]}:{peer[1]}"
 
     return name_of

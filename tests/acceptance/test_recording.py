@@ -1,4 +1,4 @@
-"""A running router that records: everything that it received, before routing, whatever happens to it."""
+"""A running router that records: everything that it received, also what it rejected, whatever happens to it."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def said(*words: object) -> str:
     return done.stdout
 
 
-def test_everything_is_recorded_before_it_is_routed_here_and_by_another_process(tmp_path: Path) -> None:
+def test_everything_is_recorded_with_what_was_decided_here_and_by_another_process(tmp_path: Path) -> None:
     """And a stop in good order loses nothing."""
     recorder = None
     with recording_router(tmp_path) as (place, router):
@@ -109,6 +109,8 @@ def test_everything_is_recorded_before_it_is_routed_here_and_by_another_process(
     expected = [data[: 16 * 1024 + 1] for data in ALL_KINDS]  # of what is too long, as much as says so
     assert [each.data for each in found] == [*expected, imu(4)]
     assert [each.endpoint for each in found] == ["sensor_board"] * len(ALL_KINDS) + ["arm_board"]
+    reasons = ["", "empty", "malformed", "", "truncated", "", "source_mismatch"]
+    assert [each.reason for each in found] == reasons
     assert found[0].peer == (HOSTS["sensor_board"], port)
     assert {each.listener for each in found} == {"rover"}
     others = read(other)

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from time import time
 from typing import Any
 from unittest.mock import ANY
+from urllib.request import urlopen
 
 import pytest
 from structlog.testing import capture_logs
@@ -29,7 +30,8 @@ from router.carrier.schema import CannotCarry
 from router.compiler import check_table
 from router.compiler.metrics import Counters
 from router.net.receiver import ReceiveThread
-from router.observe.snapshot import Snapshot, snapshot
+from router.observe.http import HttpServer
+from router.observe.snapshot import Snapshot, parse_metrics, snapshot
 from tests.acceptance.site import wait_until
 from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, numbered, udp
 from tests.ports import free_port
@@ -89,6 +91,27 @@ def numbers(router: Router) -> Snapshot:
 
 def reloads(router: Router, result: str) -> float:
     return numbers(router).total("config_reloads", result)
+
+
+def test_the_table_of_the_start_counts_as_loaded_from_the_first_scrape(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scrapes: list[Snapshot] = []
+
+    class Scraped(HttpServer):
+        """Its first client is there as soon as the port answers, before anything is received."""
+
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            with urlopen(f"http://{self.address}/metrics") as answer:
+                scrapes.append(parse_metrics(answer.read().decode(), time()))
+
+    monkeypatch.setattr("router.observe.http.HttpServer", Scraped)
+    began = time()
+    with site.router(f'{PH}http: {{address: "127.0.0.1:{free_port()}"}}\n'):
+        [first] = scrapes
+    assert first.total("config_last_reload_successful") == 1
+    assert began - 60 < first.total("config_last_reload_timestamp_seconds") <= time()
 
 
 def test_nothing_is_lost_or_doubled_or_out_of_order_while_tables_change(site: Site) -> None:

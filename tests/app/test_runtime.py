@@ -23,13 +23,17 @@ from router.app import Router
 from router.app.native_datapath import NativeDatapath
 from router.carrier.carrier import Carrier
 from router.carrier.worker import Worker
+from router.compiler.metrics import REJECT_REASONS
 from router.engine.dispatch import Receive
 from router.errors import StartError
 from router.net.receiver import ReceiveThread
 from router.net.udp import Listener
+from router.observe.snapshot import snapshot
+from router.recording.mirror import Mirrored
 from router.recording.recorder import Recorder, RecordError
+from router.types.framing import MAX_DATAGRAM
 from tests.acceptance.site import wait_until
-from tests.app.conftest import BRAKE, DRIVE, Site, let_rest
+from tests.app.conftest import BRAKE, DRIVE, Site, let_rest, udp
 from tests.ports import free_port
 from tests.recording.recorder_rig import read
 
@@ -158,11 +162,11 @@ def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkey
 
     def serve_late(thread: ReceiveThread, listeners: Sequence[Listener], receive: Mapping[str, Receive]) -> None:
         if listeners:
-            router.mirror.attach(lambda batch: seen.extend(data for _, _, _, data in batch))
+            router.mirror.attach(lambda batch: seen.extend(data for *_, data in batch))
         serve(thread, listeners, receive)
 
     def adopt_late(datapath: NativeDatapath, *change: Any) -> None:
-        router.mirror.attach(lambda batch: seen.extend(data for _, _, _, data in batch))
+        router.mirror.attach(lambda batch: seen.extend(data for *_, data in batch))
         adopt(datapath, *change)
 
     monkeypatch.setattr(ReceiveThread, "serve", serve_late)
@@ -171,6 +175,34 @@ def test_who_begins_to_watch_while_the_router_starts_sees_all(site: Site, monkey
         site.send(PH)
         assert site.basestation.recv(1000) == PH
     assert seen == [PH]
+
+
+def test_who_watches_is_told_what_was_decided_about_each_datagram_in_the_order_of_arrival(site: Site) -> None:
+    routes = f"{ROUTE}  imu_info: {{ignore: nobody wants it}}\n"
+    sent = {
+        PH: "",
+        PH + bytes(3): "",
+        bytes(MAX_DATAGRAM + 100): "truncated",
+        b"": "empty",
+        b"\x0f": "malformed",  # a field without a wire type
+        bytes(4): "no_payload",
+        bytes.fromhex("a20600"): "unknown_case",
+        bytes.fromhex("6200"): "unhandled",  # gps_info
+        bytes.fromhex("6a00"): "ignored",  # imu_info
+    }
+    seen: list[Mirrored] = []
+    with udp("127.0.0.9") as stranger, site.router(routes) as router:
+        router.mirror.attach(seen.extend)
+        for data in sent:
+            site.send(data)
+        stranger.sendto(PH, ("127.0.0.1", site.listen))
+        wait_until(lambda: router.total("datagrams_received") == len(sent) + 1)
+        counted = snapshot(router.collect(), 0).counts("datagrams_rejected")
+    assert [(host, *rest) for _, _, (host, _), *rest in seen] == [
+        *(("127.0.0.30", "sensor_board", reason, data[: MAX_DATAGRAM + 1]) for data, reason in sent.items()),
+        ("127.0.0.9", "", "source_mismatch", PH),
+    ]
+    assert counted == {("rover", reason): 1 for reason in REJECT_REASONS}
 
 
 def test_a_scrape_reads_what_was_served_before_what_was_received(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

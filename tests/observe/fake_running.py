@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 
 from prometheus_client.metrics_core import Metric as Family
 
 from router.compiler import check_table
 from router.compiler.program import Program
+from router.engine.dispatch import Peer
 from router.observe.metrics import CountersCollector
 from router.observe.running import ReloadResult
-from router.recording.mirror import Mirror
+from router.recording.mirror import Classifier, Mirror
 from router.types.framing import MAX_DATAGRAM
 from tests.tables import ROUTES
 
@@ -44,8 +45,10 @@ class FakeRunning:
         """Times are in ns, as in the counters."""
         self.counts[self.program.counters.index(metric, *labels)] = to
 
-    def receive(self, data: bytes, peer: tuple[str, int], listener: str = "rover") -> None:
-        self.mirror.tee(listener, lambda *_: None)(data, peer)
+    def receive(self, data: bytes, peer: Peer, listener: str = "rover", reason: str = "") -> None:
+        """`reason`: why no route takes it."""
+        known = Classifier(self.program.envelope, self.program.table)
+        self.mirror.tee(listener, lambda *_: reason, partial(known.sender, listener))(data, peer)
 
     def collect(self) -> Iterator[Family]:
         self.collected += 1

@@ -117,6 +117,11 @@ def test_there_is_a_status_for_the_router_and_each_listener_endpoint_route_and_g
     assert reported["route/imu_info"].hardware_id == reported["router"].hardware_id != ""
 
 
+def test_the_table_is_reported_by_its_name(router: Counting) -> None:
+    reported = dict(router.after(1)["router"].values)
+    assert (reported["table"], reported["table sha256"]) == ("table.yaml", router.program.table.sha256)
+
+
 def test_endpoints_and_what_comes_from_them_go_stale_and_come_back(router: Counting) -> None:
     router.hear("sensor_board")
     reported = router.after(3)

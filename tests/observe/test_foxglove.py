@@ -58,9 +58,10 @@ class Showing:
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.attached) == consumers, PATIENCE)
 
-    def show(self, *datagrams: bytes, at: int = 1, listener: str = "rover") -> None:
+    def show(self, *datagrams: bytes, at: int = 1, listener: str = "rover", reason: str = "") -> None:
         batch: Sequence[MirroredDatagram] = [
-            MirroredDatagram(at + number, listener, PEER, data) for number, data in enumerate(datagrams)
+            MirroredDatagram(at + number, listener, PEER, "sensor_board", reason, data)
+            for number, data in enumerate(datagrams)
         ]
         for consumer in list(self.attached):
             consumer(batch)
@@ -166,6 +167,14 @@ def test_trimmed_and_padded_datagrams_are_shown_and_what_is_no_payload_is_not(
     empty, brake = envelope(program, "manual_brake"), envelope(program, "manual_brake", brake=True)
     router.show(empty.rstrip(b"\0"), b"\xff" * 9, b"", brake * 9000, brake + bytes(5), at=100)
     assert [client.receive().log_time for _ in range(2)] == [100, 104]
+
+
+def test_what_no_route_took_is_not_shown(program: Program, router: Showing, client: FoxgloveClient) -> None:
+    client.subscribe("imu_info")
+    router.wait_for(1)
+    router.show(envelope(program, "imu_info", accel_x=66.0), at=100, reason="source_mismatch")
+    router.show(envelope(program, "imu_info", accel_x=1.5), at=101)
+    assert client.receive().log_time == 101
 
 
 def test_listener_that_repairs_nothing_shows_nothing_that_it_rejects(tmp_path: Path) -> None:

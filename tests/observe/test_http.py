@@ -151,6 +151,13 @@ def test_what_there_is_not_is_said(server: HttpServer) -> None:
     assert ask(server, "/map.json?" + "width=wide&" * 1000).status == 400
 
 
+def test_no_page_says_where_the_table_is(server: HttpServer, running: FakeRunning) -> None:
+    path = running.program.table.path
+    for page in ("/", "/status.json", "/map.json", "/metrics", "/healthz", "/ready", "/nothing"):
+        assert f"{path.parent.name}/{path.name}" not in ask(server, page).text, page
+    assert ask(server, "/status.json").json["table"] == path.name
+
+
 def test_an_order_to_reload_says_what_came_of_it(server: HttpServer, running: FakeRunning) -> None:
     answer = ask(server, "/-/reload", "POST")
     assert (answer.status, answer.json) == (200, {"ok": True, "text": "nothing has changed", "findings": []})

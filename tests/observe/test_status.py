@@ -116,11 +116,22 @@ def test_a_last_value_comes_from_what_is_received_while_somebody_looks(running: 
     assert (found["source"], found["fields"]["accel_x"], found["fields"]["accel_y"]) == ("sensor_board", 1.5, 0.0)
 
 
+def test_what_no_route_took_is_no_last_value(running: FakeRunning, shown: Status) -> None:
+    shown.numbers()
+    running.receive(imu(accel_x=1.5), BOARD)
+    running.receive(imu(accel_x=66.0), STRANGER, reason="source_mismatch")
+    found = value(shown, "imu_info")
+    running.receive(imu(accel_x=66.0), STRANGER, reason="source_mismatch")
+    wait_until(lambda: not running.mirror._waiting)
+    assert [found, value(shown, "imu_info")] == [found] * 2
+    assert (found["source"], found["fields"]["accel_x"]) == ("sensor_board", 1.5)
+
+
 def test_a_strangers_value_is_shown_with_where_it_is_from_and_a_trimmed_one_as_the_router_reads_it(
     running: FakeRunning, shown: Status
 ) -> None:
     shown.numbers()
-    running.receive(b"junk", STRANGER)
+    running.receive(b"junk", STRANGER, reason="malformed")
     running.receive(imu(accel_x=2.0).rstrip(b"\0"), STRANGER)
     found = value(shown, "imu_info")
     assert (found["source"], found["fields"]["accel_x"]) == ("127.0.0.99:1", 2.0)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from router.compiler.metrics import REJECT_REASONS
 from router.errors import TransportError
 from router.observe import tap as tap_module
 from router.observe.tap import (
@@ -56,39 +57,45 @@ def read(stream: Iterator[bytes], count: int) -> list[MirroredDatagram | Lost]:
     return found
 
 
-def test_all_that_is_received_is_shown_as_it_came(running: FakeRunning) -> None:
+def test_all_that_is_received_is_shown_as_it_came_with_what_was_decided(running: FakeRunning) -> None:
     with closing(Tap(running.mirror, None)) as tap:
-        for data in (IMU, b"junk", b""):
-            running.receive(data, BOARD)
-        shown = read(tap.stream(), 3)
-    assert [(each.listener, each.peer, each.data) for each in shown if isinstance(each, MirroredDatagram)] == [
-        ("rover", BOARD, IMU),
-        ("rover", BOARD, b"junk"),
-        ("rover", BOARD, b""),
+        for data, reason in ((IMU, ""), (b"junk", "malformed"), (b"", "empty")):
+            running.receive(data, BOARD, reason=reason)
+        running.receive(IMU, STRANGER, reason="source_mismatch")
+        shown = read(tap.stream(), 4)
+    assert [each[1:] for each in shown if isinstance(each, MirroredDatagram)] == [
+        ("rover", BOARD, "sensor_board", "", IMU),
+        ("rover", BOARD, "sensor_board", "malformed", b"junk"),
+        ("rover", BOARD, "sensor_board", "empty", b""),
+        ("rover", STRANGER, "", "source_mismatch", IMU),
     ]
 
 
 @pytest.mark.parametrize(
-    ("cases", "sources", "shown"),
+    ("cases", "sources", "decisions", "shown"),
     [
-        ((), (), ["board imu", "board gps", "station imu", "stranger imu", "board junk"]),
-        (("gps_info",), (), ["board gps", "board junk"]),
-        (("gps_info", "imu_info"), ("basestation",), ["station imu"]),
-        ((), ("sensor_board",), ["board imu", "board gps", "board junk"]),
-        ((), ("127.0.0.99", "basestation"), ["station imu", "stranger imu"]),
+        ((), (), (), ["board imu", "board gps", "station imu", "stranger imu", "board junk"]),
+        (("gps_info",), (), (), ["board gps", "board junk"]),
+        (("gps_info", "imu_info"), ("basestation",), (), ["station imu"]),
+        ((), ("sensor_board",), (), ["board imu", "board gps", "board junk"]),
+        ((), ("127.0.0.99", "basestation"), (), ["station imu", "stranger imu"]),
+        ((), (), ("accepted",), ["board imu", "board gps"]),
+        ((), (), ("rejected",), ["station imu", "stranger imu", "board junk"]),
+        (("imu_info",), ("sensor_board", "127.0.0.99"), ("rejected",), ["stranger imu", "board junk"]),
+        ((), (), ("accepted", "rejected"), ["board imu", "board gps", "station imu", "stranger imu", "board junk"]),
     ],
 )
-def test_a_tap_shows_some_cases_or_senders_only(
-    cases: tuple[str, ...], sources: tuple[str, ...], shown: list[str]
+def test_a_tap_shows_some_cases_or_senders_or_decisions_only(
+    cases: tuple[str, ...], sources: tuple[str, ...], decisions: tuple[str, ...], shown: list[str]
 ) -> None:
     seen = {
-        "board imu": MirroredDatagram(0, "rover", BOARD, IMU),
-        "board gps": MirroredDatagram(0, "rover", BOARD, GPS),
-        "station imu": MirroredDatagram(0, "rover", STATION, IMU),
-        "stranger imu": MirroredDatagram(0, "rover", STRANGER, IMU),
-        "board junk": MirroredDatagram(0, "rover", BOARD, b"\xff\xff\xff"),
+        "board imu": MirroredDatagram(0, "rover", BOARD, "sensor_board", "", IMU),
+        "board gps": MirroredDatagram(0, "rover", BOARD, "sensor_board", "", GPS),
+        "station imu": MirroredDatagram(0, "rover", STATION, "basestation", "source_mismatch", IMU),
+        "stranger imu": MirroredDatagram(0, "rover", STRANGER, "", "source_mismatch", IMU),
+        "board junk": MirroredDatagram(0, "rover", BOARD, "sensor_board", "malformed", b"\xff\xff\xff"),
     }
-    wants = wanted(PROGRAM, cases, sources)
+    wants = wanted(PROGRAM, cases, sources, decisions)
     assert [name for name, each in seen.items() if wants is None or wants(each)] == shown
 
 
@@ -97,6 +104,8 @@ def test_a_name_that_there_is_not_is_refused() -> None:
         wanted(PROGRAM, ["imu_inf"], [])
     with pytest.raises(TapRequestError, match="no endpoint 'sensor_bord'; did you mean 'sensor_board'"):
         wanted(PROGRAM, [], ["sensor_bord"])
+    with pytest.raises(TapRequestError, match="datagrams are accepted or rejected, not 'reject'"):
+        wanted(PROGRAM, [], [], ["reject"])
 
 
 def test_a_reader_who_is_too_slow_is_told_how_many_he_missed(
@@ -142,8 +151,10 @@ HOSTS = st.tuples(*[st.integers(0, 255)] * 4).map(lambda parts: ".".join(map(str
 SEEN = st.builds(
     MirroredDatagram,
     st.integers(0, 2**64 - 1),
-    st.text(min_size=1, max_size=60).filter(lambda name: len(name.encode()) < 256),
+    st.text(min_size=1, max_size=60),
     st.tuples(HOSTS, st.integers(0, 65535)),
+    st.text(max_size=60),
+    st.sampled_from(["", *REJECT_REASONS]),
     st.binary(max_size=300),
 )
 LOST = st.builds(Lost, st.integers(0, 2**64 - 1))
@@ -169,7 +180,7 @@ def test_what_a_newer_router_says_is_passed_over() -> None:
     assert list(StreamReader().take(MAGIC + unknown + encode_lost(7))) == [Lost(7)]
 
 
-@pytest.mark.parametrize("stream", [b"<!doctype html>", b"router tap 2\n"])
+@pytest.mark.parametrize("stream", [b"<!doctype html>", b"router tap 1\n"])
 def test_another_stream_is_refused(stream: bytes) -> None:
     with pytest.raises(TransportError, match="no stream of a tap"):
         list(StreamReader().take(stream))

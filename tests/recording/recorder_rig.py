@@ -13,6 +13,7 @@ from typing import Any, cast
 from hypothesis import strategies as st
 
 from router.compiler.program import Program
+from router.engine.dispatch import Peer
 from router.engine.wire import Wire, wire_of_protos
 from router.errors import Located, SourceSpan
 from router.recording.channels import Channels
@@ -29,6 +30,7 @@ SPAN = SourceSpan("table.yaml", 3)
 START = 1_790_000_000_000_000_000
 SENSOR_BOARD = ("10.0.0.3", 5000)
 STRANGER = ("10.9.9.9", 40000)
+NAMES = {SENSOR_BOARD: "sensor_board"}
 MILLISECOND = 1_000_000
 
 
@@ -82,9 +84,16 @@ def classifier() -> Classifier:
     return Classifier(wire().envelope, table())
 
 
-def seen(*datagrams: bytes, at: int = START, peer: tuple[str, int] = SENSOR_BOARD) -> list[MirroredDatagram]:
+def shown(
+    data: bytes, at: int = START, peer: Peer = SENSOR_BOARD, listener: str = "rover", reason: str = ""
+) -> MirroredDatagram:
+    """What the mirror says of a datagram."""
+    return MirroredDatagram(at, listener, peer, NAMES.get(peer, ""), reason, data)
+
+
+def seen(*datagrams: bytes, at: int = START, peer: Peer = SENSOR_BOARD, reason: str = "") -> list[MirroredDatagram]:
     """One each millisecond."""
-    return [MirroredDatagram(at + number * MILLISECOND, "rover", peer, data) for number, data in enumerate(datagrams)]
+    return [shown(data, at + number * MILLISECOND, peer, reason=reason) for number, data in enumerate(datagrams)]
 
 
 def recorded(path: Path, *batches: Sequence[MirroredDatagram], finish: bool = True) -> Path:
@@ -125,7 +134,7 @@ def read(path: Path) -> list[Recorded]:
 
 def again(found: Recorded) -> MirroredDatagram:
     """What was recorded, as it was seen."""
-    return MirroredDatagram(found.at, found.listener, found.peer, found.data)
+    return MirroredDatagram(found.at, found.listener, found.peer, found.endpoint, found.reason, found.data)
 
 
 class FakeMirror:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
+from router.engine.dispatch import Peer
 from router.recording.channels import MOST_CHANNELS, Channels
 from router.recording.encoder import Encoder
-from router.recording.mirror import MirroredDatagram
 from router.types.framing import MAX_DATAGRAM
 from router.types.wire import varint
 from tests.recording.recorder_rig import (
@@ -28,24 +30,43 @@ from tests.recording.recorder_rig import (
     read,
     recorded,
     seen,
+    shown,
     taken,
     wire,
     write,
 )
 
 PEERS = st.sampled_from([SENSOR_BOARD, STRANGER, ("0.0.0.0", 0), ("255.255.255.255", 65535)])
+DECISIONS = st.sampled_from(["", "source_mismatch", "malformed"])
 
 
-@given(st.lists(st.lists(st.builds(lambda data, peer: (data, peer), datagrams(), PEERS), min_size=1), min_size=1))
-def test_every_datagram_is_read_as_it_was_seen(batches: list[list[tuple[bytes, tuple[str, int]]]]) -> None:
+@given(st.lists(st.lists(st.tuples(datagrams(), PEERS, DECISIONS), min_size=1), min_size=1))
+def test_every_datagram_is_read_as_it_was_seen(batches: list[list[tuple[bytes, Peer, str]]]) -> None:
     at = iter(range(START, START + 10**12, MILLISECOND))
-    shown = [[MirroredDatagram(next(at), "rover", peer, data) for data, peer in batch] for batch in batches]
+    said = [[shown(data, next(at), peer, reason=reason) for data, peer, reason in batch] for batch in batches]
     with tempfile.TemporaryDirectory() as folder:
-        found = read(recorded(Path(folder) / "it.mcap", *shown))
-    assert [again(each) for each in found] == [each for batch in shown for each in batch]
+        found = read(recorded(Path(folder) / "it.mcap", *said))
+    assert [again(each) for each in found] == [each for batch in said for each in batch]
     assert all(each.steady == each.at for each in found)
-    assert {each.endpoint for each in found if each.peer == SENSOR_BOARD} <= {"sensor_board"}
-    assert {each.endpoint for each in found if each.peer == STRANGER} <= {""}
+
+
+def test_what_was_rejected_is_on_topics_of_its_own_by_reason(tmp_path: Path) -> None:
+    """A stranger's datagrams look like the board's, and are not to be plotted among them."""
+    padded = imu(2) + bytes(3)
+    path = recorded(
+        tmp_path / "it.mcap",
+        [*seen(imu(1), padded), *seen(imu(1), padded, peer=STRANGER, reason="source_mismatch")],
+        seen(b"\xff", reason="malformed"),
+    )
+    with path.open("rb") as file:
+        topics = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    assert topics == {
+        "imu_info": 2,
+        "raw/datagrams": 1,
+        "rejected/source_mismatch/imu_info": 2,
+        "rejected/source_mismatch/raw/datagrams": 1,
+        "rejected/malformed/raw/datagrams": 1,
+    }
 
 
 @pytest.mark.parametrize("size", [0, 1, 100, 127, 128, 129, 16383, MAX_DATAGRAM - 8, MAX_DATAGRAM, MAX_DATAGRAM + 1])
@@ -60,21 +81,18 @@ def test_a_datagram_that_the_router_rejects_has_no_payload_to_look_at(tmp_path: 
     """Of a listener that repairs nothing; zeros at the end are repaired by the other."""
     padded = imu() + bytes(5)
     batch = [
-        MirroredDatagram(START, "rover", SENSOR_BOARD, padded),
-        MirroredDatagram(START, "exact", SENSOR_BOARD, padded),
+        shown(padded),
+        shown(padded, listener="exact", reason="malformed"),
     ]
     channels = Channels()
     chunk = encoded(Encoder(channels), batch)
     by_topic = {channels.channels[number].topic: count for number, count in chunk.messages.items()}
-    assert by_topic == {"raw/datagrams": 2, "imu_info": 1}
+    assert by_topic == {"raw/datagrams": 1, "imu_info": 1, "rejected/malformed/raw/datagrams": 1}
 
 
 def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
     channels = Channels()
-    many = [
-        MirroredDatagram(START + n, "rover", (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1), imu())
-        for n in range(MOST_CHANNELS + 10)
-    ]
+    many = [shown(imu(), START + n, (f"10.{n >> 16}.{n >> 8 & 255}.{n & 255}", 1)) for n in range(MOST_CHANNELS + 10)]
     assert encoded(Encoder(channels), many).datagrams == len(many)
     assert len(channels.channels) == MOST_CHANNELS + 2  # the raw datagrams, and their payloads to look at
 
@@ -82,10 +100,12 @@ def test_more_senders_than_there_are_channels_for_lose_nothing() -> None:
 def test_known_senders_keep_their_channels_over_a_reload_when_there_are_too_many() -> None:
     channels = Channels()
     case = wire().case("imu_info")
-    numbers = [channels.payload(case, "rover", ("10.0.0.3", port), "sensor_board") for port in range(MOST_CHANNELS + 1)]
+    numbers = [
+        channels.payload(case, "rover", ("10.0.0.3", port), "sensor_board", "") for port in range(MOST_CHANNELS + 1)
+    ]
     assert numbers[-1] is None
-    assert channels.payload(case, "rover", ("10.0.0.3", 7), "sensor_board") == numbers[7]
-    assert channels.payload(case, "rover", ("10.0.0.3", 7), "renamed") is None
+    assert channels.payload(case, "rover", ("10.0.0.3", 7), "sensor_board", "") == numbers[7]
+    assert channels.payload(case, "rover", ("10.0.0.3", 7), "renamed", "") is None
 
 
 def test_a_clock_that_is_set_changes_log_times_and_not_what_replaying_goes_by(tmp_path: Path) -> None:

@@ -8,14 +8,15 @@ from collections.abc import Sequence
 
 import pytest
 
-from router.recording.mirror import MOST_WAITING, Consumer, Mirror, Mirrored, MirroredDatagram, Receive
+from router.engine.dispatch import Peer, Receive
+from router.recording.mirror import MOST_WAITING, Consumer, Mirror, Mirrored, MirroredDatagram
 
-PEER = ("127.0.0.2", 8)
+PEER, STRANGER = ("127.0.0.2", 8), ("127.0.0.9", 8)
 LIMIT = 100
 
 
 class Source:
-    """What receives: a function that counts, rewired as a receive thread would be."""
+    """What receives: a function that counts and rejects strangers, rewired as a receive thread would be."""
 
     def __init__(self) -> None:
         self.failures: list[Exception] = []
@@ -24,12 +25,18 @@ class Source:
         self.receive: Receive = self._route
         self.rewired = 0
 
-    def _route(self, data: bytes, peer: tuple[str, int]) -> None:
+    def _route(self, data: bytes, peer: Peer) -> str:
+        if peer == STRANGER:
+            return "source_mismatch"
         self.routed.append(data)
+        return ""
+
+    def tee(self) -> Receive:
+        return self.mirror.tee("rover", self._route, {PEER: "board", STRANGER: ""}.__getitem__)
 
     def _rewire(self) -> None:
         self.rewired += 1
-        self.receive = self.mirror.tee("rover", self._route)
+        self.receive = self.tee()
 
 
 def into(got: queue.SimpleQueue[MirroredDatagram]) -> Consumer:
@@ -46,7 +53,7 @@ def source() -> Source:
 
 
 def test_nothing_is_between_while_nobody_watches(source: Source) -> None:
-    assert source.mirror.tee("rover", source.receive) is source.receive
+    assert source.tee() == source.receive == source._route
 
 
 def test_consumers_see_what_is_routed_with_peer_and_listener(source: Source) -> None:
@@ -61,6 +68,15 @@ def test_consumers_see_what_is_routed_with_peer_and_listener(source: Source) -> 
     assert sorted(each.at for each in seen) == [each.at for each in seen]
 
 
+def test_consumers_see_what_was_decided_and_who_sent(source: Source) -> None:
+    got: queue.SimpleQueue[MirroredDatagram] = queue.SimpleQueue()
+    source.mirror.attach(into(got))
+    assert [source.receive(b"x", peer) for peer in (PEER, STRANGER, PEER)] == ["", "source_mismatch", ""]
+    source.mirror.close()
+    seen = [got.get_nowait() for _ in range(3)]
+    assert [(each.endpoint, each.reason) for each in seen] == [("board", ""), ("", "source_mismatch"), ("board", "")]
+
+
 def test_the_first_comes_and_the_last_goes_with_a_rewiring(source: Source) -> None:
     first, second = (source.mirror.attach(lambda _: None) for _ in range(2))
     assert source.rewired == 1
@@ -69,7 +85,7 @@ def test_the_first_comes_and_the_last_goes_with_a_rewiring(source: Source) -> No
     assert source.rewired == 1
     second()
     assert source.rewired == 2
-    assert source.mirror.tee("rover", source.receive) is source.receive
+    assert source.tee() == source.receive == source._route
 
 
 def test_one_who_left_sees_no_more_and_one_who_comes_again_does(source: Source) -> None:

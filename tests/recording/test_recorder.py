@@ -277,9 +277,9 @@ def test_what_came_before_a_reload_is_saved_as_it_was_known_then(tmp_path: Path)
     with running_recorder(tmp_path, continuous=False, last=10**11) as (made, mirror):
         mirror.show(now(imu(1)))
         mirror.program = SimpleNamespace(table=table(endpoints={}), envelope=wire().envelope, protos_sha256="1" * 64)
-        mirror.show(now(imu(2)))
+        mirror.show([each._replace(endpoint="", reason="source_mismatch") for each in now(imu(2))])
         saved = made.save("http")
-    assert [each.endpoint for each in read(saved)] == ["sensor_board", ""]
+    assert [(each.endpoint, each.reason) for each in read(saved)] == [("sensor_board", ""), ("", "source_mismatch")]
 
 
 def test_what_comes_after_the_end_is_refused(tmp_path: Path) -> None:

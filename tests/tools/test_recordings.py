@@ -26,7 +26,7 @@ BOARD, STRANGER = ("127.0.6.30", 40001), ("127.0.6.99", 40002)
 ELSEWHERE = ("198.51.100.7", 5000)
 BATCHES = (
     seen(imu(1), b"no envelope", imu(2).rstrip(b"\0") + bytes(7), peer=BOARD),
-    seen(imu(3), b"", imu(4), at=START + 50 * MILLISECOND, peer=STRANGER),
+    seen(imu(3), b"", imu(4), at=START + 50 * MILLISECOND, peer=STRANGER, reason="source_mismatch"),
 )
 SENT = [each.data for batch in BATCHES for each in batch]
 TAPPED = seen(imu(1), b"bad", imu(2))

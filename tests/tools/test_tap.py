@@ -38,6 +38,12 @@ def test_an_undecodable_datagram_is_shown_with_reason_and_bytes(wire: Wire) -> N
     assert json.loads(told.json(with_hex=False))["hex"] == "ffff"
 
 
+def test_a_rejected_datagram_is_marked_with_the_reason(wire: Wire) -> None:
+    told = tapped_datagram(0, "127.0.0.9:5", datagram(wire, "i32=5"), wire, "source_mismatch")
+    assert " 127.0.0.9:5 rejected (source_mismatch) every_kind i32=5" in told.line(with_hex=False)
+    assert json.loads(told.json(with_hex=False))["rejected"] == "source_mismatch"
+
+
 def test_json_has_the_fields_by_their_proto_names(wire: Wire) -> None:
     said = json.loads(tapped_datagram(0, "board", datagram(wire, "point.x=3", "single=nan"), wire).json(with_hex=False))
     assert said["fields"] == {"single": "NaN", "point": {"x": 3}}

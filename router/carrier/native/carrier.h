@@ -85,6 +85,7 @@ struct peer {
     uint32_t port;    /* 0: any */
     uint32_t column;  /* of the listener's entries */
     uint32_t last_seen; /* counter */
+    uint32_t id;        /* of the endpoint, in what is mirrored */
 };
 
 struct listener {
@@ -132,13 +133,18 @@ struct message_record {
     uint32_t handler;
 };
 
-/* A received datagram in the mirror; up to MAX_DATAGRAM + 1 bytes of it follow. */
+/* A received datagram in the mirror, once it is decided what becomes of it. Up to MAX_DATAGRAM + 1 bytes follow, as they
+ * were received. */
 struct mirror_record {
     uint32_t size, listener;
     int64_t at; /* wall clock */
     uint32_t address, port; /* of the sender, host byte order */
-    uint32_t length, reserved;
+    uint32_t length;
+    int32_t reason;   /* enum reason, or ROUTED */
+    int32_t endpoint; /* `id` of the sender, or STRANGER */
+    uint32_t reserved;
 };
+enum { ROUTED = -1, STRANGER = -1 };
 
 struct carrier;
 

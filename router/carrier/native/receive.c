@@ -22,6 +22,7 @@ struct received {
     const struct listener *listener;
     size_t length;
     uint32_t address, port; /* of the sender */
+    const struct peer *peer; /* NULL for a stranger */
     uint32_t column;
     int64_t received_at, now, born;
     struct envelope envelope;
@@ -51,7 +52,8 @@ static void reject(struct carrier *carrier, const struct received *received, enu
 
 /* ---- the mirror ---- */
 
-static void mirror(struct carrier *carrier, struct ring *to, const struct received *received) {
+/* `reason`: why no route took it, or ROUTED. */
+static void mirror(struct carrier *carrier, struct ring *to, const struct received *received, int reason) {
     struct mirror_record *record = (struct mirror_record *)carrier->record;
     size_t kept = received->length < MAX_DATAGRAM + 1 ? received->length : MAX_DATAGRAM + 1;
     *record = (struct mirror_record){.size = padded_to_word(sizeof *record + kept),
@@ -59,7 +61,9 @@ static void mirror(struct carrier *carrier, struct ring *to, const struct receiv
                                      .at = received->received_at,
                                      .address = received->address,
                                      .port = received->port,
-                                     .length = (uint32_t)kept};
+                                     .length = (uint32_t)kept,
+                                     .reason = reason,
+                                     .endpoint = received->peer ? (int32_t)received->peer->id : STRANGER};
     memcpy(record + 1, carrier->datagram, kept);
     uint32_t lost = atomic_load_explicit(&carrier->mirror_lost, memory_order_relaxed);
     if (!ring_put(to, record, record->size)) counter_add(carrier->counters, lost, 1);
@@ -149,25 +153,24 @@ static const struct payload_case *find_case(const struct program *program, uint3
     return &program->cases[low]; /* envelope_read returns no other number */
 }
 
-static void route(struct carrier *carrier, const struct payload_case *found, const struct received *received) {
+/* Return ROUTED, or the reason why no route takes the datagram. */
+static int route(struct carrier *carrier, const struct payload_case *found, const struct received *received) {
     const struct program *program = carrier->program;
     const struct listener *listener = received->listener;
     if (found->row < 0) {
-        if (!found->is_ignored) counter_add(carrier->counters, found->unhandled, 1);
-        reject(carrier, received, found->is_ignored ? IGNORED : UNHANDLED);
-        return;
+        if (found->is_ignored) return IGNORED;
+        counter_add(carrier->counters, found->unhandled, 1);
+        return UNHANDLED;
     }
     const struct entry *entry = &listener->entries[(uint32_t)found->row * listener->columns + received->column];
-    if (entry->route < 0) {
-        reject(carrier, received, SOURCE_MISMATCH);
-        return;
-    }
+    if (entry->route < 0) return SOURCE_MISMATCH;
     const struct route *chosen = &program->routes[entry->route];
     counter_add(carrier->counters, entry->received, 1);
     forward(carrier, chosen, received);
     for (uint32_t index = 0; index < chosen->part_count; index++) hand_over(carrier, &chosen->parts[index], received);
     counter_set(carrier->counters, chosen->last_message, received->received_at);
     count_duration(carrier->counters, chosen->duration, monotonic_ns() - received->now);
+    return ROUTED;
 }
 
 static void handle(struct carrier *carrier, struct received *received, int64_t arrived_at) {
@@ -179,20 +182,17 @@ static void handle(struct carrier *carrier, struct received *received, int64_t a
                                     received->received_at, received->now);
     counter_add(counters, listener->received, 1);
     counter_add(counters, listener->received_bytes, (int64_t)received->length);
-    const struct peer *peer = find_peer(listener, received->address, received->port);
-    received->column = peer ? peer->column : listener->columns - 1;
-    if (peer) counter_set(counters, peer->last_seen, received->received_at);
-    struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
-    if (observed) mirror(carrier, observed, received);
+    received->peer = find_peer(listener, received->address, received->port);
+    received->column = received->peer ? received->peer->column : listener->columns - 1;
+    if (received->peer) counter_set(counters, received->peer->last_seen, received->received_at);
     int reason = envelope_read(carrier->program->schema, carrier->datagram, received->length, listener->repairs,
                                &received->envelope);
     if (received->envelope.is_repaired) counter_add(counters, listener->padded, 1);
-    if (reason >= 0) {
-        if (reason == UNKNOWN_CASE) counter_add(counters, carrier->program->unknown_case, 1);
-        reject(carrier, received, (enum reason)reason);
-        return;
-    }
-    route(carrier, find_case(carrier->program, received->envelope.case_number), received);
+    if (reason == UNKNOWN_CASE) counter_add(counters, carrier->program->unknown_case, 1);
+    if (reason == ROUTED) reason = route(carrier, find_case(carrier->program, received->envelope.case_number), received);
+    if (reason != ROUTED) reject(carrier, received, (enum reason)reason);
+    struct ring *observed = atomic_load_explicit(&carrier->mirror, memory_order_acquire);
+    if (observed) mirror(carrier, observed, received, reason);
 }
 
 /* ---- receiving ---- */

@@ -25,7 +25,7 @@ static const struct destination destinations[] = {
 static struct part part = {.wanted = topics, .targets = &target, .wanted_count = 1, .target_count = 1};
 static const struct route only = {.ttl = 1000000000, .destinations = destinations, .parts = &part, .destination_count = 1,
                                   .part_count = 1, .last_message = LAST_MESSAGE, .duration = DURATION};
-static const struct peer peers[] = {{1, 7, 0, SEEN}, {1, 0, 1, SEEN}, {2, 9, 1, SEEN}};
+static const struct peer peers[] = {{1, 7, 0, SEEN, 0}, {1, 0, 1, SEEN, 1}, {2, 9, 1, SEEN, 1}};
 static const struct entry entries[] = {{0, ACCEPTED}, {-1, 0}, {0, ACCEPTED}}; /* strangers, too */
 static struct payload_case cases[MOST_CASES];
 static struct listener listeners[LISTENERS];

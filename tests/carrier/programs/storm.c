@@ -155,7 +155,7 @@ static struct made *make(uint32_t generation) {
     check(made, "memory");
     made->wanted[0] = &wanted;
     made->feed.deadman = open_deadman();
-    made->peer = (struct peer){0x7f000002, 0, 0, SEEN};
+    made->peer = (struct peer){0x7f000002, 0, 0, SEEN, 0};
     made->cases[ROUTES] = (struct payload_case){.number = ROUTES + 1, .row = -1, .unhandled = UNHANDLED_CASE};
     for (int index = 0; index < ROUTES; index++) make_route(made, index);
     made->program = (struct program){.generation = generation, .listener_count = 1 + generation % LISTENERS,
