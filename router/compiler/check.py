@@ -110,7 +110,7 @@ def _boards(table: RouteTable, schema: ProtoSchema, envelope: Envelope, limit: i
     """What each endpoint that is a board can take; `limit` is the largest envelope in bytes."""
     boards = [endpoint for endpoint in table.endpoints.values() if endpoint.kind is EndpointKind.BOARD]
     fields = board_fields(schema.descriptor(envelope.name), schema.board_options) if boards else {}
-    return {each.name: BoardLimits(envelope, fields, limit, each.allow_non_finite) for each in boards}
+    return {each.name: BoardLimits(fields, limit, each.allow_non_finite) for each in boards}
 
 
 def _wire(table: RouteTable, definitions: Definitions) -> tuple[ProtoSchema, Envelope]:

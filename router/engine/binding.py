@@ -11,7 +11,17 @@ from router.compiler.metrics import Counters
 from router.compiler.program import Handler, TargetPlan
 from router.engine.collecting import Collector
 from router.engine.deadman import CommandMaker
-from router.engine.delivery import MAPPING_FAILURES, Deliver, FrameOutcome, Outcome, Report, Stale, checked, immediately
+from router.engine.delivery import (
+    MAPPING_FAILURES,
+    Deliver,
+    FrameOutcome,
+    Outcome,
+    Report,
+    Stale,
+    checked,
+    immediately,
+    only_what_fits,
+)
 from router.engine.freshness import Freshness
 from router.engine.pacing import Latest, Pacer, RateLimit
 from router.engine.timers import Locked
@@ -163,21 +173,21 @@ def _deliver(place: tuple[str, str | None, TargetPlan], outcome: Outcome, contex
     """
     route, _, target = place
     locked = context.holding.locked if target.is_topic else context.pacing.locked
+    board = None if target.is_topic else context.boards.get(target.label)
     destination: object
     pacer = None if target.is_topic else context.pacers.get(target.label)
     if pacer is not None:
-        command = checked(context.command(target.label, route, target.deadmen), context.boards.get(target.label))
+        command = context.command(target.label, route, target.deadmen)
         destination, deliver = pacer, pacer.queue(target.priority, outcome, command)
     elif target.is_topic:
         destination = publish = context.publish[target.label]
         deliver = immediately(lambda data, _: publish(data), outcome, context.publish_errors)
     else:
         destination = context.send[target.label]
-        command = checked(context.command(target.label, route, target.deadmen), context.boards.get(target.label))
-        deliver = immediately(command, outcome)
+        deliver = immediately(context.command(target.label, route, target.deadmen), outcome)
     if target.on_limit is OnLimit.LATEST and target.max_rate is not None:
         rate = target.max_rate
         latest = context.state.keep(("latest", *place, destination), lambda: Latest(rate, deliver, outcome))
-        return locked(latest, latest.offer)
+        return locked(latest, only_what_fits(latest.offer, board, outcome))
     assert pacer is not None  # noqa: S101 - the other reason to defer
-    return locked(pacer, deliver)
+    return locked(pacer, only_what_fits(deliver, board, outcome))

@@ -173,5 +173,19 @@ def checked(send: Callable[..., int], board: BoardLimits | None) -> Callable[...
     return send_checked
 
 
+def only_what_fits(deliver: Deliver, board: BoardLimits | None, outcome: Outcome) -> Deliver:
+    """Return a Deliver that does not let a message wait which the board cannot take."""
+    if board is None:
+        return deliver
+
+    def deliver_what_fits(now: int, data: bytes, expires: int | None) -> None:
+        if refusal := board.refusal(restored(data)):
+            outcome.failed(BoardRefuses(refusal))
+        else:
+            deliver(now, data, expires)
+
+    return deliver_what_fits
+
+
 def is_stale(now: int, expires: int | None) -> bool:
     return expires is not None and now > expires

@@ -8,19 +8,16 @@ in an enum that declares none, an unknown group.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
-from google.protobuf.message import DecodeError as ProtobufError
-from google.protobuf.message import Message
-from google.protobuf.message_factory import GetMessageClass
 
 from router.errors import plural
 from router.types.boards import OptionsOf, why_unbounded
 from router.types.descriptors import message_of
-from router.types.protobuf import Envelope
+from router.types.wire import I32_SIZE, I64, I64_SIZE, LEN, VARINT, wire_fields, wire_type_of
 
 TOO_LARGE, NON_FINITE = "too_large", "non_finite"
 """Those of DROP_REASONS for which a datagram is not sent to a board."""
@@ -65,7 +62,6 @@ class Refusal:
 class BoardLimits:
     """What one board can take. `longest` is the size of its largest envelope in bytes."""
 
-    envelope: Envelope
     fields: BoardMessage
     longest: int
     allows_non_finite: bool
@@ -73,51 +69,58 @@ class BoardLimits:
     def refusal(self, datagram: bytes) -> Refusal | None:
         """Why the board cannot take an envelope that is well formed; None if it can."""
         if len(datagram) > self.longest:
-            return Refusal(TOO_LARGE, _too_many("the envelope", len(datagram), "byte", self.longest))
-        try:
-            message = self.envelope.message_class.FromString(datagram)
-        except ProtobufError:  # a payload may have one level more than within the envelope
-            return Refusal(TOO_LARGE, "messages are nested too deeply")
-        return next(self._refusals(message, self.fields), None)
+            return _too_many("the envelope", len(datagram), "byte", self.longest)
+        return next(self._refusals(datagram, self.fields, {}), None)
 
-    def _refusals(self, message: Message, fields: BoardMessage) -> Iterator[Refusal]:
-        for descriptor, value in message.ListFields():
-            field = fields.get(descriptor.number)
+    def _refusals(self, message: bytes, fields: BoardMessage, counts: dict[str, int]) -> Iterator[Refusal]:
+        """`counts` are the elements of each list so far, by path; a message that comes twice is merged."""
+        for number, wire_type, value in wire_fields(message):
+            field = fields.get(number)
             if field is None:
                 continue
-            elements = _elements(descriptor, value)
-            if field.most is not None and not _fits(len(elements), field.most, field.has_fixed_count):
-                yield Refusal(TOO_LARGE, _too_many(field.path, len(elements), "element", field.most))
-            for element in elements:
-                yield from self._of_element(field, element)
+            elements = _elements(field, wire_type, value)
+            if field.most is not None and elements is not None:
+                counts[field.path] = total = counts.get(field.path, 0) + len(elements)
+                if total > field.most or (field.has_fixed_count and not elements):
+                    yield _too_many(field.path, total, "element", field.most)
+            for element in elements or ():
+                yield from self._of_element(field, element, counts)
+        for field in fields.values():
+            count = counts.get(field.path, 0)
+            if field.most is not None and field.has_fixed_count and count not in (0, field.most):
+                yield _too_many(field.path, count, "element", field.most)
 
-    def _of_element(self, field: BoardField, element: Any) -> Iterator[Refusal]:
+    def _of_element(self, field: BoardField, element: bytes, counts: dict[str, int]) -> Iterator[Refusal]:
         if field.message is not None:
-            yield from self._refusals(element, field.message)
+            yield from self._refusals(element, field.message, {} if field.most is not None else counts)
         elif field.longest is not None:
-            size = len(element.encode() if isinstance(element, str) else element)
-            if not _fits(size, field.longest, field.has_fixed_length):
-                yield Refusal(TOO_LARGE, _too_many(field.path, size, "byte", field.longest))
-        elif field.is_float and not self.allows_non_finite and not math.isfinite(element):
-            yield Refusal(NON_FINITE, f"{field.path} is {element}")
+            if not _fits(len(element), field.longest, field.has_fixed_length):
+                yield _too_many(field.path, len(element), "byte", field.longest)
+        elif field.is_float and not self.allows_non_finite:
+            [number] = struct.unpack("<d" if len(element) == I64_SIZE else "<f", element)
+            if not math.isfinite(number):
+                yield Refusal(NON_FINITE, f"{field.path} is {number}")
 
 
-def _too_many(what: str, found: int, unit: str, bound: int) -> str:
-    return f"{what} has {plural(found, unit)}; the board takes {bound}"
+def _too_many(what: str, found: int, unit: str, bound: int) -> Refusal:
+    return Refusal(TOO_LARGE, f"{what} has {plural(found, unit)}; the board takes {bound}")
 
 
 def _fits(size: int, bound: int, is_fixed: bool) -> bool:
     return size in (0, bound) if is_fixed else size <= bound
 
 
-def _elements(descriptor: FieldDescriptor, value: Any) -> Sequence[Any]:
-    """The values of a repeated field, the entries of a map, or the only value."""
-    if not descriptor.is_repeated:
+def _elements(field: BoardField, wire_type: int, value: bytes) -> Sequence[bytes] | None:
+    """The elements that a field brings, as they are encoded; None if it has another wire type than its own."""
+    own = wire_type_of(field.descriptor)
+    if wire_type == own:
         return [value]
-    if descriptor.message_type is None or not descriptor.message_type.GetOptions().map_entry:
-        return list(value)
-    entry = GetMessageClass(descriptor.message_type)
-    return [entry(key=key, value=value[key]) for key in value]
+    if wire_type != LEN or not field.descriptor.is_repeated:
+        return None
+    if own == VARINT:
+        return [b""] * sum(byte < 0x80 for byte in value)
+    size = I64_SIZE if own == I64 else I32_SIZE
+    return [value[at : at + size] for at in range(0, len(value) - size + 1, size)]
 
 
 def board_fields(

@@ -6,16 +6,13 @@ padded with zeros. Both can be undone, because a tag is never zero and the last 
 
 from __future__ import annotations
 
-from router.types.wire import LEN
+from router.types.wire import I32, I32_SIZE, I64, I64_SIZE, LEN, VARINT, read_varint
 
 MAX_DATAGRAM = 16 * 1024
 """The longest accepted datagram, in bytes; a longer one is rejected as `truncated`."""
 
-_VARINT = 0
-_FIXED = {1: 8, 5: 4}
+_FIXED = {I64: I64_SIZE, I32: I32_SIZE}
 """Bytes of a value, by wire type."""
-
-_LONGEST_VARINT = 10
 
 
 def restored(data: bytes, limit: int = MAX_DATAGRAM) -> bytes:
@@ -31,19 +28,19 @@ def restored(data: bytes, limit: int = MAX_DATAGRAM) -> bytes:
         while position < size:
             if data[position] == 0:
                 return data if data[position:].strip(b"\0") else data[:position]
-            tag, position = _varint(data, position)
+            tag, position = read_varint(data, position)
             wire_type = tag & 7
             if wire_type in _FIXED:
                 position += _FIXED[wire_type]
             elif wire_type == LEN:
-                length, position = _varint(with_zero, position)  # `c2 01 80` was `c2 01 80 00`
+                length, position = read_varint(with_zero, position)  # `c2 01 80` was `c2 01 80 00`
                 position += length
-            elif wire_type != _VARINT:
+            elif wire_type != VARINT:
                 return data
             elif position == size:
                 position += 1  # the value was zero
             else:
-                _, position = _varint(data, position)
+                _, position = read_varint(data, position)
     except IndexError:
         return data
     return data if position > limit else data.ljust(position, b"\0")
@@ -53,14 +50,3 @@ def trimmed(data: bytes) -> bytes:
     """Return an envelope without its trailing zeros, if `restored` can tell from the rest how many there were."""
     bare = data.rstrip(b"\0")
     return bare if restored(bare) == data else data
-
-
-def _varint(data: bytes, position: int) -> tuple[int, int]:
-    """Return a varint and the position behind it. Raises IndexError for one that is cut or too long."""
-    value = 0
-    for index in range(_LONGEST_VARINT):
-        byte = data[position + index]
-        value |= (byte & 0x7F) << (7 * index)
-        if byte < 0x80:
-            return value, position + index + 1
-    raise IndexError

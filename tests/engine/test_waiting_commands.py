@@ -122,3 +122,29 @@ def test_what_is_held_back_for_a_rate_feeds_it_when_it_leaves(tmp_path: Path) ->
     assert rig.changes == []
     rig.pass_time(67 * MS)
     assert rig.changes == [("manual_drive", True)]
+
+
+def test_what_a_board_cannot_take_does_not_replace_what_is_held(tmp_path: Path) -> None:
+    head = HEAD.replace("routes:", "  far_board: {address: 192.168.0.70:8, kind: board}\nroutes:")
+    held = (
+        "  imu_info: {source: sensor_board, destinations: [{endpoint: far_board, max_rate: 1 Hz, on_limit: latest}]}\n"
+    )
+    rig = Rig(program(tmp_path, held, head))
+    first, good, bad = (enveloped(imu_info={"accel_x": value}) for value in (1, 2, float("nan")))
+    for datagram in (first, good, bad):
+        rig.receive(datagram, SENSOR_BOARD)
+    rig.pass_time(2 * SECOND)
+    assert rig.sent == [("far_board", first), ("far_board", good)]
+    assert rig.dropped("imu_info", "far_board") == {"non_finite": 1}
+
+
+def test_what_a_board_cannot_take_feeds_no_deadman(tmp_path: Path) -> None:
+    deadman = "deadman: {timeout: 500ms, send: {arm_ctrl: {}}}"
+    table = f"  arm_ctrl: {{source: basestation, destinations: [driving_board], {deadman}}}\n"
+    rig = Rig(program(tmp_path, table))
+    rig.receive(enveloped(arm_ctrl={"control_base": 1}), BASESTATION)
+    for _ in range(12):
+        rig.pass_time(50 * MS)
+        rig.receive(enveloped(arm_ctrl={"control_base": float("inf")}), BASESTATION)
+    assert rig.changes == [("arm_ctrl", True)]
+    assert rig.dropped("arm_ctrl", "driving_board") == {"non_finite": 12}

@@ -55,7 +55,8 @@ static bool takes_number(struct check *check, const struct board_field *field, c
 static bool takes_more(struct check *check, const struct board_field *field, uint64_t elements) {
     if (!(field->flags & BOARD_IS_REPEATED)) return true;
     uint64_t total = check->counts[field->counter] + elements;
-    if (total > field->most) return too_large(check, field->path, total, "element", field->most);
+    bool is_empty = !elements && field->flags & BOARD_HAS_FIXED_COUNT;
+    if (total > field->most || is_empty) return too_large(check, field->path, total, "element", field->most);
     check->counts[field->counter] = (uint32_t)total;
     return true;
 }
